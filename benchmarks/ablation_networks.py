@@ -49,8 +49,8 @@ class Pooled(Unread):
         valid = bias[:, 0, 0, :, None] == 0
         rows = self.norm_voxels(voxels)
         mean = (rows * valid).sum(1) / valid.sum(1).clamp(min=1)
-        most = rows.masked_fill(~valid, -1e4).amax(1)
-        return self.mix(torch.cat([mean, most], -1))[:, None]
+        maximum = rows.masked_fill(~valid, -1e4).amax(1)
+        return self.mix(torch.cat([mean, maximum], -1))[:, None]
 
 
 def pooled(config: NetworkConfig) -> PoseNet:
@@ -65,13 +65,15 @@ def pooled(config: NetworkConfig) -> PoseNet:
 def reading(*levels: str):
     """A network whose anchors read these levels alone."""
 
-    def made(config: NetworkConfig) -> PoseNet:
+    def make_network(config: NetworkConfig) -> PoseNet:
         network = PoseNet(config)
         pairs = zip(LEVELS, network.exchanges, strict=True)
-        network.exchanges = nn.ModuleList(e if level in levels else Unread(e) for level, e in pairs)
+        network.exchanges = nn.ModuleList(
+            exchange if level in levels else Unread(exchange) for level, exchange in pairs
+        )
         return network
 
-    return made
+    return make_network
 
 
 class Uncounted(PoseNet):

@@ -130,15 +130,17 @@ class PointJoints(VariantObjective):
         part, label, offset = outputs.part.float().split([self.config.parts, count + 1, 3], -1)
         terms = losses(replace(outputs, part=part), targets, share=share)
         true = torch.where(targets.known[..., None], targets.joints, 0.0)
-        own, to_joint = point_labels(batch.fine.position, batch.fine.valid, true, targets.known)
+        nearest_joint, to_joint = point_labels(batch.fine.position, batch.fine.valid, true, targets.known)
         # things near a joint are nobody's
-        own = own.masked_fill((targets.part == 0) & batch.fine.valid, count).masked_fill(targets.part < 0, -1)
-        cross = F.cross_entropy(label.flatten(0, 1), own.flatten(), ignore_index=-1, reduction="sum")
-        is_body = (own >= 0) & (own < count)
-        missed = ((offset - to_joint).norm(dim=-1) * is_body).sum()
+        nearest_joint = nearest_joint.masked_fill((targets.part == 0) & batch.fine.valid, count).masked_fill(
+            targets.part < 0, -1
+        )
+        label_entropy = F.cross_entropy(label.flatten(0, 1), nearest_joint.flatten(), ignore_index=-1, reduction="sum")
+        is_body = (nearest_joint >= 0) & (nearest_joint < count)
+        offset_error = ((offset - to_joint).norm(dim=-1) * is_body).sum()
         return terms | {
-            "label": LABEL * cross / at_least_one(share((own >= 0).sum())),
-            "offset": OFFSET * missed / at_least_one(share(is_body.sum())),
+            "label": LABEL * label_entropy / at_least_one(share((nearest_joint >= 0).sum())),
+            "offset": OFFSET * offset_error / at_least_one(share(is_body.sum())),
         }
 
 
@@ -154,12 +156,14 @@ class HardestPeople(VariantObjective):
         self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
     ) -> dict[str, Tensor]:
         outputs, targets = network(Batch.from_arrays(arrays, device)), Targets.from_arrays(arrays, device)
-        missed = (outputs.joints().detach().float() - targets.joints).norm(dim=-1).where(targets.known, 0.0).sum(1)
-        hardest = missed.topk(max(round(HARDEST * len(missed)), 1)).indices
-        everybody = losses(outputs, targets, share=share)
-        hard = losses(of_people(outputs, hardest), of_people(targets, hardest), share=share)
-        mixed = {name: (value + hard[name]) / 2 for name, value in everybody.items()}
-        return mixed | {"mpjpe": everybody["mpjpe"]}
+        person_error = (
+            (outputs.joints().detach().float() - targets.joints).norm(dim=-1).where(targets.known, 0.0).sum(1)
+        )
+        hardest_rows = person_error.topk(max(round(HARDEST * len(person_error)), 1)).indices
+        all_losses = losses(outputs, targets, share=share)
+        hard_losses = losses(of_people(outputs, hardest_rows), of_people(targets, hardest_rows), share=share)
+        terms = {name: (value + hard_losses[name]) / 2 for name, value in all_losses.items()}
+        return terms | {"mpjpe": all_losses["mpjpe"]}
 
 
 def of_people(tensors: Any, rows: Tensor) -> Any:
@@ -182,8 +186,8 @@ class MirroredPairs(VariantObjective):
     to each other. As many people pass through the network as without it."""
 
     def collate(self, examples: list[Example]) -> dict[str, np.ndarray]:
-        kept = examples[::2]
-        return super().collate([*kept, *map(mirrored, kept)])
+        originals = examples[::2]
+        return super().collate([*originals, *map(mirrored, originals)])
 
     def terms(
         self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
@@ -191,9 +195,9 @@ class MirroredPairs(VariantObjective):
         outputs, targets = network(Batch.from_arrays(arrays, device)), Targets.from_arrays(arrays, device)
         straight, image = outputs.joints().float().chunk(2)
         image = mirrored_joints(image)
-        known = targets.known.float().chunk(2)[0]
-        apart = ((straight - image).norm(dim=-1) * known).sum() / at_least_one(share(known.sum()))
-        return losses(outputs, targets, share=share) | {"consistency": CONSISTENCY * apart}
+        is_labeled = targets.known.float().chunk(2)[0]
+        distance = ((straight - image).norm(dim=-1) * is_labeled).sum() / at_least_one(share(is_labeled.sum()))
+        return losses(outputs, targets, share=share) | {"consistency": CONSISTENCY * distance}
 
 
 def mirrored(example: Example) -> Example:
@@ -226,23 +230,26 @@ class Taught(VariantObjective):
     def collate(self, examples: list[Example]) -> dict[str, np.ndarray]:
         config = _teacher(self.teacher).config
         assert config.grid == self.config.grid
-        own = PoseNetObjective(config=config).collate(examples)
-        image = PoseNetObjective(config=config).collate([mirrored(example) for example in examples])
-        return own | {_IMAGE + name: value for name, value in image.items()}
+        arrays = PoseNetObjective(config=config).collate(examples)
+        image_arrays = PoseNetObjective(config=config).collate([mirrored(example) for example in examples])
+        return arrays | {_IMAGE + name: value for name, value in image_arrays.items()}
 
     def terms(
         self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
     ) -> dict[str, Tensor]:
         teacher, targets = _teacher(self.teacher).to(device), Targets.from_arrays(arrays, device)
-        image = {name.removeprefix(_IMAGE): value for name, value in arrays.items() if name.startswith(_IMAGE)}
+        image_arrays = {name.removeprefix(_IMAGE): value for name, value in arrays.items() if name.startswith(_IMAGE)}
         batch = Batch.from_arrays(arrays, device)
         with torch.no_grad():
-            looks = teacher(batch).joints(), mirrored_joints(teacher(Batch.from_arrays(image, device)).joints())
-            taught = (looks[0].float() + looks[1].float()) / 2
+            teacher_answers = (
+                teacher(batch).joints(),
+                mirrored_joints(teacher(Batch.from_arrays(image_arrays, device)).joints()),
+            )
+            teacher_joints = (teacher_answers[0].float() + teacher_answers[1].float()) / 2
         outputs: Outputs = network(batch)
         terms = losses(outputs, targets, share=share)
-        copied = losses(outputs, replace(targets, joints=taught), share=share)
-        return terms | {name: (terms[name] + copied[name]) / 2 for name in _OF_JOINTS if name in terms}
+        teacher_losses = losses(outputs, replace(targets, joints=teacher_joints), share=share)
+        return terms | {name: (terms[name] + teacher_losses[name]) / 2 for name in _OF_JOINTS if name in terms}
 
 
 @lru_cache(maxsize=1)

@@ -43,18 +43,18 @@ def own_lines(result: Result) -> list[MetricRow]:
 
 def figures(result: Result) -> dict[str, dict[str, float]]:
     """value, low and high of each of `FIGURES` that the result has."""
-    found = {}
+    values = {}
     for name, (group, of, figure) in FIGURES.items():
-        fitting = (x for x in own_lines(result) if x.group == group and x.figure == figure and of in (None, x.of))
-        if (line := next(fitting, None)) is not None:
-            found[name] = {"value": line.value, "low": line.low, "high": line.high}
-    return found
+        matches = (x for x in own_lines(result) if x.group == group and x.figure == figure and of in (None, x.of))
+        if (line := next(matches, None)) is not None:
+            values[name] = {"value": line.value, "low": line.low, "high": line.high}
+    return values
 
 
 def collect(folder: Path, known: list[dict]) -> list[dict]:
     """What the runs of a folder scored, and those known that it does not hold, in a fixed order."""
-    found = [json.loads(path.read_text()) for path in sorted(folder.rglob("scores.json"))]
-    runs = {(run["variant"], run["begun"], run["people"], run["seed"]): run for run in known + found}
+    new_runs = [json.loads(path.read_text()) for path in sorted(folder.rglob("scores.json"))]
+    runs = {(run["variant"], run["begun"], run["people"], run["seed"]): run for run in known + new_runs}
     return [runs[key] for key in sorted(runs)]
 
 
@@ -71,9 +71,9 @@ class Runs:
         self._design = np.array([[n == v for v in variants] + [s == x for x in seeds] for n, s in self.by], float)
         self._inverse = np.linalg.pinv(self._design.T @ self._design)
         self.freedom = len(self.by) - int(np.linalg.matrix_rank(self._design))
-        found = self._found("all")
-        left = found - self._design @ self._effects(found)
-        self.deviation = float((left @ left / self.freedom) ** 0.5) if self.freedom else math.nan
+        errors = self._found("all")
+        residual = errors - self._design @ self._effects(errors)
+        self.deviation = float((residual @ residual / self.freedom) ** 0.5) if self.freedom else math.nan
 
     def seeds(self, variant: str) -> list[int]:
         return sorted(seed for name, seed in self.by if name == variant)
@@ -98,19 +98,19 @@ class Runs:
 
     def told(self, variant: str) -> str:
         """The difference and its interval, and whether it is one."""
-        found, reach = self.difference(variant), self.reach(variant)
-        if math.isnan(found):
+        difference, reach = self.difference(variant), self.reach(variant)
+        if math.isnan(difference):
             return "-"
         if math.isnan(reach):
-            return f"{found:+.1f}"
-        word = "" if abs(found) > reach else ", unresolved"
-        return f"{found:+.1f} ± {reach:.1f}{word}"
+            return f"{difference:+.1f}"
+        word = "" if abs(difference) > reach else ", unresolved"
+        return f"{difference:+.1f} ± {reach:.1f}{word}"
 
     def _found(self, figure: str) -> np.ndarray:
         return np.array([run["figures"][figure]["value"] for run in self.by.values()])
 
-    def _effects(self, found: np.ndarray) -> np.ndarray:
-        return self._inverse @ self._design.T @ found
+    def _effects(self, values: np.ndarray) -> np.ndarray:
+        return self._inverse @ self._design.T @ values
 
     def _contrast(self, variant: str) -> np.ndarray:
         return (self._columns == variant) * 1.0 - (self._columns == BASE)
@@ -121,44 +121,46 @@ Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]
 
 def study(runs: list[dict], studies: Collection[str] | None = None) -> Rows:
     """The variants of some studies, or of all, beside `base`, at the length that most runs have."""
-    own = _common(runs)
+    common_runs = _common(runs)
     names = dict.fromkeys(run["variant"] for run in runs if studies is None or run["study"] in studies)
-    chosen = [variant for variant in names if variant != BASE and own.seeds(variant)]
-    chosen.sort(key=lambda variant: own.mean(variant, "all"))
+    variants = [variant for variant in names if variant != BASE and common_runs.seeds(variant)]
+    variants.sort(key=lambda variant: common_runs.mean(variant, "all"))
     header = ("", "MPJPE mm", "against base", *_HEADER, "seeds")
-    return header, [_row(own, variant) for variant in (BASE, *chosen)]
+    return header, [_row(common_runs, variant) for variant in (BASE, *variants)]
 
 
-def _row(own: Runs, variant: str) -> tuple[str, ...]:
-    what = own.by[variant, own.seeds(variant)[0]]["what"]
-    found = [f"{own.mean(variant, figure):.1f}" for figure in ("all", *_SHOWN)]
-    found[-1] += " %"
-    against = "" if variant == BASE else own.told(variant)
-    return what, found[0], against, *found[1:], str(len(own.seeds(variant)))
+def _row(runs: Runs, variant: str) -> tuple[str, ...]:
+    what = runs.by[variant, runs.seeds(variant)[0]]["what"]
+    cells = [f"{runs.mean(variant, figure):.1f}" for figure in ("all", *_SHOWN)]
+    cells[-1] += " %"
+    difference = "" if variant == BASE else runs.told(variant)
+    return what, cells[0], difference, *cells[1:], str(len(runs.seeds(variant)))
 
 
 def noise(runs: list[dict]) -> str:
-    own = _common(runs)
-    if not own.freedom:
-        return f"{own.people:,} people per run, one seed: differences have no interval.\n"
+    common_runs = _common(runs)
+    if not common_runs.freedom:
+        return f"{common_runs.people:,} people per run, one seed: differences have no interval.\n"
     return (
-        f"{own.people:,} people per run. Runs that differ only in their seed have a standard deviation of "
-        f"{own.deviation:.1f} mm,\n"
-        f"after removing what all variants of a seed share ({own.freedom} degrees of freedom).\n"
+        f"{common_runs.people:,} people per run. Runs that differ only in their seed have a standard deviation of "
+        f"{common_runs.deviation:.1f} mm,\n"
+        f"after removing what all variants of a seed share ({common_runs.freedom} degrees of freedom).\n"
     )
 
 
 def scaling(runs: list[dict], shipped: dict | None = None) -> Rows:
     """`base` by the number of people seen; runs of their own, each cooled, and what ships as the longest."""
-    seen = sorted({run["people"] for run in runs if run["variant"] == BASE})
-    lengths = {people: Runs(runs, people) for people in seen}
-    found = {people: {name: own.mean(BASE, name) for name in ("all", *_SHOWN)} for people, own in lengths.items()}
-    rows, before = [], None
-    for people, own in (found | (shipped or {})).items():
-        fall = "" if before is None else f"{(own['all'] - before[1]) / math.log2(people / before[0]):+.1f}"
-        cells = [f"{own[name]:.1f}" for name in ("all", *_SHOWN)]
-        rows.append((f"{people:,}", cells[0], fall, *cells[1:-1], f"{cells[-1]} %"))
-        before = people, own["all"]
+    run_lengths = sorted({run["people"] for run in runs if run["variant"] == BASE})
+    runs_by_length = {people: Runs(runs, people) for people in run_lengths}
+    figures_by_length = {
+        people: {name: group.mean(BASE, name) for name in ("all", *_SHOWN)} for people, group in runs_by_length.items()
+    }
+    rows, previous = [], None
+    for people, values in (figures_by_length | (shipped or {})).items():
+        slope = "" if previous is None else f"{(values['all'] - previous[1]) / math.log2(people / previous[0]):+.1f}"
+        cells = [f"{values[name]:.1f}" for name in ("all", *_SHOWN)]
+        rows.append((f"{people:,}", cells[0], slope, *cells[1:-1], f"{cells[-1]} %"))
+        previous = people, values["all"]
     return ("people seen", "MPJPE mm", "per doubling", *_HEADER), rows
 
 
@@ -166,20 +168,22 @@ def against_paper(runs: list[dict]) -> Rows:
     """`base` and the paper's design, at every length at which both ran."""
     rows = []
     for people in sorted({run["people"] for run in runs if run["study"] == "paper"}):
-        own = Runs(runs, people)
-        ways = [v for v in dict.fromkeys(run["variant"] for run in runs if run["study"] == "paper") if own.seeds(v)]
-        rows += [_beside(own, variant) for variant in (BASE, *ways)]
+        length_runs = Runs(runs, people)
+        variants = [
+            v for v in dict.fromkeys(run["variant"] for run in runs if run["study"] == "paper") if length_runs.seeds(v)
+        ]
+        rows += [_beside(length_runs, variant) for variant in (BASE, *variants)]
     header = ("", "people seen", "parameters", "MPJPE mm", "plain", "clean", "cluttered", "lost to clutter")
     return (*header, "processor minutes"), rows
 
 
-def _beside(own: Runs, variant: str) -> tuple[str, ...]:
-    one = own.by[variant, own.seeds(variant)[0]]
-    lost = own.mean(variant, "cluttered") - own.mean(variant, "clean")
-    what = f"ours: {one['what']}" if variant == BASE else one["what"]
-    found = [f"{own.mean(variant, figure):.1f}" for figure in ("all", "plain", "clean", "cluttered")]
-    minutes = np.mean([own.by[variant, seed]["processor_seconds"] for seed in own.seeds(variant)]) / 60
-    return what, f"{own.people:,}", f"{one['parameters']:,}", *found, f"{lost:+.1f}", f"{minutes:.0f}"
+def _beside(runs: Runs, variant: str) -> tuple[str, ...]:
+    run = runs.by[variant, runs.seeds(variant)[0]]
+    clutter_cost = runs.mean(variant, "cluttered") - runs.mean(variant, "clean")
+    what = f"ours: {run['what']}" if variant == BASE else run["what"]
+    cells = [f"{runs.mean(variant, figure):.1f}" for figure in ("all", "plain", "clean", "cluttered")]
+    minutes = np.mean([runs.by[variant, seed]["processor_seconds"] for seed in runs.seeds(variant)]) / 60
+    return what, f"{runs.people:,}", f"{run['parameters']:,}", *cells, f"{clutter_cost:+.1f}", f"{minutes:.0f}"
 
 
 def _common(runs: list[dict]) -> Runs:

@@ -143,10 +143,10 @@ class SceneSource(SyntheticSource):
     config: SceneConfig
 
     def example(self, index: int) -> Example:
-        known = _remembered(self)
-        if index not in known:
-            known[index] = super().example(index)
-        return known[index]
+        examples = _remembered(self)
+        if index not in examples:
+            examples[index] = super().example(index)
+        return examples[index]
 
     @cached_property
     def _generator(self) -> Generator:
@@ -177,8 +177,8 @@ class HardKindsSource(SceneSource):
         """Which person example `index` shows."""
         pair = 2 * index, 2 * index + 1
         weights = [KIND_WEIGHTS.get(self.kind(k), 1.5) for k in pair]
-        first = np.random.default_rng([self.seed, index]).random() < weights[0] / sum(weights)
-        return pair[0] if first else pair[1]
+        takes_first = np.random.default_rng([self.seed, index]).random() < weights[0] / sum(weights)
+        return pair[0] if takes_first else pair[1]
 
     def kind(self, index: int) -> str:
         """What person `index` does."""
@@ -200,16 +200,16 @@ def keeps_network(variant: Variant) -> bool:
 
 def configuration(variant: Variant, init: str) -> NetworkConfig:
     """That of the variant's network: without convolutions, or with those of the weights that it goes on from."""
-    kept = read_header(init).config.convolution if init else 0
-    return replace(preset(variant.size), **{"convolution": kept} | variant.config)
+    convolution = read_header(init).config.convolution if init else 0
+    return replace(preset(variant.size), **{"convolution": convolution} | variant.config)
 
 
 def job(variant: Variant, settings: Pretrain) -> TrainSetup:
     """What the variant comes to."""
-    usual = make_setup(settings)
+    base_setup = make_setup(settings)
     config = configuration(variant, settings.init)
     objective = variant.objective(config=config, made=variant.network)
-    values = {name: value for name, value in vars(usual.source).items() if not name.startswith("_")}
+    values = {name: value for name, value in vars(base_setup.source).items() if not name.startswith("_")}
     values["scene"] = variant.scene.name
     if not variant.scene.hard:
         values["easy"] = math.inf
@@ -217,20 +217,20 @@ def job(variant: Variant, settings: Pretrain) -> TrainSetup:
         # of twice as many people
         values["easy"] *= 2
     # the pairs or the teacher's arrays of an objective are of training alone
-    plain = VariantObjective(config=config, made=variant.network)
+    plain_objective = VariantObjective(config=config, made=variant.network)
     network = objective.network
     if settings.init:
-        trained = load_checkpoint(settings.init)[0]
-        network = partial(expand_weights, trained, config)
+        trained_network = load_checkpoint(settings.init)[0]
+        network = partial(expand_weights, trained_network, config)
         if variant.network is not PoseNet:
-            network = partial(grown, trained, variant.network)
+            network = partial(grown, trained_network, variant.network)
     source = HardKindsSource if variant.kinds else SceneSource
     return replace(
-        usual,
+        base_setup,
         objective=objective,
         source=source(config=variant.scene, **values),
         network=network,
-        validate=lambda _, *given: usual.validate(plain, *given),
+        validate=lambda _, *args: base_setup.validate(plain_objective, *args),
     )
 
 
@@ -242,13 +242,13 @@ def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict
     changes |= {"workers": 0, "pictures": 0, "validate": people}
     changes |= {"init": init, "easy": 0.0, "cool": 0.9} if init else {}
     settings = recipe(Pretrain, **changes | variant.recipe)
-    started, used = time.perf_counter(), time.process_time()
-    own = job(variant, settings)
-    model = train(settings, folder, setup=own)
-    taken = {"seconds": time.perf_counter() - started, "processor_seconds": time.process_time() - used}
-    network = own.objective.network()
+    start, process_start = time.perf_counter(), time.process_time()
+    setup = job(variant, settings)
+    model = train(settings, folder, setup=setup)
+    durations = {"seconds": time.perf_counter() - start, "processor_seconds": time.process_time() - process_start}
+    network = setup.objective.network()
     network.load_state_dict(SafetensorsFile.open(model).load(network.state_dict()))
-    predictor = Predictor(TorchBackend(network, Header(config=own.objective.config, card={})), name=name)
+    predictor = Predictor(TorchBackend(network, Header(config=setup.objective.config, card={})), name=name)
     result = evaluation.run(predictor, ["bench"]).scores.results[0]
     return record(
         name,
@@ -256,7 +256,7 @@ def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict
         people,
         begun=read_header(init).card["people_seen"] if init else 0,
         parameters=sum(value.numel() for value in network.parameters()),
-        **taken,
+        **durations,
         figures=figures(result),
     )
 
@@ -276,10 +276,10 @@ def each(names: Iterable[str], options: argparse.Namespace, scored: Callable[[st
             if (folder / "scores.json").is_file():
                 continue
             shutil.rmtree(folder, ignore_errors=True)
-            found = scored(name, seed, folder)
-            write_atomic(folder / "scores.json", json.dumps(found, indent=1) + os.linesep)
-            shown = "  ".join(f"{key} {value['value']:.1f}" for key, value in found["figures"].items())
-            print(f"{name} {seed}: {shown}  ({found['processor_seconds']:.0f} s)", flush=True)
+            scores = scored(name, seed, folder)
+            write_atomic(folder / "scores.json", json.dumps(scores, indent=1) + os.linesep)
+            summary = "  ".join(f"{key} {value['value']:.1f}" for key, value in scores["figures"].items())
+            print(f"{name} {seed}: {summary}  ({scores['processor_seconds']:.0f} s)", flush=True)
 
 
 def arguments(parser: argparse.ArgumentParser, **motion) -> None:

@@ -87,38 +87,38 @@ def sized(config: DaptConfig) -> DaptConfig:
 
 def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict:
     """Both stages and the verdict; returns its `ablations.record`."""
-    way, people = WAYS[name], options.people
-    started, used = time.perf_counter(), time.process_time()
+    variant, people = WAYS[name], options.people
+    start, process_start = time.perf_counter(), time.process_time()
     subjects = tuple(options.subjects.split(","))
     changes = {"size": "paper-small", "motion": options.motion, "subjects": subjects}
-    changes |= {"people": people if way.one_stage else people // 2}
-    changes |= {"workers": 0, "pictures": 0, "validate": people, "scene": way.scene} | (way.recipe or {})
-    changes |= {"strays": 0.2, "noise": 0.15} if way.scene == "wild" else {}
-    settings = recipe(Pretrain, "paper", **changes, seed=seed, rate=way.rates[0])
-    second = DaptObjective(config=sized(finetuning_config("humanm3")), stage="finetune")
-    begun: Callable[[], nn.Module] = second.network
-    if not way.one_stage:
-        first = DaptObjective(config=sized(pretraining_config()), stage="pretrain")
-        own = replace(make_setup(settings), objective=first, network=first.network)
-        trained, _ = load_checkpoint(train(settings, folder / "pretrain", setup=own))
-        begun = partial(transferred, trained, second.config, keep_anchors=way.anchors)
+    changes |= {"people": people if variant.one_stage else people // 2}
+    changes |= {"workers": 0, "pictures": 0, "validate": people, "scene": variant.scene} | (variant.recipe or {})
+    changes |= {"strays": 0.2, "noise": 0.15} if variant.scene == "wild" else {}
+    settings = recipe(Pretrain, "paper", **changes, seed=seed, rate=variant.rates[0])
+    finetuning = DaptObjective(config=sized(finetuning_config("humanm3")), stage="finetune")
+    make_network: Callable[[], nn.Module] = finetuning.network
+    if not variant.one_stage:
+        pretraining = DaptObjective(config=sized(pretraining_config()), stage="pretrain")
+        setup = replace(make_setup(settings), objective=pretraining, network=pretraining.network)
+        trained_network, _ = load_checkpoint(train(settings, folder / "pretrain", setup=setup))
+        make_network = partial(transferred, trained_network, finetuning.config, keep_anchors=variant.anchors)
     # other people than those of the first half
-    settings = replace(settings, seed=seed + 1_000, rate=way.rates[1])
-    own = replace(make_setup(settings), objective=second, network=begun)
-    model = train(settings, folder / "finetune", setup=own)
-    taken = {"seconds": time.perf_counter() - started, "processor_seconds": time.process_time() - used}
+    settings = replace(settings, seed=seed + 1_000, rate=variant.rates[1])
+    setup = replace(make_setup(settings), objective=finetuning, network=make_network)
+    model = train(settings, folder / "finetune", setup=setup)
+    durations = {"seconds": time.perf_counter() - start, "processor_seconds": time.process_time() - process_start}
     results = [
-        evaluation.run(load(model, decode=way_, tta=1), ["bench"]).scores.results[0] for way_ in ("dark", "window")
+        evaluation.run(load(model, decode=decode, tta=1), ["bench"]).scores.results[0] for decode in ("dark", "window")
     ]
-    best = min((figures(result) for result in results), key=lambda found: found["all"]["value"])
+    best_figures = min((figures(result) for result in results), key=lambda scores: scores["all"]["value"])
     return record(
         name,
         seed,
         people,
         begun=0,
         parameters=sum(value.numel() for value in load_checkpoint(model)[0].parameters()),
-        **taken,
-        figures=best,
+        **durations,
+        figures=best_figures,
     )
 
 

@@ -33,10 +33,10 @@ def about(make: Callable[[int], nn.Module], parameters: int, *, widths: range) -
         with torch.device("meta"):
             return abs(count(make(width)) / parameters - 1)
 
-    best = min(widths, key=off)
-    if off(best) > 0.1:
+    best_width = min(widths, key=off)
+    if off(best_width) > 0.1:
         raise ValueError(f"no width of {widths} comes within a tenth of {parameters:,} parameters")
-    return make(best)
+    return make(best_width)
 
 
 def count(network: nn.Module) -> int:
@@ -96,8 +96,8 @@ class Draft(nn.Module):
         self.pool = nn.ModuleList(nn.Linear(a, b) for a, b in zip(encoder, encoder[1:], strict=False))
         self.pool_norm = nn.ModuleList(nn.LayerNorm(c) for c in encoder[1:])
         self.decoder = nn.ModuleList(_stage(c, n) for c, n in zip(decoder, decoder_depths, strict=True))
-        wide = (*decoder, encoder[-1])
-        self.up = nn.ModuleList(_aligned(wide[s + 1], c) for s, c in enumerate(decoder))
+        widths = (*decoder, encoder[-1])
+        self.up = nn.ModuleList(_aligned(widths[s + 1], c) for s, c in enumerate(decoder))
         self.skip = nn.ModuleList(_aligned(encoder[s], c) for s, c in enumerate(decoder))
         self.anchors = nn.Parameter(torch.randn(JOINTS, decoder[-1]) * 0.02)
         self.anchor = nn.ModuleList(nn.Linear(decoder[min(s + 1, len(decoder) - 1)], c) for s, c in enumerate(decoder))
@@ -119,8 +119,8 @@ class Draft(nn.Module):
         features = np.concatenate(
             [tables.fine.position[rows], tables.offset[rows], tables.fine.log_count[rows][:, None]], 1
         )
-        ragged = (_ragged(level, above) for level, above in zip(levels, (*levels[1:], None), strict=True))
-        return DraftTables(features=torch.from_numpy(features), levels=tuple(ragged))
+        ragged_levels = (_ragged(level, coarser) for level, coarser in zip(levels, (*levels[1:], None), strict=True))
+        return DraftTables(features=torch.from_numpy(features), levels=tuple(ragged_levels))
 
     def forward(self, tables: DraftTables) -> Tensor:
         """Joints (B, J, 3) m."""
@@ -141,9 +141,9 @@ class Draft(nn.Module):
             for block in self.decoder[s]:
                 rows = block(rows, places[s], level, biases[s])
             # a person without voxels reads a row of zeros: all keys masked would be not a number
-            empty = ~level.valid
-            empty[:, 0] = False
-            anchors = self.exchange[s](self.anchor[s](anchors), _padded(rows, level), memory_key_padding_mask=empty)
+            is_empty = ~level.valid
+            is_empty[:, 0] = False
+            anchors = self.exchange[s](self.anchor[s](anchors), _padded(rows, level), memory_key_padding_mask=is_empty)
         return self.head(anchors)
 
 
@@ -184,25 +184,31 @@ def _bias(valid: Tensor, dtype: torch.dtype) -> Tensor | None:
 
 def _padded(rows: Tensor, level: DraftLevel) -> Tensor:
     """rows (M, C) -> (B, N, C), zero where there is no voxel."""
-    people, most = level.valid.shape
-    if rows.shape[0] == people * most:
-        return rows.unflatten(0, (people, most))
-    return rows.new_zeros(people * most, rows.shape[1]).index_copy(0, level.slot, rows).unflatten(0, (people, most))
+    people, max_voxels = level.valid.shape
+    if rows.shape[0] == people * max_voxels:
+        return rows.unflatten(0, (people, max_voxels))
+    return (
+        rows.new_zeros(people * max_voxels, rows.shape[1])
+        .index_copy(0, level.slot, rows)
+        .unflatten(0, (people, max_voxels))
+    )
 
 
-def _ragged(level: VoxelLevel, above: VoxelLevel | None) -> DraftLevel:
+def _ragged(level: VoxelLevel, coarser: VoxelLevel | None) -> DraftLevel:
     """A plan's padded level as ragged rows; `above`: the next coarser one."""
     children = parent = None
-    if above is not None:
-        lengths = above.valid.sum(1)
+    if coarser is not None:
+        lengths = coarser.valid.sum(1)
         start = np.cumsum(lengths) - lengths
         parent = (level.parent + start[:, None])[level.valid]
         # parents of a person's voxels go up and down: children are numbered in the parents' order
         order = np.argsort(parent, kind="stable")
-        number = np.bincount(parent, minlength=lengths.sum())
-        first = np.cumsum(number) - number
-        nth = np.arange(number.max(initial=1))
-        children = order[first[:, None] + np.where(nth < number[:, None], nth, 0)] if len(order) else order[:, None]
+        child_count = np.bincount(parent, minlength=lengths.sum())
+        first_child = np.cumsum(child_count) - child_count
+        nth = np.arange(child_count.max(initial=1))
+        children = (
+            order[first_child[:, None] + np.where(nth < child_count[:, None], nth, 0)] if len(order) else order[:, None]
+        )
     return DraftLevel(
         position=torch.from_numpy(level.position[level.valid]),
         slot=torch.from_numpy(np.flatnonzero(level.valid)),
@@ -261,8 +267,8 @@ class GroupedViT(nn.Module):
     def forward(self, groups: Groups) -> Tensor:
         """Joints (B, J, 3) m."""
         points = self.first(groups.relative)
-        whole = _largest(points, groups.valid, 2)
-        points = torch.cat([points, whole[:, :, None].expand_as(points)], -1)
+        group_maximum = _largest(points, groups.valid, 2)
+        points = torch.cat([points, group_maximum[:, :, None].expand_as(points)], -1)
         tokens = _largest(self.second(points), groups.valid, 2) + self.place(groups.center)
         bias = _bias(groups.center_valid, tokens.dtype)
         for block in self.blocks:
@@ -315,21 +321,21 @@ class PointNet2(nn.Module):
     @torch.no_grad()
     def prepare(self, clouds: list[np.ndarray]) -> tuple[Groups, ...]:
         points, valid = padded(clouds)
-        out = []
+        sets = []
         for centers, neighbors, radius in self.SETS:
-            out.append(grouped(points, valid, centers=centers, neighbors=neighbors, radius=radius))
-            points, valid = out[-1].center, out[-1].center_valid
-        return tuple(out)
+            sets.append(grouped(points, valid, centers=centers, neighbors=neighbors, radius=radius))
+            points, valid = sets[-1].center, sets[-1].center_valid
+        return tuple(sets)
 
     def forward(self, sets: tuple[Groups, ...]) -> Tensor:
         """Joints (B, J, 3) m."""
         rows = None
         for groups, perceptron, norm in zip(sets, self.sets, self.norms, strict=True):
-            read = groups.relative
+            features = groups.relative
             if rows is not None:
                 index = groups.index.flatten(1)[..., None].expand(-1, -1, rows.shape[-1])
-                read = torch.cat([read, rows.gather(1, index).unflatten(1, groups.index.shape[1:])], -1)
-            rows = norm(_largest(perceptron(read), groups.valid, 2))
+                features = torch.cat([features, rows.gather(1, index).unflatten(1, groups.index.shape[1:])], -1)
+            rows = norm(_largest(perceptron(features), groups.valid, 2))
         last = sets[-1]
         rows = self.whole(torch.cat([last.center, rows], -1))
         return self.head(_largest(rows, last.center_valid, 1)).unflatten(-1, (JOINTS, 3))
@@ -348,8 +354,11 @@ def _perceptron(*widths: int) -> nn.Sequential:
 
 def padded(clouds: list[np.ndarray]) -> tuple[Tensor, Tensor]:
     """Clouds (n, 3) m -> points (B, N, 3) float32, valid (B, N) bool."""
-    most = max((len(cloud) for cloud in clouds), default=0)
-    points, valid = np.zeros((len(clouds), max(most, 1), 3), np.float32), np.zeros((len(clouds), max(most, 1)), bool)
+    max_points = max((len(cloud) for cloud in clouds), default=0)
+    points, valid = (
+        np.zeros((len(clouds), max(max_points, 1), 3), np.float32),
+        np.zeros((len(clouds), max(max_points, 1)), bool),
+    )
     for k, cloud in enumerate(clouds):
         points[k, : len(cloud)], valid[k, : len(cloud)] = cloud, True
     return torch.from_numpy(points), torch.from_numpy(valid)
@@ -380,14 +389,14 @@ def grouped(points: Tensor, valid: Tensor, *, centers: int, neighbors: int, radi
     # differences, not products: what is far from the origin is not less exact
     distance = torch.cdist(center, points, compute_mode="donot_use_mm_for_euclid_dist")
     distance = distance.masked_fill(~valid[:, None], torch.inf)
-    near, which = distance.topk(min(neighbors, points.shape[1]), largest=False)
-    found = points.gather(1, which.flatten(1)[..., None].expand(-1, -1, 3)).unflatten(1, which.shape[1:])
+    distances, indices = distance.topk(min(neighbors, points.shape[1]), largest=False)
+    neighbor_points = points.gather(1, indices.flatten(1)[..., None].expand(-1, -1, 3)).unflatten(1, indices.shape[1:])
     return Groups(
         center=center,
         center_valid=fresh,
-        index=which,
-        relative=found - center[:, :, None],
-        valid=(near <= radius) & near.isfinite(),
+        index=indices,
+        relative=neighbor_points - center[:, :, None],
+        valid=(distances <= radius) & distances.isfinite(),
     )
 
 

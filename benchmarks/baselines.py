@@ -40,20 +40,22 @@ def main() -> None:
     for name in options.models:
         model = next((model for model, sizes in MODELS.items() if name in sizes), name)
         size = "" if model == name else name
-        named = {"dapt": "paper", "ours": "default"}.get(model, model)
-        wanted = recipe(Pretrain, named, model=model, size=size)
-        config = PRETRAINED[wanted.size][0]
+        recipe_name = {"dapt": "paper", "ours": "default"}.get(model, model)
+        settings = recipe(Pretrain, recipe_name, model=model, size=size)
+        config = PRETRAINED[settings.size][0]
         frames = getattr(config, "frames", 1)
         examples = people if frames == 1 else clips(source, options.people // frames)
         configs = [config, replace(config, grid=32)] if size == "" and model == "lpformer" else [config]
         for config in configs:
-            objective = objective_of(config, wanted)
+            objective = objective_of(config, settings)
             network = objective.network()
-            made, arrays = optimizers(network, wanted), objective.collate(examples)
+            network_optimizers, arrays = optimizers(network, settings), objective.collate(examples)
 
-            def step(objective=objective, network=network, made=made, arrays=arrays) -> None:
+            def step(
+                objective=objective, network=network, network_optimizers=network_optimizers, arrays=arrays
+            ) -> None:
                 total(objective.terms(network.train(), arrays)).backward()
-                for optimizer in made:
+                for optimizer in network_optimizers:
                     optimizer.step()
                     optimizer.zero_grad()
 
@@ -61,16 +63,16 @@ def main() -> None:
                 objective.joints(network.eval(), arrays)
 
             rates = [len(examples) * frames / _seconds(task) for task in (step, inference)]
-            name = f"{wanted.size}, {config.grid}^3" if model == "lpformer" else wanted.size
+            name = f"{settings.size}, {config.grid}^3" if model == "lpformer" else settings.size
             print(f"{name:20} training {rates[0]:8.2f} people/s, inference {rates[1]:8.2f}", flush=True)
 
 
 def clips(source: SyntheticSource, count: int) -> list[ClipExample]:
     """At least one synthesized clip."""
-    made = [source.clip(index, trans_center=False) for index in range(max(count, 1))]
-    points = [len(frame.points) for clip in made for frame in clip.frames]
-    print(f"{len(made)} clips, {np.mean(points):.0f} points a frame")
-    return made
+    examples = [source.clip(index, trans_center=False) for index in range(max(count, 1))]
+    points = [len(frame.points) for clip in examples for frame in clip.frames]
+    print(f"{len(examples)} clips, {np.mean(points):.0f} points a frame")
+    return examples
 
 
 def _seconds(task: Callable[[], None]) -> float:
@@ -78,9 +80,9 @@ def _seconds(task: Callable[[], None]) -> float:
     task()
     times = []
     for _ in range(ROUNDS):
-        started = time.process_time()
+        start = time.process_time()
         task()
-        times.append(time.process_time() - started)
+        times.append(time.process_time() - start)
     return min(times)
 
 

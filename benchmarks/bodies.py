@@ -36,9 +36,11 @@ def print_joints() -> None:
     mean = rig.rest(rig.coefficients[rig.age >= 18].mean(0, keepdims=True))
     vertices, joints, floor = mean.vertices[0], mean.joints[0], mean.vertices[0, :, 2].min()
     print(f"mean adult, {100 * np.ptp(vertices[:, 2]):.1f} cm\njoint             height   left  ahead   skin")
-    for name, at in zip(BODY26.joints, joints, strict=True):
-        skin = np.linalg.norm(vertices - at, axis=1).min()
-        print(f"{name:15s} {100 * (at[2] - floor):8.1f} {100 * at[1]:6.1f} {100 * at[0]:6.1f} {100 * skin:6.1f}")
+    for name, joint in zip(BODY26.joints, joints, strict=True):
+        skin = np.linalg.norm(vertices - joint, axis=1).min()
+        print(
+            f"{name:15s} {100 * (joint[2] - floor):8.1f} {100 * joint[1]:6.1f} {100 * joint[0]:6.1f} {100 * skin:6.1f}"
+        )
 
 
 def print_people(count: int) -> None:
@@ -46,12 +48,12 @@ def print_people(count: int) -> None:
     groups = {sex: (people.sex == sex) & (people.age >= 18) for sex in ("male", "female")}
     groups["child"] = people.age < 18
     print(f"\n{count} people\ngroup    share   stature m        BMI 5/50/95        age 5/50/95, oldest")
-    for name, here in groups.items():
-        bmi, age = (np.percentile(value[here], (5, 50, 95)) for value in (people.bmi, people.age))
+    for name, mask in groups.items():
+        bmi, age = (np.percentile(value[mask], (5, 50, 95)) for value in (people.bmi, people.age))
         print(
-            f"{name:8s} {here.mean():5.2f}   {people.height[here].mean():.3f} +- {people.height[here].std():.3f}"
+            f"{name:8s} {mask.mean():5.2f}   {people.height[mask].mean():.3f} +- {people.height[mask].std():.3f}"
             f"   {bmi[0]:.1f} {bmi[1]:.1f} {bmi[2]:.1f}   {age[0]:.0f} {age[1]:.0f} {age[2]:.0f}, "
-            f"{people.age[here].max():.0f}"
+            f"{people.age[mask].max():.0f}"
         )
 
 
@@ -78,31 +80,31 @@ def print_costs(bodies: Bodies) -> None:
     print(f"shapes          {best(lambda: sample_people(rng, BLOCK)) / BLOCK * 1e6:6.1f}")
     print(f"clothing        {best(lambda: clothing(rng, BLOCK)) / BLOCK * 1e6:6.1f}")
     print(f"props and place {best(props) / count * 1e6:6.1f}")
-    worn = clothing(rng, 400)
+    thickness = clothing(rng, 400)
     torso = rig.dense_weight[:, [BODY26.index(n) for n in ("pelvis", "spine1", "spine2", "spine3")]].sum(1) > 0.9
-    low, middle, high = 100 * np.percentile(worn[:, torso].mean(1), (5, 50, 95))
+    low, middle, high = 100 * np.percentile(thickness[:, torso].mean(1), (5, 50, 95))
     print(f"clothes on the torso, mean of a person, 5/50/95: {low:.1f} {middle:.1f} {high:.1f} cm")
 
 
 def drawn(bodies: Bodies, rounds: int) -> dict[str, list[tuple[list[Prop], int]]]:
     """name of a prop -> everything its person has, and the person's row."""
     rng = np.random.default_rng(0)
-    found: dict[str, list[tuple[list[Prop], int]]] = {}
+    entries_by_name: dict[str, list[tuple[list[Prop], int]]] = {}
     for _ in range(rounds):
         for row, kind in enumerate(bodies.kinds):
             props = draw_props(rng, kind=kind, joints=bodies.joints[row])
             for prop in props:
-                found.setdefault(prop.name, []).append((props, row))
-    return found
+                entries_by_name.setdefault(prop.name, []).append((props, row))
+    return entries_by_name
 
 
 def print_things(bodies: Bodies) -> None:
     rounds = 5
-    found = drawn(bodies, rounds)
-    counts = Counter({name: len(rows) for name, rows in found.items()})
+    entries_by_name = drawn(bodies, rounds)
+    counts = Counter({name: len(rows) for name, rows in entries_by_name.items()})
     print("\nthings, share of people, and faces")
     for name, count in counts.most_common():
-        faces = [len(p.mesh.faces) for props, _ in found[name] for p in props if p.name == name]
+        faces = [len(p.mesh.faces) for props, _ in entries_by_name[name] for p in props if p.name == name]
         print(f"{name:14s} {count / rounds / len(bodies.kinds):6.3f}   {min(faces)}-{max(faces)}")
 
 
@@ -112,14 +114,14 @@ def draw_sheet(bodies: Bodies, path: Path) -> None:
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-    found = drawn(bodies, 8)
+    entries_by_name = drawn(bodies, 8)
     rows = -(-len(ON_SHEET) // PER_ROW)
     figure = Figure(figsize=(2.0 * PER_ROW, 2.2 * rows), dpi=64)
-    canvas, used = FigureCanvasAgg(figure), Counter()
+    canvas, use_counts = FigureCanvasAgg(figure), Counter()
     for place, name in enumerate(ON_SHEET):
-        alone = [entry for entry in found[name] if len(entry[0]) == 1] or found[name]
-        props, row = alone[(3 * used[name]) % len(alone)]
-        used[name] += 1
+        entries = [entry for entry in entries_by_name[name] if len(entry[0]) == 1] or entries_by_name[name]
+        props, row = entries[(3 * use_counts[name]) % len(entries)]
+        use_counts[name] += 1
         meshes = [(bodies.vertices[row], bodies.faces, SKIN)]
         for prop in props:
             mesh = prop.place(bodies.joints[row])

@@ -47,36 +47,38 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures")
     options = parser.parse_args()
     bank = PoseBank.from_clips(options.motion, tuple(options.subjects.split(",")))
-    found = heldout.people(bank, options.people, 50, heldout.SEED + 9)
+    persons = heldout.people(bank, options.people, 50, heldout.SEED + 9)
     model = load(options.weights, tta=1)
-    predicted = model.predict([p.sample.points for p in found], sensor_origin=(0, 0, 0), skeleton="body26")
-    true = np.stack([p.sample.pose.to(BODY26).joints for p in found])
-    error = np.linalg.norm(np.stack([p.joints for p in predicted]) - true, axis=-1)
-    body = [p.sample.points[p.sample.part > 0].astype(float) for p in found]
-    visible = np.stack([seen(joints, points) for joints, points in zip(true, body, strict=True)])
-    confidence = np.stack([p.confidence for p in predicted])
-    spread = np.stack([p.spread for p in predicted])
-    told = np.stack([p.pose.visible for p in predicted])
-    hit = error < CONFIDENCE_RADIUS
+    predictions = model.predict([p.sample.points for p in persons], sensor_origin=(0, 0, 0), skeleton="body26")
+    true = np.stack([p.sample.pose.to(BODY26).joints for p in persons])
+    error = np.linalg.norm(np.stack([p.joints for p in predictions]) - true, axis=-1)
+    body_points = [p.sample.points[p.sample.part > 0].astype(float) for p in persons]
+    visible = np.stack([seen(joints, points) for joints, points in zip(true, body_points, strict=True)])
+    confidence = np.stack([p.confidence for p in predictions])
+    spread = np.stack([p.spread for p in predictions])
+    predicted_visible = np.stack([p.pose.visible for p in predictions])
+    is_hit = error < CONFIDENCE_RADIUS
     curves = {
-        "confidence: the joint is within 10 cm": (confidence.ravel(), hit.ravel()),
-        "visible: a point of the body lies within 18 cm of the joint": (told.ravel(), visible.ravel()),
+        "confidence: the joint is within 10 cm": (confidence.ravel(), is_hit.ravel()),
+        "visible: a point of the body lies within 18 cm of the joint": (predicted_visible.ravel(), visible.ravel()),
     }
-    found = {"weights": options.weights, "people": len(true), "stated": [], "spread": []}
-    for name, (stated, truth) in curves.items():
-        one = {"what": name, "ece": calibration_error(stated, truth), "auroc": auroc(stated, truth)}
-        found["stated"].append(one)
-        print(f"{name}: ECE {one['ece']:.3f}, AUROC {one['auroc']:.3f}")
-    found["rank"] = float(_rank(spread, error))
-    print(f"spread and error: rank correlation {found['rank']:.2f}")
+    report = {"weights": options.weights, "people": len(true), "stated": [], "spread": []}
+    for name, (probability, truth) in curves.items():
+        entry = {"what": name, "ece": calibration_error(probability, truth), "auroc": auroc(probability, truth)}
+        report["stated"].append(entry)
+        print(f"{name}: ECE {entry['ece']:.3f}, AUROC {entry['auroc']:.3f}")
+    report["rank"] = float(_rank(spread, error))
+    print(f"spread and error: rank correlation {report['rank']:.2f}")
     for name, low, high in SPREADS:
-        there = (spread >= low) & (spread < high)
-        one = {"of": name, "share": 100 * there.mean()}
-        one |= {"stated": spread[there].mean() * 1e3, "true": error[there].mean() * 1e3}
-        found["spread"].append({key: value if key == "of" else float(value) for key, value in one.items()})
-        print(f"  {name}: {one['share']:.1f} % of joints, {one['stated']:.1f} mm stated, {one['true']:.1f} mm true")
+        is_in_bin = (spread >= low) & (spread < high)
+        entry = {"of": name, "share": 100 * is_in_bin.mean()}
+        entry |= {"stated": spread[is_in_bin].mean() * 1e3, "true": error[is_in_bin].mean() * 1e3}
+        report["spread"].append({key: value if key == "of" else float(value) for key, value in entry.items()})
+        print(
+            f"  {name}: {entry['share']:.1f} % of joints, {entry['stated']:.1f} mm stated, {entry['true']:.1f} mm true"
+        )
     if options.json:
-        write_atomic(options.json, json.dumps(found, indent=1) + "\n")
+        write_atomic(options.json, json.dumps(report, indent=1) + "\n")
     if options.out:
         _plot(curves, options.out)
 
@@ -90,12 +92,12 @@ def _rank(a: np.ndarray, b: np.ndarray) -> float:
 def _plot(curves: dict, path: str) -> None:
     figure = Figure(figsize=(7.6, 3.6), dpi=80, layout="constrained")
     canvas = FigureCanvasAgg(figure)
-    for axes, (name, (stated, truth)) in zip(figure.subplots(1, 2), curves.items(), strict=True):
-        index = np.minimum((stated * BINS).astype(int), BINS - 1)
+    for axes, (name, (probability, truth)) in zip(figure.subplots(1, 2), curves.items(), strict=True):
+        index = np.minimum((probability * BINS).astype(int), BINS - 1)
         count = np.bincount(index, minlength=BINS)
-        some = count > 0
-        mean = np.bincount(index, stated, BINS)[some] / count[some]
-        share = np.bincount(index, truth, BINS)[some] / count[some]
+        is_filled = count > 0
+        mean = np.bincount(index, probability, BINS)[is_filled] / count[is_filled]
+        share = np.bincount(index, truth, BINS)[is_filled] / count[is_filled]
         axes.bar((np.arange(BINS) + 0.5) / BINS, count / count.sum(), 0.09, color="#d8dee6", label="share of joints")
         axes.plot([0, 1], [0, 1], color="#888888", linewidth=0.8)
         axes.plot(mean, share, "o-", color="#1f5f99", markersize=4, label="true share")

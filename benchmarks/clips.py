@@ -43,18 +43,18 @@ _PICKED = BODY26.map_to(HUMAN15)
 
 def make_clips(motion: list[str], count: int, seed: int, weights: str, looks: int) -> dict[str, np.ndarray]:
     """Truth (C, T, 26, 3) m and what the network says frame by frame, NaN where the person was not seen."""
-    scenes = []
+    generators = []
     for spec in motion or [_PRIOR]:
         path, _, subjects = spec.partition(":")
         if spec == _PRIOR:
-            scenes.append(Generator(scene="wild", measure=False))
+            generators.append(Generator(scene="wild", measure=False))
         else:
             bank = PoseBank.from_clips(path, tuple(subjects.split(",")) if subjects else None)
-            scenes.append(Generator(scene="wild", bank=bank, captured=1.0, measure=False))
+            generators.append(Generator(scene="wild", bank=bank, captured=1.0, measure=False))
     # clips are small batches, which further threads only delay
     model, clips = load(weights, tta=looks, threads=1), []
     for index in range(count):
-        people = scenes[index % len(scenes)].clip(seed, index)
+        people = generators[index % len(generators)].clip(seed, index)
         clouds = [np.asarray(person.sample.points, float) for person in people]
         poses = [person.pose for person in model.predict(clouds, sensor_origin=(0, 0, 0), skeleton="body26")]
         track = TrackPoses.of_poses(np.arange(len(poses)), poses, BODY26)
@@ -68,18 +68,18 @@ def make_clips(motion: list[str], count: int, seed: int, weights: str, looks: in
 def nearest_seen(joints: np.ndarray) -> np.ndarray:
     """Frames (T, J, 3) without joints repeat the nearest that has some."""
     frames = np.arange(len(joints))
-    seen = np.flatnonzero(np.isfinite(joints).all((1, 2)))
-    return joints[seen[np.abs(frames[:, None] - seen).argmin(1)]]
+    seen_frames = np.flatnonzero(np.isfinite(joints).all((1, 2)))
+    return joints[seen_frames[np.abs(frames[:, None] - seen_frames).argmin(1)]]
 
 
 def plain_solve(track: TrackPoses) -> np.ndarray:
     """(T, J, 3) m."""
     frames = len(track)
-    bends = np.diff(np.eye(frames), 2, axis=0)
+    second_differences = np.diff(np.eye(frames), 2, axis=0)
     weight = np.where(track.seen[:, None], track.spread**-2, 0.0)
-    seen = np.where(track.seen[:, None, None], track.joints, 0.0)
-    system = STIFFNESS * bends.T @ bends + np.eye(frames) * weight.T[:, :, None]
-    return np.linalg.solve(system, (weight[..., None] * seen).swapaxes(0, 1)).swapaxes(0, 1)
+    known_joints = np.where(track.seen[:, None, None], track.joints, 0.0)
+    system = STIFFNESS * second_differences.T @ second_differences + np.eye(frames) * weight.T[:, :, None]
+    return np.linalg.solve(system, (weight[..., None] * known_joints).swapaxes(0, 1)).swapaxes(0, 1)
 
 
 def live_joints(track: TrackPoses) -> np.ndarray:
@@ -97,8 +97,10 @@ WAYS = {
 
 def across(joints: np.ndarray) -> np.ndarray:
     """(..., 3): from right to left."""
-    at = BODY26.index
-    return sum(joints[..., at(f"left_{name}"), :] - joints[..., at(f"right_{name}"), :] for name in ("hip", "shoulder"))
+    index = BODY26.index
+    return sum(
+        joints[..., index(f"left_{name}"), :] - joints[..., index(f"right_{name}"), :] for name in ("hip", "shoulder")
+    )
 
 
 def figures(joints: np.ndarray, base: np.ndarray, true: np.ndarray) -> dict:
@@ -113,22 +115,22 @@ def figures(joints: np.ndarray, base: np.ndarray, true: np.ndarray) -> dict:
     bones = rigid_bones(HUMAN15)
     ends = joints[:, :, _PICKED][:, :, bones]
     lengths = 1e3 * np.linalg.norm(ends[..., 0, :] - ends[..., 1, :], axis=-1)
-    turned, turned_before = ((across(a) * across(true)).sum(-1) < 0 for a in (joints, base))
-    mostly_right = turned_before.mean(1) < 0.5
+    is_turned, was_turned = ((across(a) * across(true)).sum(-1) < 0 for a in (joints, base))
+    is_mostly_right = was_turned.mean(1) < 0.5
     values = {}
-    for name, own, before in zip(("mpjpe", "acceleration"), errors(joints), errors(base), strict=True):
-        mean = interval(own, rng)
-        values[name] = {"value": float(own.mean()), "low": mean.low, "high": mean.high}
+    for name, own_errors, base_errors in zip(("mpjpe", "acceleration"), errors(joints), errors(base), strict=True):
+        mean = interval(own_errors, rng)
+        values[name] = {"value": float(own_errors.mean()), "low": mean.low, "high": mean.high}
         draws = np.concatenate([np.arange(count)[None], rng.integers(count, size=(2000, count))])
-        less = 100 * (1 - own.mean(1)[draws].mean(1) / before.mean(1)[draws].mean(1))
-        values[f"{name}_less"] = [float(less[0]), *np.percentile(less[1:], [2.5, 97.5]).tolist()]
+        reduction = 100 * (1 - own_errors.mean(1)[draws].mean(1) / base_errors.mean(1)[draws].mean(1))
+        values[f"{name}_less"] = [float(reduction[0]), *np.percentile(reduction[1:], [2.5, 97.5]).tolist()]
     return values | {
         "pa_mpjpe": float(aligned_errors(joints[:, :, _PICKED], true[:, :, _PICKED]).mean()),
         "p95": float(np.percentile(errors(joints)[0], 95)),
-        "turned_percent": float(100 * turned.mean()),
-        "clips_mostly_right": int(mostly_right.sum()),
-        "turned_clips_of_these": int(turned[mostly_right].any(1).sum()),
-        "turned_frames_of_these": int(turned[mostly_right].sum()),
+        "turned_percent": float(100 * is_turned.mean()),
+        "clips_mostly_right": int(is_mostly_right.sum()),
+        "turned_clips_of_these": int(is_turned[is_mostly_right].any(1).sum()),
+        "turned_frames_of_these": int(is_turned[is_mostly_right].sum()),
         "bone_deviation": float(lengths.std(1).mean()),
     }
 
@@ -143,20 +145,20 @@ def run(clips: dict[str, np.ndarray]) -> dict:
         )
         for i in range(len(clips["true"]))
     ]
-    seen = np.array([track.seen.any() for track in tracks])
-    tracks, true = [track for track in tracks if track.seen.any()], clips["true"][seen]
-    report, base = {"clips": len(tracks), "unseen_clips": int((~seen).sum()), "ways": {}}, None
-    for name, way in WAYS.items():
-        started = time.perf_counter()
-        found = [way(track) for track in tracks]
-        spent = time.perf_counter() - started
-        joints = np.stack([nearest_seen(each) for each in found])
+    is_seen = np.array([track.seen.any() for track in tracks])
+    tracks, true = [track for track in tracks if track.seen.any()], clips["true"][is_seen]
+    report, base = {"clips": len(tracks), "unseen_clips": int((~is_seen).sum()), "ways": {}}, None
+    for name, solve in WAYS.items():
+        start = time.perf_counter()
+        way_joints = [solve(track) for track in tracks]
+        seconds = time.perf_counter() - start
+        joints = np.stack([nearest_seen(track_joints) for track_joints in way_joints])
         base = joints if base is None else base
-        report["ways"][name] = figures(joints, base, true) | {"ms_a_frame": 1e3 * spent / true[..., 0, 0].size}
-    steady = [smooth(track) for track in tracks]
-    ok = np.stack([track.seen for track in steady])
-    spread = np.stack([track.spread for track in steady])[ok]
-    error = np.linalg.norm(np.stack([track.joints for track in steady])[ok] - true[ok], axis=-1)
+        report["ways"][name] = figures(joints, base, true) | {"ms_a_frame": 1e3 * seconds / true[..., 0, 0].size}
+    steady_tracks = [smooth(track) for track in tracks]
+    is_known = np.stack([track.seen for track in steady_tracks])
+    spread = np.stack([track.spread for track in steady_tracks])[is_known]
+    error = np.linalg.norm(np.stack([track.joints for track in steady_tracks])[is_known] - true[is_known], axis=-1)
     report["spread_over_error"] = float(spread.mean() / error.mean())
     tenths = np.array_split(np.argsort(spread.ravel()), 10)
     report["spread_tenths_mm"] = [[1e3 * float(v.ravel()[i].mean()) for v in (spread, error)] for i in tenths]
@@ -167,7 +169,7 @@ def hidden(clips: dict[str, np.ndarray], gap: int) -> list[list[float]]:
     """Of frames hidden in the middle of clips, by frames to the nearest one that is seen: mean spread and error, mm."""
     count, frames = clips["true"].shape[:2]
     rows = np.arange((frames - gap) // 2, (frames - gap) // 2 + gap)
-    to_seen = np.minimum(rows - rows[0], rows[-1] - rows)
+    frames_to_seen = np.minimum(rows - rows[0], rows[-1] - rows)
     means = []
     for i in range(count):
         values = {name: clips[name][i].copy() for name in _VALUES}
@@ -177,7 +179,7 @@ def hidden(clips: dict[str, np.ndarray], gap: int) -> list[list[float]]:
         if track.filled[rows].all():
             means.append(1e3 * np.stack([track.spread[rows], error[rows]]))
     means = np.stack(means)
-    return [means[:, :, to_seen == k].mean((0, 2, 3)).tolist() for k in range(to_seen.max() + 1)]
+    return [means[:, :, frames_to_seen == k].mean((0, 2, 3)).tolist() for k in range(frames_to_seen.max() + 1)]
 
 
 def main() -> None:
@@ -193,21 +195,23 @@ def main() -> None:
     options = parser.parse_args()
 
     if options.store and Path(options.store).exists():
-        with np.load(options.store) as stored:
-            clips = dict(stored)
+        with np.load(options.store) as archive:
+            clips = dict(archive)
     else:
         clips = make_clips(options.motion, options.clips, options.seed, options.weights, options.looks)
         if options.store:
             np.savez_compressed(options.store, **clips)
     report = run(clips)
-    for name, way in report["ways"].items():
-        mpjpe, bent = way["mpjpe_less"], way["acceleration_less"]
+    for name, row in report["ways"].items():
+        mpjpe_less, acceleration_less = row["mpjpe_less"], row["acceleration_less"]
         print(
-            f"{name:15s} MPJPE {way['mpjpe']['value']:5.1f} mm, less {mpjpe[0]:4.1f} % [{mpjpe[1]:.1f}, {mpjpe[2]:.1f}]"
-            f"  acceleration {way['acceleration']['value']:5.1f}, less {bent[0]:4.1f} % [{bent[1]:.1f}, {bent[2]:.1f}]"
-            f"  PA {way['pa_mpjpe']:4.1f}  p95 {way['p95']:5.1f}  turned {way['turned_percent']:.2f} %"
-            f" ({way['turned_clips_of_these']} of {way['clips_mostly_right']} clips)"
-            f"  bones {way['bone_deviation']:4.1f} mm  {way['ms_a_frame']:.2f} ms"
+            f"{name:15s} MPJPE {row['mpjpe']['value']:5.1f} mm, less {mpjpe_less[0]:4.1f} % "
+            f"[{mpjpe_less[1]:.1f}, {mpjpe_less[2]:.1f}]"
+            f"  acceleration {row['acceleration']['value']:5.1f}, less {acceleration_less[0]:4.1f} % "
+            f"[{acceleration_less[1]:.1f}, {acceleration_less[2]:.1f}]"
+            f"  PA {row['pa_mpjpe']:4.1f}  p95 {row['p95']:5.1f}  turned {row['turned_percent']:.2f} %"
+            f" ({row['turned_clips_of_these']} of {row['clips_mostly_right']} clips)"
+            f"  bones {row['bone_deviation']:4.1f} mm  {row['ms_a_frame']:.2f} ms"
         )
     print(f"spread / error {report['spread_over_error']:.2f}")
     for gap in options.hide:

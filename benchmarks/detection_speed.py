@@ -95,17 +95,17 @@ def measure(sources: dict[str, Path], file: Path, rounds: int) -> dict[str, dict
     for process in workers.values():
         process.stdin.close()
         process.wait()
-    return {step: {name: values[1:] for name, values in own.items()} for step, own in times.items()}
+    return {step: {name: values[1:] for name, values in source_times.items()} for step, source_times in times.items()}
 
 
 def report(title: str, times: dict[str, dict[str, list[float]]]) -> None:
     names = list(times[STEPS[0]])
     print(f"\n{title}\n\n| step | {' | '.join(names)} |{' ratio |' * (len(names) > 1)}")
     print("|---" * (len(names) + 1 + (len(names) > 1)) + "|")
-    for step, own in times.items():
-        cells = [f"{min(values):.0f} ({statistics.median(values):.0f})" for values in own.values()]
+    for step, source_times in times.items():
+        cells = [f"{min(values):.0f} ({statistics.median(values):.0f})" for values in source_times.values()]
         if len(names) > 1:
-            cells.append(f"{min(own[names[0]]) / min(own[names[1]]):.2f}")
+            cells.append(f"{min(source_times[names[0]]) / min(source_times[names[1]]):.2f}")
         print(f"| {step} | {' | '.join(cells)} |")
 
 

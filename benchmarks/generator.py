@@ -37,20 +37,24 @@ def rate(scene, people, processes):
     """People a second of all processes together, mean points a person, the largest process in MiB."""
     context = multiprocessing.get_context("spawn")
     ready, go, out = context.Semaphore(0), context.Event(), context.Queue()
-    started = [
+    workers = [
         context.Process(target=work, args=(scene, BLOCK + k * people, people, ready, go, out)) for k in range(processes)
     ]
-    for process in started:
+    for process in workers:
         process.start()
-    for _ in started:
+    for _ in workers:
         ready.acquire()
     go.set()
-    done = [out.get() for _ in started]
-    for process in started:
+    results = [out.get() for _ in workers]
+    for process in workers:
         process.join()
     # the clock is the machine's, the same for all processes
-    seconds = max(d[1] for d in done) - min(d[0] for d in done)
-    return processes * people / seconds, sum(d[2] for d in done) / (processes * people), max(d[3] for d in done)
+    seconds = max(result[1] for result in results) - min(result[0] for result in results)
+    return (
+        processes * people / seconds,
+        sum(result[2] for result in results) / (processes * people),
+        max(result[3] for result in results),
+    )
 
 
 def main():
@@ -63,9 +67,9 @@ def main():
     for _ in range(arguments.rounds):
         for scene in arguments.scenes:
             for processes in (1, 2):
-                found = rate(scene, arguments.people, processes)
-                if found[0] > best.get((scene, processes), (0,))[0]:
-                    best[scene, processes] = found
+                result = rate(scene, arguments.people, processes)
+                if result[0] > best.get((scene, processes), (0,))[0]:
+                    best[scene, processes] = result
     print(f"{'scene':10s}{'one core':>12s}{'ms':>8s}{'two cores':>12s}{'x one':>8s}{'points':>9s}{'MiB':>7s}")
     for scene in arguments.scenes:
         (one, points, memory), (two, _, _) = best[scene, 1], best[scene, 2]

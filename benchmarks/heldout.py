@@ -31,21 +31,21 @@ PAIRED = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
 def people(bank: PoseBank, count: int, least: int, seed: int) -> list[SyntheticPerson]:
     """The first `count` people of the seed with at least `least` points."""
     generator = Generator(scene=scene_config("wild"), bank=bank, captured=1.0)
-    found: list[SyntheticPerson] = []
+    persons: list[SyntheticPerson] = []
     index = 0
-    while len(found) < count:
+    while len(persons) < count:
         person = generator.person(seed, index)
         index += 1
         if len(person.sample.points) >= least:
-            found.append(person)
-    return found
+            persons.append(person)
+    return persons
 
 
 def facing(joints: np.ndarray) -> np.ndarray:
     """joints (n, 15, 3) -> (n,) rad: where the hips and shoulders face."""
-    at = HUMAN15.index
-    left = joints[:, at("left_hip")] - joints[:, at("right_hip")]
-    left = left + joints[:, at("left_shoulder")] - joints[:, at("right_shoulder")]
+    index = HUMAN15.index
+    left = joints[:, index("left_hip")] - joints[:, index("right_hip")]
+    left = left + joints[:, index("left_shoulder")] - joints[:, index("right_shoulder")]
     return np.arctan2(-left[:, 0], left[:, 1])
 
 
@@ -62,7 +62,7 @@ def score(predicted, found: list[SyntheticPerson]) -> dict:
     error = np.linalg.norm(pred - true, axis=-1)
     confidence = np.stack([p.pose.to(HUMAN15).confidence for p in predicted])
     spread = np.stack([p.pose.to(HUMAN15).spread for p in predicted])
-    where = {
+    masks = {
         "all": np.ones(len(found), bool),
         "upright, whole, uncluttered": plain,
         "under half visible": visible < 0.5,
@@ -71,7 +71,7 @@ def score(predicted, found: list[SyntheticPerson]) -> dict:
         "100-400 points": (count >= 100) & (count < 400),
         "400 points and more": count >= 400,
     }
-    where |= {name: np.array([f.sensor == name for f in facts]) for name in sorted({f.sensor for f in facts})}
+    masks |= {name: np.array([f.sensor == name for f in facts]) for name in sorted({f.sensor for f in facts})}
     groups = {
         name: {
             "people": int(mask.sum()),
@@ -79,7 +79,7 @@ def score(predicted, found: list[SyntheticPerson]) -> dict:
             "pa_mpjpe": round(pa_mpjpe(pred[mask], true[mask]), 1),
             "facing_45": round(float((turn[mask] < np.pi / 4).mean()), 3),
         }
-        for name, mask in where.items()
+        for name, mask in masks.items()
         if mask.any()
     }
     joints = {"head": ("head",), "neck": ("neck",), "pelvis": ("pelvis",)}
@@ -98,9 +98,9 @@ def score(predicted, found: list[SyntheticPerson]) -> dict:
     }
 
 
-def _whole(predicted, found: list[SyntheticPerson], skeleton) -> float:
-    pred = np.stack([p.pose.to(skeleton).joints for p in predicted])
-    return mpjpe(pred, np.stack([p.sample.pose.to(skeleton).joints for p in found]))
+def _whole(predictions, persons: list[SyntheticPerson], skeleton) -> float:
+    pred = np.stack([p.pose.to(skeleton).joints for p in predictions])
+    return mpjpe(pred, np.stack([p.sample.pose.to(skeleton).joints for p in persons]))
 
 
 def main() -> None:
@@ -115,16 +115,16 @@ def main() -> None:
     options = parser.parse_args()
 
     bank = PoseBank.from_clips(options.motion, tuple(options.subjects.split(",")))
-    found = people(bank, options.people, options.least, options.seed)
+    persons = people(bank, options.people, options.least, options.seed)
     model = load(options.weights, tta=1)
-    clouds = [p.sample.points for p in found]
+    clouds = [p.sample.points for p in persons]
     results = {}
     for name, origin in (("sensor known", (0.0, 0.0, 0.0)), ("sensor unknown", None)):
-        started = time.perf_counter()
-        predicted = model.predict(clouds, sensor_origin=origin, skeleton="body26")
-        results[name] = score(predicted, found)
-        results[name]["ms_a_person"] = round((time.perf_counter() - started) * 1e3 / len(found), 2)
-    results["mean pose, true facing"] = {"mpjpe": round(_floor(found), 1)}
+        start = time.perf_counter()
+        predictions = model.predict(clouds, sensor_origin=origin, skeleton="body26")
+        results[name] = score(predictions, persons)
+        results[name]["ms_a_person"] = round((time.perf_counter() - start) * 1e3 / len(persons), 2)
+    results["mean pose, true facing"] = {"mpjpe": round(_floor(persons), 1)}
     for name, result in results.items():
         print(f"--- {name}")
         for group, figures in result.get("groups", {}).items():
@@ -133,16 +133,16 @@ def main() -> None:
     if options.json:
         with open(options.json, "w") as file:
             json.dump(
-                {"people": len(found), "seed": options.seed, "subjects": options.subjects} | results, file, indent=1
+                {"people": len(persons), "seed": options.seed, "subjects": options.subjects} | results, file, indent=1
             )
 
 
-def _floor(found: list[SyntheticPerson]) -> float:
+def _floor(persons: list[SyntheticPerson]) -> float:
     """MPJPE of the mean pose, turned to where each person truly faces, about the center of their points."""
-    true = np.stack([p.sample.pose.to(HUMAN15).joints - p.sample.center for p in found])
+    true = np.stack([p.sample.pose.to(HUMAN15).joints - p.sample.center for p in persons])
     R_world_person = rotation_about("z", facing(true))
-    own = true @ R_world_person
-    return mpjpe(own.mean(0) @ np.swapaxes(R_world_person, -1, -2), true)
+    local_joints = true @ R_world_person
+    return mpjpe(local_joints.mean(0) @ np.swapaxes(R_world_person, -1, -2), true)
 
 
 if __name__ == "__main__":

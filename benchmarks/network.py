@@ -77,13 +77,13 @@ class Job:
 
 def forward_job(section: str, one: Runner, points: int | str, calls: list[list[Example]]) -> Job:
     def run() -> float:
-        alone = 0.0
+        network_seconds = 0.0
         for people in calls:
             tables = one.tables(people)
-            started = time.perf_counter()
+            start = time.perf_counter()
             one.joints(tables)
-            alone += time.perf_counter() - started
-        return alone
+            network_seconds += time.perf_counter() - start
+        return network_seconds
 
     return Job(Key(section, one.name, points, sum(map(len, calls))), one, run)
 
@@ -92,48 +92,48 @@ def training_job(section: str, one: Runner, points: int | str, calls: list[list[
     lessons = [one.lesson(people) for people in calls]
 
     def run() -> float:
-        started = time.perf_counter()
+        start = time.perf_counter()
         for lesson in lessons:
             one.step(lesson)
-        return time.perf_counter() - started
+        return time.perf_counter() - start
 
     return Job(Key(section, one.name, points, sum(map(len, calls))), one, run)
 
 
 def measure(jobs: list[Job], rounds: int, left_out: list[str]) -> Times:
     """Seconds of each job's calls, whole and of the network alone, all jobs in turn each round."""
-    repeat, slow, times = {}, set(), defaultdict(list)
+    repeats, slow_keys, times = {}, set(), defaultdict(list)
     for number, job in enumerate(jobs):
         say(f"warming up {job.key.section} {number + 1}/{len(jobs)}: {job.key.network}, {job.key.points}")
         try:
             # the first call allocates, the second shows how long one takes
             first = _turn(job, 1)[0][0]
-            taken = first if first > 1 else _turn(job, 1)[0][0]
-            repeat[job.key] = min(max(math.ceil(TURN / taken), 1), MOST_TIMES)
-            if taken > SLOW:
-                slow.add(job.key)
+            seconds = first if first > 1 else _turn(job, 1)[0][0]
+            repeats[job.key] = min(max(math.ceil(TURN / seconds), 1), MOST_TIMES)
+            if seconds > SLOW:
+                slow_keys.add(job.key)
         except Exception as error:
             left_out.append(f"{job.key.section} of {job.key.network} at {job.key.points}: {reason(error)}")
     for number in range(rounds):
         say(f"{jobs[0].key.section if jobs else 'nothing'}: round {number + 1} of {rounds}")
         for job in jobs:
-            if job.key in repeat and not (job.key in slow and number % 2):
+            if job.key in repeats and not (job.key in slow_keys and number % 2):
                 # of several calls the first finds the caches as another network left them
-                several = repeat[job.key] > 1
-                times[job.key] += _turn(job, repeat[job.key] + several)[several:]
+                num_extra = repeats[job.key] > 1
+                times[job.key] += _turn(job, repeats[job.key] + num_extra)[num_extra:]
     return dict(times)
 
 
 def _turn(job: Job, calls: int) -> list[tuple[float, float]]:
     job.runner.train(job.key.section.endswith("training"))
-    out = []
+    times = []
     for _ in range(calls):
-        started = time.perf_counter()
-        alone = job.run()
-        out.append((time.perf_counter() - started, alone))
+        start = time.perf_counter()
+        network_seconds = job.run()
+        times.append((time.perf_counter() - start, network_seconds))
     job.runner.rest()
     time.sleep(REST)
-    return out
+    return times
 
 
 def measured(made: list[Runner], options: argparse.Namespace, left_out: list[str]) -> Times:
@@ -141,40 +141,44 @@ def measured(made: list[Runner], options: argparse.Namespace, left_out: list[str
     if not made:
         return {}
     rng = np.random.default_rng(0)
-    most = max(one.batch for one in made)
+    max_batch = max(timed_runner.batch for timed_runner in made)
     number = 2 if options.quick else BATCHES
     say("making people")
     with threadpool_limits(limits=1, user_api="blas"):
-        pool = crops(most * number, rng)
-    clouds = {n: of_points(pool, n, most, rng) for n in sorted({*options.points, *options.scaling_points})}
+        pool = crops(max_batch * number, rng)
+    clouds = {n: of_points(pool, n, max_batch, rng) for n in sorted({*options.points, *options.scaling_points})}
     times: Times = {}
     if "latency" in options.sections:
         jobs = [
-            forward_job("latency", one, n, [[person] for person in clouds[n][:ALONE]])
+            forward_job("latency", timed_runner, n, [[person] for person in clouds[n][:ALONE]])
             for n in options.points
-            for one in made
+            for timed_runner in made
         ]
         times |= measure(jobs, 2 * options.rounds, left_out)
     if "forward" in options.sections:
         jobs = []
         for n in (*options.points, CROPS):
-            for one in made:
-                if one.batch > 1 and not isinstance(one, Session):
-                    calls = batches(pool, one.batch, number) if n == CROPS else [clouds[n][: one.batch]]
-                    jobs.append(forward_job("forward", one, n, calls))
+            for timed_runner in made:
+                if timed_runner.batch > 1 and not isinstance(timed_runner, Session):
+                    calls = (
+                        batches(pool, timed_runner.batch, number) if n == CROPS else [clouds[n][: timed_runner.batch]]
+                    )
+                    jobs.append(forward_job("forward", timed_runner, n, calls))
         times |= measure(jobs, options.rounds, left_out)
     if "training" in options.sections:
         jobs = []
         for n in (*options.points, CROPS):
-            for one in made:
-                if one.trains:
-                    calls = batches(pool, one.batch, number) if n == CROPS else [clouds[n][: one.batch]]
-                    jobs.append(training_job("training", one, n, calls))
+            for timed_runner in made:
+                if timed_runner.trains:
+                    calls = (
+                        batches(pool, timed_runner.batch, number) if n == CROPS else [clouds[n][: timed_runner.batch]]
+                    )
+                    jobs.append(training_job("training", timed_runner, n, calls))
         times |= measure(jobs, options.rounds, left_out)
     if "scaling" in options.sections and made and made[0].name == "tiny":
         for section, make in (("scaling forward", forward_job), ("scaling training", training_job)):
             jobs = [
-                make(section, made[0], n, [[clouds[n][k % most] for k in range(people)]])
+                make(section, made[0], n, [[clouds[n][k % max_batch] for k in range(people)]])
                 for n in options.scaling_points
                 for people in options.scaling_people
             ]
@@ -194,41 +198,41 @@ def memory(options: argparse.Namespace, left_out: list[str]) -> list[dict]:
     for name in names:
         batch = PAPER_BATCH if name == "paper" and options.device == "cpu" else BATCH
         # of the crops the batch of the most voxels
-        sets = {n: of_points(pool, n, batch, rng) for n in options.points[-2:]}
-        sets[CROPS] = batches(pool, batch, number)[-1]
-        for points, people in sets.items():
+        people_by_points = {n: of_points(pool, n, batch, rng) for n in options.points[-2:]}
+        people_by_points[CROPS] = batches(pool, batch, number)[-1]
+        for points, people in people_by_points.items():
             say(f"memory of {name}, {points}")
-            out = context.SimpleQueue()
-            process = context.Process(target=_memory_of_steps, args=(name, people, options, out))
+            queue = context.SimpleQueue()
+            process = context.Process(target=_memory_of_steps, args=(name, people, options, queue))
             process.start()
             process.join()
-            if out.empty():
+            if queue.empty():
                 left_out.append(f"memory of {name} at {points}: its process ended with {process.exitcode}")
                 continue
-            found = out.get()
-            if "error" in found:
-                left_out.append(f"memory of {name} at {points}: {found['error']}")
+            result = queue.get()
+            if "error" in result:
+                left_out.append(f"memory of {name} at {points}: {result['error']}")
             else:
-                rows.append({"network": name, "points": points, "people": len(people)} | found)
+                rows.append({"network": name, "points": points, "people": len(people)} | result)
     return rows
 
 
-def _memory_of_steps(name: str, people: list[Example], options: argparse.Namespace, out) -> None:
+def _memory_of_steps(name: str, people: list[Example], options: argparse.Namespace, queue) -> None:
     """Three training steps; puts bytes before the network is made and at the peak."""
     torch.set_num_threads(options.threads)
     try:
-        before = resident()
-        one = runner(name, options.device)
-        lesson = one.lesson(people)
-        one.train(True)
+        bytes_before = resident()
+        timed_runner = runner(name, options.device)
+        lesson = timed_runner.lesson(people)
+        timed_runner.train(True)
         for _ in range(3):
-            one.step(lesson)
-        found = {"before": before, "peak": peak()}
+            timed_runner.step(lesson)
+        memory_bytes = {"before": bytes_before, "peak": peak()}
         if options.device != "cpu":
-            found |= {"device_peak": torch.cuda.max_memory_allocated()}
-        out.put(found)
+            memory_bytes |= {"device_peak": torch.cuda.max_memory_allocated()}
+        queue.put(memory_bytes)
     except Exception as error:
-        out.put({"error": reason(error)})
+        queue.put({"error": reason(error)})
 
 
 def resident() -> int:
@@ -292,9 +296,9 @@ def main() -> None:
     # first, while this process is small and no thread of it is busy
     memory_rows = memory(options, left_out) if "memory" in options.sections else []
     with tempfile.TemporaryDirectory() as folder:
-        made = runners_of(options, Path(folder), left_out)
-        times = measured(made, options, left_out) if set(options.sections) - {"memory"} else {}
-    report = Report(options, made, times, memory_rows, left_out)
+        runners = runners_of(options, Path(folder), left_out)
+        times = measured(runners, options, left_out) if set(options.sections) - {"memory"} else {}
+    report = Report(options, runners, times, memory_rows, left_out)
     if options.json is not None:
         options.json.write_text(json.dumps(report.to_json(), default=str, indent=1) + "\n")
     print(report.write())

@@ -37,8 +37,8 @@ class Report:
     def __init__(self, options, made: list[Runner], times: Times, memory_rows: list[dict], left_out: list[str]):
         self.options, self.made, self.times = options, made, times
         self.memory_rows, self.left_out = memory_rows, left_out
-        self.names = [one.name for one in made]
-        self.trained = [one.name for one in made if one.trains]
+        self.names = [runner.name for runner in made]
+        self.trained = [runner.name for runner in made if runner.trains]
 
     def seconds(self, section: str, network: str, points, people: int | None = None) -> tuple[np.ndarray, int] | None:
         """Whole and network-alone seconds (calls, 2), and the people of a call; None where not measured."""
@@ -49,13 +49,13 @@ class Report:
 
     def median(self, section: str, network: str, points, people: int | None = None, *, alone: bool = False) -> float:
         """Median seconds a person, not a number where not measured."""
-        found = self.seconds(section, network, points, people)
-        return math.nan if found is None else float(np.median(found[0][:, int(alone)])) / found[1]
+        measurement = self.seconds(section, network, points, people)
+        return math.nan if measurement is None else float(np.median(measurement[0][:, int(alone)])) / measurement[1]
 
     def best(self, section: str, network: str, points, people: int | None = None, *, alone: bool = False) -> float:
         """Least seconds a person."""
-        found = self.seconds(section, network, points, people)
-        return math.nan if found is None else float(found[0][:, int(alone)].min()) / found[1]
+        measurement = self.seconds(section, network, points, people)
+        return math.nan if measurement is None else float(measurement[0][:, int(alone)].min()) / measurement[1]
 
     def write(self) -> str:
         parts = [f"# Speed and memory of the network\n\n{self._machine()}"]
@@ -97,11 +97,11 @@ class Report:
         )
 
     def _paper_batch(self) -> int:
-        return next((one.batch for one in self.made if one.name == "paper"), PAPER_BATCH)
+        return next((runner.batch for runner in self.made if runner.name == "paper"), PAPER_BATCH)
 
     def _latency(self) -> str:
         rows = []
-        parameters = {one.name: one.parameters for one in self.made}
+        parameters = {runner.name: runner.parameters for runner in self.made}
         for name in self.names:
             if not name.endswith("session"):
                 cells = [self._cell("latency", name, n) for n in self.options.points]
@@ -123,40 +123,40 @@ class Report:
         return table(["network", *map(shown, columns)], rows)
 
     def _ratios(self) -> str:
-        beside = {"tiny": f"{DRAFT} as tiny", "small": DRAFT}
+        draft_by_size = {"tiny": f"{DRAFT} as tiny", "small": DRAFT}
         pairs = []
-        for size, draft in beside.items():
+        for size, draft in draft_by_size.items():
             pairs += [(size, other) for other in (draft, f"ViT as {size}", f"PointNet++ as {size}")]
         pairs += [(f"{size} ONNX", size) for size in SIZES[:3]] + [("tiny", "small"), ("small", "base")]
         pairs += [("tiny", "paper")]
         columns = (*self.options.points, CROPS)
         rows = []
-        for one, other in pairs:
+        for network, other in pairs:
             for section in ("latency", "forward", "training"):
-                values = [self.median(section, other, n) / self.median(section, one, n) for n in columns]
+                values = [self.median(section, other, n) / self.median(section, network, n) for n in columns]
                 if not all(map(math.isnan, values)):
                     cells = ["-" if math.isnan(value) else f"{value:.2f}" for value in values]
-                    rows.append([f"{one} over {other}", section, *cells])
+                    rows.append([f"{network} over {other}", section, *cells])
         return table(["pair", "", *map(shown, columns)], rows)
 
     def _scaling(self) -> str:
-        out = []
+        all_rows = []
         for section in ("scaling forward", "scaling training"):
             rows = []
             for n in self.options.scaling_points:
                 medians = [self.median(section, "tiny", n, people) for people in self.options.scaling_people]
                 rows.append([f"{section.split()[1]}, {shown(n)}", *("-" if m != m else rate(m) for m in medians)])
-            out += rows
-        most = "A person of more than so many voxels is thinned, so cost stops growing where that begins."
+            all_rows += rows
+        note = "A person of more than so many voxels is thinned, so cost stops growing where that begins."
         head = ["points", *(f"batch {people}" for people in self.options.scaling_people)]
-        return f"{table(head, out)}\n\n{most}"
+        return f"{table(head, all_rows)}\n\n{note}"
 
     def _memory(self) -> str:
         rows = []
         for row in self.memory_rows:
-            before, high = row["before"] / MEBIBYTE, row["peak"] / MEBIBYTE
-            cells = [row["network"], shown(row["points"]), str(row["people"]), f"{before:,.0f}", f"{high:,.0f}"]
-            cells.append(f"{high - before:,.0f}")
+            before, peak = row["before"] / MEBIBYTE, row["peak"] / MEBIBYTE
+            cells = [row["network"], shown(row["points"]), str(row["people"]), f"{before:,.0f}", f"{peak:,.0f}"]
+            cells.append(f"{peak - before:,.0f}")
             if "device_peak" in row:
                 cells.append(f"{row['device_peak'] / MEBIBYTE:,.0f}")
             rows.append(cells)
@@ -167,41 +167,49 @@ class Report:
         """what, unit, target, whether it is a ceiling; figures by the medians and by the best rounds, None where not
         measured; whether the medians meet it."""
         by_median, by_best = self._figures(self.median), self._figures(self.best)
-        found = []
+        rows = []
         for (what, unit, most, target, figure), (*_, best) in zip(by_median, by_best, strict=True):
-            met = None if math.isnan(figure) else bool(figure <= target if most else figure >= target)
+            is_met = None if math.isnan(figure) else bool(figure <= target if most else figure >= target)
             figure, best = (None if math.isnan(value) else value for value in (figure, best))
-            found.append(dict(what=what, unit=unit, most=most, target=target, figure=figure, best=best, met=met))
-        return found
+            rows.append(dict(what=what, unit=unit, most=most, target=target, figure=figure, best=best, met=is_met))
+        return rows
 
-    def _figures(self, take: Callable[..., float]) -> list[tuple[str, str, bool, float, float]]:
+    def _figures(self, statistic: Callable[..., float]) -> list[tuple[str, str, bool, float, float]]:
         """what, unit, whether a ceiling, target, figure; take: `median` or `best`."""
-        out = [
-            ("`tiny` ONNX, one person of 512 points", "ms", True, 3, take("latency", "tiny ONNX", 512) * 1e3),
-            ("`tiny` in torch, one person of 512 points", "ms", True, 8, take("latency", "tiny", 512) * 1e3),
-            ("`tiny` training, crops", "people/s", False, 500, 1 / take("training", "tiny", CROPS)),
+        figures = [
+            ("`tiny` ONNX, one person of 512 points", "ms", True, 3, statistic("latency", "tiny ONNX", 512) * 1e3),
+            ("`tiny` in torch, one person of 512 points", "ms", True, 8, statistic("latency", "tiny", 512) * 1e3),
+            ("`tiny` training, crops", "people/s", False, 500, 1 / statistic("training", "tiny", CROPS)),
         ]
         for n in (256, 512):
-            ratio = take("training", DRAFT, n) / take("training", "small", n)
-            out.append((f"`small` over the draft, training, {n} points", "x", False, 1.5, ratio))
-        out.append(("`paper` forward, 512 points", "people/s", False, 10, 1 / take("forward", "paper", 512)))
+            ratio = statistic("training", DRAFT, n) / statistic("training", "small", n)
+            figures.append((f"`small` over the draft, training, {n} points", "x", False, 1.5, ratio))
+        figures.append(("`paper` forward, 512 points", "people/s", False, 10, 1 / statistic("forward", "paper", 512)))
         low, high = self.options.scaling_people[-2:]
         for kind in ("forward", "training"):
-            few, many = (take(f"scaling {kind}", "tiny", 512, people) for people in (low, high))
-            out.append((f"`tiny` {kind}, cost a person, batch {high} over batch {low}", "x", True, 1.15, many / few))
-            few, many = (take(f"scaling {kind}", "tiny", n, BATCH) for n in (128, 512))
-            exponent = math.log(many / few) / math.log(4)
-            out.append((f"`tiny` {kind}, exponent of cost, 128 to 512 points", "", True, 1.2, exponent))
+            small_cost, large_cost = (statistic(f"scaling {kind}", "tiny", 512, people) for people in (low, high))
+            figures.append(
+                (
+                    f"`tiny` {kind}, cost a person, batch {high} over batch {low}",
+                    "x",
+                    True,
+                    1.15,
+                    large_cost / small_cost,
+                )
+            )
+            small_cost, large_cost = (statistic(f"scaling {kind}", "tiny", n, BATCH) for n in (128, 512))
+            exponent = math.log(large_cost / small_cost) / math.log(4)
+            figures.append((f"`tiny` {kind}, exponent of cost, 128 to 512 points", "", True, 1.2, exponent))
         peaks = [row["peak"] / 1e9 for row in self.memory_rows if row["network"] == "tiny"]
-        out.append(("`tiny` training, peak memory", "GB", True, 2, max(peaks, default=math.nan)))
-        return out
+        figures.append(("`tiny` training, peak memory", "GB", True, 2, max(peaks, default=math.nan)))
+        return figures
 
     def to_json(self) -> dict:
         options = {name: value for name, value in vars(self.options).items() if name != "json"}
         return {
             "machine": self._machine(),
             "options": options,
-            "parameters": {one.name: one.parameters for one in self.made},
+            "parameters": {runner.name: runner.parameters for runner in self.made},
             "times": [
                 vars(key) | {"median_s": self.median(**vars(key)), "best_s": self.best(**vars(key))}
                 for key in self.times

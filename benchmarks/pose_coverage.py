@@ -25,24 +25,33 @@ THIGH, SHANK, UPPER_ARM, FOREARM = 0.42, 0.42, 0.28, 0.25
 
 def on_one_body(joints: np.ndarray) -> np.ndarray:
     """joints (n, 24, 3) -> (n, 13, 3) float32 m."""
-    at = {name: joints[:, i].astype(float) for i, name in enumerate(SMPL24.joints)}
+    joint_positions = {name: joints[:, i].astype(float) for i, name in enumerate(SMPL24.joints)}
 
-    def way(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    def direction(start: np.ndarray, end: np.ndarray) -> np.ndarray:
         return (end - start) / np.maximum(np.linalg.norm(end - start, axis=-1, keepdims=True), 1e-9)
 
-    hips, shoulders = ((at[f"left_{name}"] + at[f"right_{name}"]) / 2 for name in ("hip", "shoulder"))
-    chest = CHEST * way(hips, shoulders)
-    built = [chest + HEAD * way(shoulders, at["head"])]
-    for side, other in (("left", "right"), ("right", "left")):
+    hips, shoulders = (
+        (joint_positions[f"left_{name}"] + joint_positions[f"right_{name}"]) / 2 for name in ("hip", "shoulder")
+    )
+    chest = CHEST * direction(hips, shoulders)
+    positions = [chest + HEAD * direction(shoulders, joint_positions["head"])]
+    for side, other_side in (("left", "right"), ("right", "left")):
         for root, breadth, bones in (
             (0 * chest, HALF_HIPS, (("hip", "knee", THIGH), ("knee", "ankle", SHANK))),
             (chest, HALF_SHOULDERS, (("shoulder", "elbow", UPPER_ARM), ("elbow", "wrist", FOREARM))),
         ):
-            first = bones[0][0]
-            built.append(root + breadth * way(at[f"{other}_{first}"], at[f"{side}_{first}"]))
+            first_joint = bones[0][0]
+            positions.append(
+                root
+                + breadth
+                * direction(joint_positions[f"{other_side}_{first_joint}"], joint_positions[f"{side}_{first_joint}"])
+            )
             for start, end, length in bones:
-                built.append(built[-1] + length * way(at[f"{side}_{start}"], at[f"{side}_{end}"]))
-    points = np.stack(built, 1)
+                positions.append(
+                    positions[-1]
+                    + length * direction(joint_positions[f"{side}_{start}"], joint_positions[f"{side}_{end}"])
+                )
+    points = np.stack(positions, 1)
     left = points[:, 1]
     return (points @ rotation_about("z", np.arctan2(left[:, 0], left[:, 1])).swapaxes(-1, -2)).astype(np.float32)
 
@@ -54,8 +63,8 @@ def drawn_poses(count: int, unusual: float) -> np.ndarray:
 
 
 def nearest(poses: np.ndarray, frame: np.ndarray) -> float:
-    apart = poses - frame
-    return 1e3 * float(np.sqrt(np.einsum("njk,njk->nj", apart, apart)).mean(1).min())
+    offsets = poses - frame
+    return 1e3 * float(np.sqrt(np.einsum("njk,njk->nj", offsets, offsets)).mean(1).min())
 
 
 def main() -> None:
@@ -72,17 +81,17 @@ def main() -> None:
         with np.load(path, allow_pickle=False) as motion:
             names, frames = np.repeat(motion["clip"], motion["clip_length"]), on_one_body(motion["joints"])
         rows = np.array([str(name).rpartition("_")[0] for name in names])
-        people, total = np.array([row.partition("_")[0] for row in rows]), {}
+        people, sums_by_person = np.array([row.partition("_")[0] for row in rows]), {}
         for row in np.unique(rows):
             person = row.partition("_")[0]
             if options.people and person not in options.people:
                 continue
-            here = np.flatnonzero(rows == row)
-            picked = np.random.default_rng(0).permutation(here)[: options.frames]
-            mean = [np.mean([nearest(bank, frame) for frame in frames[picked]]) for bank in banks]
-            total.setdefault(person, []).append(np.multiply(mean, len(here)))
-            print(f"{row:40s}{len(here):8d}" + "".join(f"{value:8.1f}" for value in mean), flush=True)
-        for person, sums in total.items():
+            row_frames = np.flatnonzero(rows == row)
+            picked_frames = np.random.default_rng(0).permutation(row_frames)[: options.frames]
+            mean = [np.mean([nearest(bank, frame) for frame in frames[picked_frames]]) for bank in banks]
+            sums_by_person.setdefault(person, []).append(np.multiply(mean, len(row_frames)))
+            print(f"{row:40s}{len(row_frames):8d}" + "".join(f"{value:8.1f}" for value in mean), flush=True)
+        for person, sums in sums_by_person.items():
             if len(sums) == 1:
                 continue
             count = int((people == person).sum())

@@ -40,27 +40,28 @@ TICKS = (0.05, 0.1, 0.2, 0.3, 0.5, 1, 5, 20, 50)
 
 def blob(rng, rings):
     """A closed bumpy mesh about as large as a person, with 4 * rings * (rings - 1) triangles."""
-    around = 2 * rings
-    polar, angle = np.pi * np.arange(1, rings) / rings, np.pi * np.arange(around) / rings
+    segments = 2 * rings
+    polar, angle = np.pi * np.arange(1, rings) / rings, np.pi * np.arange(segments) / rings
     ring = np.stack([np.cos(angle), np.sin(angle)], -1)
     grid = np.concatenate(
-        [np.sin(polar)[:, None, None] * ring, np.broadcast_to(np.cos(polar)[:, None, None], (rings - 1, around, 1))], -1
+        [np.sin(polar)[:, None, None] * ring, np.broadcast_to(np.cos(polar)[:, None, None], (rings - 1, segments, 1))],
+        -1,
     )
     vertices = np.concatenate([grid.reshape(-1, 3), [[0, 0, 1], [0, 0, -1]]])
-    j = np.arange(around)
-    k, top = (j + 1) % around, (rings - 1) * around
-    faces = [np.stack([np.full(around, top), j, k], -1)]
+    j = np.arange(segments)
+    k, top = (j + 1) % segments, (rings - 1) * segments
+    faces = [np.stack([np.full(segments, top), j, k], -1)]
     for i in range(rings - 2):
-        a, b = i * around, (i + 1) * around
+        a, b = i * segments, (i + 1) * segments
         faces += [np.stack([a + j, b + j, b + k], -1), np.stack([a + j, b + k, a + k], -1)]
-    faces.append(np.stack([np.full(around, top + 1), top - around + k, top - around + j], -1))
+    faces.append(np.stack([np.full(segments, top + 1), top - segments + k, top - segments + j], -1))
     bumps = 1 + 0.4 * np.sin(vertices @ rng.normal(0, 5, (3, 4))).sum(1, keepdims=True) / 4
     return vertices * bumps * [0.2, 0.35, 0.9], np.concatenate(faces)
 
 
 def scenes(sensor, rings):
     """Lists of (distance, vertices, faces, the body's vertex count); the ground's two faces are the last."""
-    made = []
+    scene_list = []
     for m in range(MESHES):
         for distance in DISTANCES:
             rng = np.random.default_rng([m, int(distance)])
@@ -70,13 +71,13 @@ def scenes(sensor, rings):
             ground = np.array([[-1.0, -1, -0.9], [1, -1, -0.9], [1, 1, -0.9], [-1, 1, -0.9]])
             n = len(vertices)
             faces = np.concatenate([faces, [[n, n + 1, n + 2], [n, n + 2, n + 3]]]).astype(np.int32)
-            made.append((distance, (np.concatenate([vertices, ground]) + place).astype(np.float32), faces, n))
-    return made
+            scene_list.append((distance, (np.concatenate([vertices, ground]) + place).astype(np.float32), faces, n))
+    return scene_list
 
 
 def other_ways():
     """Name -> function(vertices, faces, rays, ...); each builds its tree and casts, as a new body needs."""
-    ways = {}
+    casters = {}
     try:
         from embreex import rtcore_scene
         from embreex.mesh_construction import TriangleMesh
@@ -86,7 +87,7 @@ def other_ways():
             TriangleMesh(scene, vertices[faces])
             return scene.run(np.zeros_like(rays, dtype=np.float32), rays.astype(np.float32))
 
-        ways["embreex"] = embree
+        casters["embreex"] = embree
     except ImportError:
         pass
     try:
@@ -108,24 +109,24 @@ def other_ways():
             scene.add_triangles(open3d.core.Tensor(vertices), open3d.core.Tensor(faces.astype(np.uint32)))
             return cast(scene, rays)
 
-        ways["open3d"], ways["open3d direct"] = by_legacy_mesh, by_tensors
+        casters["open3d"], casters["open3d direct"] = by_legacy_mesh, by_tensors
     except ImportError:
         pass
-    return ways
+    return casters
 
 
 def measure(made, sensor, ways, rounds, *, reference=False):
     """Way -> least seconds of each scene (scenes,), and the number of hits of each."""
-    best = {way: np.full(len(made), np.inf) for way in (*ways, *([REFERENCE] if reference else []))}
+    best = {name: np.full(len(made), np.inf) for name in (*ways, *([REFERENCE] if reference else []))}
     counts = np.zeros(len(made))
     rng = np.random.default_rng(0)
     for turn in range(rounds + 1):  # the first turn warms up
         for i, (_, vertices, faces, body) in enumerate(made):
             hits = scan(vertices, faces, sensor, window_vertices=vertices[:body])
             rays, counts[i] = window_rays(hits, sensor).reshape(-1, 3), len(hits.points)
-            for name, way in ways.items():
+            for name, caster in ways.items():
                 start = time.perf_counter()
-                way(vertices, faces, rays, body)
+                caster(vertices, faces, rays, body)
                 if turn:
                     best[name][i] = min(best[name][i], time.perf_counter() - start)
             if reference and turn == 1:
@@ -144,9 +145,9 @@ def plot(path, sensor, by_distance, by_count):
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.6), sharey=True, layout="constrained")
     for axis, series in ((left, by_distance), (right, by_count)):
-        for way in next(iter(series.values())):
-            values = [series[x][way] * 1e3 for x in series]
-            axis.plot(list(series), values, marker="o", ms=4, label=way)
+        for name in next(iter(series.values())):
+            values = [series[x][name] * 1e3 for x in series]
+            axis.plot(list(series), values, marker="o", ms=4, label=name)
         axis.set_yscale("log")
         axis.grid(True, lw=0.3)
     # of both axes, which share them
@@ -171,33 +172,33 @@ def main():
     arguments = parser.parse_args()
     sensor = named_sensor(arguments.sensor)
 
-    def own(vertices, faces, rays, body):
+    def cast_scan(vertices, faces, rays, body):
         return scan(vertices, faces, sensor, window_vertices=vertices[:body])
 
-    ways = {"scan": own, **other_ways()}
-    made = scenes(sensor, arguments.rings)
-    best, hits = measure(made, sensor, ways, arguments.rounds, reference=True)
-    distances = np.array([scene[0] for scene in made])
-    print(f"{sensor.name}, {len(made[0][2]):,} triangles, best of {arguments.rounds}; ms a cast by distance")
+    casters = {"scan": cast_scan, **other_ways()}
+    scene_list = scenes(sensor, arguments.rings)
+    best, hits = measure(scene_list, sensor, casters, arguments.rounds, reference=True)
+    distances = np.array([scene[0] for scene in scene_list])
+    print(f"{sensor.name}, {len(scene_list[0][2]):,} triangles, best of {arguments.rounds}; ms a cast by distance")
     print(f"{'way':14s}" + "".join(f"{d:9.0f} m" for d in DISTANCES) + f"{'mean':>11s}{'casts/s':>10s}{'x scan':>10s}")
-    for way, seconds in best.items():
+    for name, seconds in best.items():
         by_distance = [seconds[distances == d].mean() * 1e3 for d in DISTANCES]
         mean = seconds.mean()
         print(
-            f"{way:14s}"
+            f"{name:14s}"
             + "".join(f"{ms:11.3f}" for ms in by_distance)
             + f"{mean * 1e3:11.3f}{1 / mean:10,.0f}{mean / best['scan'].mean():10.1f}"
         )
     print(f"{'hits':14s}" + "".join(f"{hits[distances == d].mean():11.0f}" for d in DISTANCES))
     if arguments.plot:
-        drawn = {way: best[way] for way in ways}
-        by_distance = {d: {way: drawn[way][distances == d].mean() for way in ways} for d in DISTANCES}
+        plotted_times = {name: best[name] for name in casters}
+        by_distance = {d: {name: plotted_times[name][distances == d].mean() for name in casters} for d in DISTANCES}
         by_count = {}
         for rings in RINGS:
-            found, _ = measure(scenes(sensor, rings), sensor, ways, max(1, arguments.rounds // 2))
-            by_count[4 * rings * (rings - 1)] = {way: seconds.mean() for way, seconds in found.items()}
+            times_by_name, _ = measure(scenes(sensor, rings), sensor, casters, max(1, arguments.rounds // 2))
+            by_count[4 * rings * (rings - 1)] = {name: seconds.mean() for name, seconds in times_by_name.items()}
         for count, series in by_count.items():
-            print(f"{count:7,} triangles: " + ", ".join(f"{way} {ms * 1e3:.3f} ms" for way, ms in series.items()))
+            print(f"{count:7,} triangles: " + ", ".join(f"{name} {ms * 1e3:.3f} ms" for name, ms in series.items()))
         plot(arguments.plot, sensor, by_distance, by_count)
 
 

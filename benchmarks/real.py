@@ -31,9 +31,9 @@ NEAR = 0.15
 def distance_to_bones(points: np.ndarray, joints: np.ndarray) -> np.ndarray:
     """points (n, 3), joints (24, 3) m -> (n,) m to the nearest bone."""
     start, end = joints[[a for a, _ in SMPL24.bones]], joints[[b for _, b in SMPL24.bones]]
-    along = end - start
-    share = ((points[:, None] - start) * along).sum(-1) / np.maximum((along**2).sum(-1), 1e-9)
-    nearest = start + np.clip(share, 0, 1)[..., None] * along
+    bone = end - start
+    share = ((points[:, None] - start) * bone).sum(-1) / np.maximum((bone**2).sum(-1), 1e-9)
+    nearest = start + np.clip(share, 0, 1)[..., None] * bone
     return np.linalg.norm(points[:, None] - nearest, axis=-1).min(1)
 
 
@@ -42,7 +42,7 @@ def rows_of(model: Predictor, four: Predictor, folder: Path, least: int) -> Iter
     for labels in sorted(folder.glob("sweep_*.json")):
         sweep = next(path for path in sorted(folder.glob(f"{labels.stem}.*")) if path.suffix != ".json")
         boxes = {"people": json.loads(labels.read_text())["people"]}
-        people = (lidarpose.predict(sweep, boxes=boxes, model=one) for one in (model, four))
+        people = (lidarpose.predict(sweep, boxes=boxes, model=predictor) for predictor in (model, four))
         for person, other in zip(*people, strict=True):
             if person.num_points < least or person.pose is None:
                 continue
@@ -74,8 +74,8 @@ def moved(people: list[tuple[dict, PersonPose]]) -> Iterator[dict]:
     pelvis = SMPL24.index("pelvis")
     for row, person in people:
         tracks.setdefault(row["person"], []).append(person.joints - person.joints[pelvis])
-    for name, seen in tracks.items():
-        for first, second in pairwise(seen):
+    for name, poses in tracks.items():
+        for first, second in pairwise(poses):
             yield {"person": name, "mm": round(float(np.linalg.norm(second - first, axis=-1).mean() * 1e3), 1)}
 
 
@@ -87,20 +87,20 @@ def main() -> None:
     parser.add_argument("--tta", type=int, default=TTA, help="as of predict")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write people's figures")
     options = parser.parse_args()
-    models = (lidarpose.load(options.weights, tta=looks) for looks in (options.tta, 4))
+    models = (lidarpose.load(options.weights, tta=count) for count in (options.tta, 4))
     people = list(rows_of(*models, options.folder, options.least))
     for row, _ in people:
         print(
             f"{row['sweep']} {row['person']}  {row['points']:4d} points {row['distance']:5.1f} m"
-            f"  facing {row['turn']:5.0f} deg off the box, with one look {row['turn_of_four']:5.0f}"
+            f"  facing {row['turn']:5.0f} deg off the box, with four looks {row['turn_of_four']:5.0f}"
             f"  {row['near']:4.0%} near bones  lean {row['lean']:3.0f} deg  confidence {row['confidence']:.2f}"
         )
     tracks = list(moved(people))
-    for one in tracks:
-        print(f"track {one['person']}: two sweeps differ by {one['mm']:.0f} mm a joint")
+    for entry in tracks:
+        print(f"track {entry['person']}: two sweeps differ by {entry['mm']:.0f} mm a joint")
     if options.json:
-        found = {"people": [row for row, _ in people], "tracks": tracks}
-        write_atomic(options.json, json.dumps(found, indent=1) + "\n")
+        report = {"people": [row for row, _ in people], "tracks": tracks}
+        write_atomic(options.json, json.dumps(report, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -50,19 +50,19 @@ MEASURES = ("points", "rings", "ring step", "ring offset", "ground", "wide", "ta
 def measures(points: np.ndarray, ring: np.ndarray, box: Box) -> dict[str, float]:
     """The figures of one person. points (n, 3) m in the sensor's frame, ring (n,), -1 for none; box as a detector's."""
     bottom = box.center[2] - box.size[2] / 2
-    ahead = box.center[:2] / np.linalg.norm(box.center[:2])
-    across = points[:, :2] @ [-ahead[1], ahead[0]]
+    forward = box.center[:2] / np.linalg.norm(box.center[:2])
+    lateral = points[:, :2] @ [-forward[1], forward[0]]
     low, high = (bottom + share * box.size[2] for share in UPPER_BODY)
-    upper = (points[:, 2] > low) & (points[:, 2] < high) & (ring >= 0)
+    is_upper = (points[:, 2] > low) & (points[:, 2] < high) & (ring >= 0)
     numbers, counts = np.unique(ring[ring >= 0], return_counts=True)
-    step, offset = along_rings(points[upper], ring[upper])
+    step, offset = along_rings(points[is_upper], ring[is_upper])
     return {
         "points": len(points),
         "rings": int((counts >= 2).sum()),
         "ring step": step,
         "ring offset": offset,
         "ground": float((points[:, 2] < bottom + GROUND).mean()),
-        "wide": float(np.ptp(across)),
+        "wide": float(np.ptp(lateral)),
         "tall": float(np.ptp(points[:, 2])),
     }
 
@@ -78,8 +78,8 @@ def along_rings(points: np.ndarray, ring: np.ndarray) -> tuple[float, float]:
         gaps = np.diff(azimuth[order])
         if len(order) < 3:
             continue
-        even = (gaps[1:] < 1.6 * np.median(gaps)) & (gaps[:-1] < 1.6 * np.median(gaps))
-        steps.append(np.abs(np.diff(distance[order], 2))[even])
+        is_even = (gaps[1:] < 1.6 * np.median(gaps)) & (gaps[:-1] < 1.6 * np.median(gaps))
+        steps.append(np.abs(np.diff(distance[order], 2))[is_even])
         middles.append((np.median(points[order, 2]), np.median(distance[order])))
     step = float(np.median(np.concatenate(steps)) / 3) if steps and len(np.concatenate(steps)) else np.nan
     height = np.array(sorted(middles))
@@ -92,15 +92,15 @@ def along_rings(points: np.ndarray, ring: np.ndarray) -> tuple[float, float]:
 def rings_of(points: np.ndarray) -> np.ndarray:
     """(n,) rings of points of a real sweep, by the elevation seen from either head; -1 for points between rings."""
     table = np.degrees(sensor("vlp-32c").elevations)
-    flat = np.hypot(points[:, 0], points[:, 1])
-    off, number = [], []
+    horizontal = np.hypot(points[:, 0], points[:, 1])
+    deviations, numbers = [], []
     for head, angles in ((0.0, table), (LOWER_HEAD, -table)):
-        apart = np.abs(np.degrees(np.arctan2(points[:, 2] - head, flat))[:, None] - angles)
-        off.append(apart.min(1))
-        number.append(apart.argmin(1))
-    upper = off[0] <= off[1]
-    ring = np.where(upper, number[0], 32 + number[1])
-    return np.where(np.minimum(*off) < RING_TOLERANCE, ring, -1)
+        deviation = np.abs(np.degrees(np.arctan2(points[:, 2] - head, horizontal))[:, None] - angles)
+        deviations.append(deviation.min(1))
+        numbers.append(deviation.argmin(1))
+    is_upper = deviations[0] <= deviations[1]
+    ring = np.where(is_upper, numbers[0], 32 + numbers[1])
+    return np.where(np.minimum(*deviations) < RING_TOLERANCE, ring, -1)
 
 
 def real_people(folder: Path) -> list[tuple[str, float, np.ndarray, np.ndarray, Box]]:
@@ -137,17 +137,17 @@ PUBLISHED = (
 
 def points_alone(device: Sensor | RayPattern, tilt: float, height: float, distance: float, count: int) -> float:
     """Median of the returns of `count` bodies with nothing around, somewhere ahead of a sensor."""
-    rng, bodies, found = np.random.default_rng(0), draw_bodies(None, 0.0, count, 1, 0), []
+    rng, bodies, counts = np.random.default_rng(0), draw_bodies(None, 0.0, count, 1, 0), []
     mount = rotation_about("y", -tilt)
     for body in bodies.vertices:
         # a tilted sensor sees all of a person only beside the way it is tilted
         azimuth = rng.uniform(-AHEAD, AHEAD)
-        there = (body + [distance * np.cos(azimuth), distance * np.sin(azimuth), -height]) @ mount.T
+        vertices = (body + [distance * np.cos(azimuth), distance * np.sin(azimuth), -height]) @ mount.T
         if isinstance(device, RayPattern):
-            found.append(len(scan_pattern(there, bodies.faces, device, 0).points))
+            counts.append(len(scan_pattern(vertices, bodies.faces, device, 0).points))
         else:
-            found.append(len(scan(there, bodies.faces, device).points))
-    return float(np.median(found))
+            counts.append(len(scan(vertices, bodies.faces, device).points))
+    return float(np.median(counts))
 
 
 def print_published(count: int) -> None:
@@ -157,14 +157,14 @@ def print_published(count: int) -> None:
     """
     distances = np.geomspace(2, 30, 10)
     for name, device, tilt, height, mean, distance in PUBLISHED:
-        alone = [points_alone(sensor(device), tilt, height, d, count) for d in distances]
+        counts = [points_alone(sensor(device), tilt, height, d, count) for d in distances]
         # from afar: very near, the fan cuts people
-        from_afar = np.maximum.accumulate(np.maximum(alone, 1)[::-1])
-        same = np.exp(np.interp(np.log(mean), np.log(from_afar), np.log(distances)[::-1]))
-        line = f"{name}: {mean} points a person on average; {device} casts as many at {same:.1f} m"
+        from_afar = np.maximum.accumulate(np.maximum(counts, 1)[::-1])
+        same_distance = np.exp(np.interp(np.log(mean), np.log(from_afar), np.log(distances)[::-1]))
+        line = f"{name}: {mean} points a person on average; {device} casts as many at {same_distance:.1f} m"
         if distance:
-            there = np.exp(np.interp(np.log(distance), np.log(distances), np.log(np.maximum(alone, 1))))
-            line += f", and {there:.0f} at the {distance} m that people are away on average"
+            count_there = np.exp(np.interp(np.log(distance), np.log(distances), np.log(np.maximum(counts, 1))))
+            line += f", and {count_there:.0f} at the {distance} m that people are away on average"
         print(line)
 
 
@@ -172,30 +172,30 @@ def compare(real: list, count: int) -> tuple[list[tuple], list[tuple]]:
     """Rows (name, distance, real figures, synthetic figures: one dict a person) and the synthetic crops."""
     rows, crops = [], []
     for number, (name, distance, points, ring, box) in enumerate(real):
-        made = synthetic_people(distance, count, seed=100 + number)
-        rows.append((name, distance, measures(points, ring, box), [measures(*person) for person in made]))
-        crops.append(made)
+        synthetic = synthetic_people(distance, count, seed=100 + number)
+        rows.append((name, distance, measures(points, ring, box), [measures(*person) for person in synthetic]))
+        crops.append(synthetic)
     return rows, crops
 
 
 def print_table(rows: list[tuple]) -> None:
     """Each real figure, and below it the 10, 50 and 90 percent quantiles of the synthetic people."""
     print(f"{'real person':>14} {'m':>5} " + " ".join(f"{name:>17}" for name in MEASURES))
-    inside = dict.fromkeys(MEASURES, 0)
-    for name, distance, figures, made in rows:
-        cells, below = [], []
+    inside_counts = dict.fromkeys(MEASURES, 0)
+    for name, distance, figures, synthetic in rows:
+        cells, quantile_cells = [], []
         for measure in MEASURES:
-            low, middle, high = np.nanquantile([m[measure] for m in made], [0.1, 0.5, 0.9])
-            inside[measure] += low <= figures[measure] <= high
+            low, middle, high = np.nanquantile([m[measure] for m in synthetic], [0.1, 0.5, 0.9])
+            inside_counts[measure] += low <= figures[measure] <= high
             cells.append(f"{figures[measure]:17.3g}")
-            below.append(f"{low:5.3g} {middle:5.3g} {high:5.3g}")
+            quantile_cells.append(f"{low:5.3g} {middle:5.3g} {high:5.3g}")
         print(f"{name:>14} {distance:5.1f} " + " ".join(cells))
-        print(f"{'wild':>14} {'':5} " + " ".join(f"{cell:>17}" for cell in below))
+        print(f"{'wild':>14} {'':5} " + " ".join(f"{cell:>17}" for cell in quantile_cells))
     print("real people within the synthetic 10 to 90 percent, of", len(rows), end=": ")
-    print(", ".join(f"{measure} {hits}" for measure, hits in inside.items()))
+    print(", ".join(f"{measure} {hits}" for measure, hits in inside_counts.items()))
     ratio = {
         measure: np.nanmedian(
-            [f[measure] / max(np.nanmedian([m[measure] for m in made]), 1e-9) for *_, f, made in rows]
+            [f[measure] / max(np.nanmedian([m[measure] for m in synthetic]), 1e-9) for *_, f, synthetic in rows]
         )
         for measure in MEASURES
     }
@@ -211,8 +211,8 @@ def draw(rows: list[tuple], path: Path) -> None:
 
     figure, axes = plt.subplots(2, 4, figsize=(11, 4.6))
     for axis, measure in zip(axes.flat, MEASURES, strict=False):
-        for _, distance, figures, made in rows:
-            low, middle, high = np.nanquantile([m[measure] for m in made], [0.1, 0.5, 0.9])
+        for _, distance, figures, synthetic in rows:
+            low, middle, high = np.nanquantile([m[measure] for m in synthetic], [0.1, 0.5, 0.9])
             axis.plot([distance, distance], [low, high], color="0.75", linewidth=5, solid_capstyle="butt")
             axis.plot(distance, middle, "_", color="0.35", markersize=9)
             axis.plot(distance, figures[measure], "o", color="crimson", markersize=4)
@@ -243,9 +243,9 @@ def draw_crops(real: list, crops: list, path: Path) -> None:
     for column, (name, distance, points, _, box) in enumerate(real):
         people = [(points, box)] + [(p, b) for p, _, b in crops[column][:3]]
         for row, (cloud, crop) in enumerate(people):
-            ahead = crop.center[:2] / np.linalg.norm(crop.center[:2])
+            forward = crop.center[:2] / np.linalg.norm(crop.center[:2])
             local = cloud - crop.center
-            for k, values in enumerate((local[:, :2] @ [ahead[1], -ahead[0]], local[:, :2] @ ahead)):
+            for k, values in enumerate((local[:, :2] @ [forward[1], -forward[0]], local[:, :2] @ forward)):
                 axis = axes[2 * row + k, column]
                 axis.plot(values, local[:, 2], ".", color="crimson" if row == 0 else "black", markersize=2.5)
                 axis.set(xlim=(-0.9, 0.9), ylim=(-1.2, 1.2), aspect="equal", xticks=[], yticks=[])

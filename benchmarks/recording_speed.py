@@ -3,10 +3,9 @@
     python benchmarks/recording_speed.py --sweeps 1000
 
 A street of the generator is seen by an OS1-128, of whose returns every other one is kept, about 100,000 a sweep; the
-frames are repeated forth and back. Printed are wall and processor time a sweep, what each part takes (the detector
-runs beside them, a frame ahead), people a sweep,
-tracks, and the memory after a tenth of the sweeps and after all. On a machine that does something else, the processor
-time tells more.
+frames are repeated forth and back. Printed are wall and processor time a sweep, what each part takes (the detector runs
+beside them, a frame ahead), people a sweep, tracks, and the memory after a tenth of the sweeps and after all. On a
+machine that does something else, the processor time tells more.
 """
 
 import argparse
@@ -80,9 +79,9 @@ def main() -> None:
                 memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10)
         count = options.sweeps
         wall, processor = (time.perf_counter() - wall) / count, (time.process_time() - processor) / count
-        each = ", ".join(f"{name} {value / count:.0f}" for name, value in parts.items())
+        times = ", ".join(f"{name} {value / count:.0f}" for name, value in parts.items())
         print(
-            f"{'with tracks' if track else 'without tracks'}: {1 / wall:.1f} sweeps/s, {wall * 1e3:.0f} ms ({each}), "
+            f"{'with tracks' if track else 'without tracks'}: {1 / wall:.1f} sweeps/s, {wall * 1e3:.0f} ms ({times}), "
             f"{processor * 1e3:.0f} ms of processors; {people / count:.1f} people a sweep"
             f"{f', {len(tracks)} tracks' if track else ''}; {' -> '.join(f'{size:.0f}' for size in memory)} MiB"
         )

@@ -60,7 +60,7 @@ def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
 def _longest() -> dict[int, dict[str, float]]:
     """The figures of `tiny` as it ships, by the number of people that it has seen in all its runs."""
     scores = {name: figure["value"] for name, figure in figures(_scored("tiny").results[0]).items()}
-    return {sum(one["people_seen"] for one in runs_of(read_header(bundled_path("tiny")).card)): scores}
+    return {sum(entry["people_seen"] for entry in runs_of(read_header(bundled_path("tiny")).card)): scores}
 
 
 def strays(**networks: str) -> str:
@@ -99,9 +99,9 @@ def _cell(line: MetricRow) -> str:
     return f"{line.value:.1f} {_interval(line)}".rstrip()
 
 
-def headline(*models: str) -> str:
-    """The bundled models side by side."""
-    wanted = {
+def headline(bench: str, **files: str) -> str:
+    """What the scores of a bench say of networks side by side. files: title -> name of the scores."""
+    figure_by_title = {
         "MPJPE, mm": ("all", "mpjpe"),
         "95th percentile of people's errors, mm": ("all", "mpjpe_p95"),
         "PA-MPJPE, mm": ("all", "pa_mpjpe"),
@@ -113,33 +113,39 @@ def headline(*models: str) -> str:
         "confidence: AUROC, %": ("all", "auroc"),
     }
     rows = []
-    for name, (of, figure) in wanted.items():
+    for name, (of, figure) in figure_by_title.items():
         cells = []
-        for model in models:
-            lines = (x for x in own_lines(_scored(model).results[0]) if x.figure == figure)
+        for file in files.values():
+            lines = (x for x in own_lines(_scored(file).results[0]) if x.figure == figure)
             line = next(x for x in lines if of in (x.group, x.of))
             cells.append(_cell(line))
         rows.append((name, *cells))
-    return table(("lidarpose-bench", *(f"`{model}`" for model in models)), rows)
+    return table((bench, *files), rows)
 
 
 _MEAN_POSE = f"{BASELINE}mean pose, true facing"
+# the bundled models, and the default one of before
+_FIRST = {"`tiny`": "tiny", "`small` of 0.2.0": "small-before", "`small`": "small"}
+_SECOND = {"`tiny`": "tiny-2", "`small` of 0.2.0": "small-2-before", "`small`": "small-2"}
 _CONDITIONS = ("clean", "cluttered", "company", "crop", "occluded")
 
 
 def _mpjpe(file: str, method: str) -> dict[tuple[str, str], MetricRow]:
     """Lines of MPJPE on lidarpose-bench, by group and by what of it."""
     lines = _scored(file).results[0].lines
-    wanted = (x for x in lines if (x.method, x.figure, x.arithmetic) == (method, "mpjpe", "lidarpose"))
-    return {(line.group, line.of): line for line in wanted}
+    mpjpe_lines = (x for x in lines if (x.method, x.figure, x.arithmetic) == (method, "mpjpe", "lidarpose"))
+    return {(line.group, line.of): line for line in mpjpe_lines}
 
 
 def readme() -> str:
     """The headline: the default network, the mean pose beside it, and what the paper prints for its own data."""
-    own, mean_pose = _mpjpe(DEFAULT, DEFAULT)["all", "all"], _mpjpe(DEFAULT, _MEAN_POSE)["all", "all"]
+    network_line, mean_pose = _mpjpe(DEFAULT, DEFAULT)["all", "all"], _mpjpe(DEFAULT, _MEAN_POSE)["all", "all"]
     dapt = next(method for method in published()["methods"] if method["method"] == "DAPT")["figures"]["waymo"]
     rows = [
-        (f"**`{DEFAULT}`, the default, on `lidarpose-bench`**", f"**{own.value:.1f}** {_interval(own)}"),
+        (
+            f"**`{DEFAULT}`, the default, on `lidarpose-bench`**",
+            f"**{network_line.value:.1f}** {_interval(network_line)}",
+        ),
         ("the mean pose with the true facing, on the same people", f"{mean_pose.value:.1f}"),
         ("for context: the paper's network on Waymo, as printed, not run here", f"{dapt['mpjpe']:.1f}"),
     ]
@@ -148,8 +154,8 @@ def readme() -> str:
 
 def conditions() -> str:
     """The default network by condition, the sensor's position known or not, beside the mean pose."""
-    wanted = [("all", "all"), *(("condition", name) for name in _CONDITIONS)]
-    wanted.append(("plain", f"{_PLAIN}, 100 points"))
+    groups = [("all", "all"), *(("condition", name) for name in _CONDITIONS)]
+    groups.append(("plain", f"{_PLAIN}, 100 points"))
     sources = {
         "sensor's position known": (DEFAULT, DEFAULT),
         "unknown": (f"{DEFAULT}-unknown", DEFAULT),
@@ -158,15 +164,14 @@ def conditions() -> str:
     rows = []
     for name, source in sources.items():
         lines = _mpjpe(*source)
-        rows.append((name, *(f"{lines[group].value:.1f}" for group in wanted)))
-    return table(("MPJPE, mm", *(changed.WORDS.get(of, of) for _, of in wanted)), rows)
+        rows.append((name, *(f"{lines[group].value:.1f}" for group in groups)))
+    return table(("MPJPE, mm", *(changed.WORDS.get(of, of) for _, of in groups)), rows)
 
 
 def second_bench(group: str) -> str:
     """MPJPE of the bundled models, and of the default one of before, on lidarpose-bench-2 by a group of people, the
     default's worst last."""
-    files = {"`tiny`": "tiny-2", "`small` of 0.2.0": "small-2-before", "`small`": "small-2"}
-    scores = {name: _mpjpe(file, _scored(file).results[0].setting.method) for name, file in files.items()}
+    scores = {name: _mpjpe(file, _scored(file).results[0].setting.method) for name, file in _SECOND.items()}
     lines = [line for key, line in scores["`small`"].items() if key[0] in ("all", group)]
     lines.sort(key=lambda line: (line.group != "all", line.value))
     rows = []
@@ -178,14 +183,16 @@ def second_bench(group: str) -> str:
 
 def persons() -> str:
     """How well networks that say whether somebody is there tell so, on lidarpose-bench-2."""
-    wanted = {
+    figure_by_title = {
         "`person`: people before objects": "person_auroc",
         "`second_person`: crops of two people before those of one": "second_person_auroc",
     }
     lines = {(model, line.figure): line for model in BUNDLED for line in own_lines(_scored(f"{model}-2").results[0])}
     models = [model for model in BUNDLED if (model, "person_auroc") in lines]
     # one decimal would round to more than it is
-    rows = [(what, *(f"{lines[model, figure].value:.2f}" for model in models)) for what, figure in wanted.items()]
+    rows = [
+        (what, *(f"{lines[model, figure].value:.2f}" for model in models)) for what, figure in figure_by_title.items()
+    ]
     return table(("AUROC, %", *(f"`{model}`" for model in models)), rows)
 
 
@@ -205,7 +212,9 @@ def card(model: str) -> str:
         ("hours", _in_all(runs, "hours", ".2f")),
         ("captured motion", f"{card['motion']}, subjects {', '.join(card['recipe']['subjects']) or 'all'}"),
     ]
-    stages = [f"{run['recipe']['init']} ({before['people_seen']:,} people)" for run, before in pairwise(runs)]
+    stages = [
+        f"{run['recipe']['init']} ({previous_run['people_seen']:,} people)" for run, previous_run in pairwise(runs)
+    ]
     if stages:
         rows.append(("started from", ", itself from ".join(stages)))
     if "note" in card:
@@ -228,19 +237,19 @@ def progress(model: str) -> str:
 
 def _in_all(runs: list[dict], name: str, form: str) -> str:
     """A number of the last run, and of all of them."""
-    own = f"{runs[0][name]:{form}}"
-    return own if len(runs) == 1 else f"{own}; over all runs {sum(run[name] for run in runs):{form}}"
+    last_value = f"{runs[0][name]:{form}}"
+    return last_value if len(runs) == 1 else f"{last_value}; over all runs {sum(run[name] for run in runs):{form}}"
 
 
 def extras(model: str) -> str:
     """What test-time extras bring; see test_time.py."""
     rows = []
     report = _read("test_time")[model]
-    usual = next(one for one in report["ways"] if one["usual"])
-    for one in report["ways"]:
-        cost = one["seconds"] / usual["seconds"]
-        figures = [f"{one['figures'][name]['value']:.1f}" for name in ("all", "plain", "cluttered", "occluded")]
-        rows.append((one["what"], *figures, f"{one['figures']['turned round']['value']:.1f} %", f"{cost:.1f}"))
+    usual_entry = next(entry for entry in report["ways"] if entry["usual"])
+    for entry in report["ways"]:
+        cost = entry["seconds"] / usual_entry["seconds"]
+        figures = [f"{entry['figures'][name]['value']:.1f}" for name in ("all", "plain", "cluttered", "occluded")]
+        rows.append((entry["what"], *figures, f"{entry['figures']['turned round']['value']:.1f} %", f"{cost:.1f}"))
     return table(("", "MPJPE mm", "plain", "cluttered", "occluded", changed.WORDS["turned round"], "cost"), rows)
 
 
@@ -248,11 +257,11 @@ def visibility() -> str:
     """Conditions against clean people of whom as much is hidden; see visibility.py."""
     rows = []
     for model, rows_of_model in _read("visibility").items():
-        for one in rows_of_model:
-            ratio = f"{one['ratio']:.2f} [{one['low']:.2f}, {one['high']:.2f}]"
-            mm, clean = f"{one['mm']:.1f}", f"{one['clean']:.1f}"
-            condition = changed.WORDS.get(one["condition"], one["condition"])
-            rows.append((f"`{model}`", condition, mm, clean, ratio, str(one["people"])))
+        for entry in rows_of_model:
+            ratio = f"{entry['ratio']:.2f} [{entry['low']:.2f}, {entry['high']:.2f}]"
+            mm, clean = f"{entry['mm']:.1f}", f"{entry['clean']:.1f}"
+            condition = changed.WORDS.get(entry["condition"], entry["condition"])
+            rows.append((f"`{model}`", condition, mm, clean, ratio, str(entry["people"])))
     return table(("", "condition", "MPJPE mm", "clean, equally hidden: mm", "ratio", "people"), rows)
 
 
@@ -260,17 +269,17 @@ def real() -> str:
     """Real people; see real.py."""
     rows = [
         (
-            one["sweep"].removeprefix("sweep_"),
-            one["person"],
-            str(one["points"]),
-            f"{one['distance']:.1f}",
-            f"{one['turn']:.0f} deg",
-            f"{one['turn_of_four']:.0f} deg",
-            f"{100 * one['near']:.0f} %",
-            f"{one['lean']:.0f} deg",
-            f"{one['confidence']:.2f}",
+            entry["sweep"].removeprefix("sweep_"),
+            entry["person"],
+            str(entry["points"]),
+            f"{entry['distance']:.1f}",
+            f"{entry['turn']:.0f} deg",
+            f"{entry['turn_of_four']:.0f} deg",
+            f"{100 * entry['near']:.0f} %",
+            f"{entry['lean']:.0f} deg",
+            f"{entry['confidence']:.2f}",
         )
-        for one in _read("real")["people"]
+        for entry in _read("real")["people"]
     ]
     header = ("sweep", "person", "points", "distance m", "facing relative to the box", "the same, `--tta 4`")
     return table((*header, "points within 15 cm of a bone", "trunk lean", "confidence"), rows)
@@ -279,26 +288,29 @@ def real() -> str:
 def clips() -> str:
     """Poses over clips made steady; see clips.py."""
     rows = []
-    for name, way in _read("clips")["ways"].items():
+    for name, scores in _read("clips")["ways"].items():
         cells = [name]
         for figure in ("mpjpe", "acceleration"):
-            less, low, high = way[f"{figure}_less"]
-            cells.append(f"{way[figure]['value']:.1f}" + (f" (-{less:.0f} % [{low:.0f}, {high:.0f}])" if less else ""))
-        turned = f"{way['turned_clips_of_these']} of {way['clips_mostly_right']}"
-        rows.append((*cells, f"{way['pa_mpjpe']:.1f}", turned, f"{way['bone_deviation']:.1f}"))
+            reduction, low, high = scores[f"{figure}_less"]
+            cells.append(
+                f"{scores[figure]['value']:.1f}"
+                + (f" (-{reduction:.0f} % [{low:.0f}, {high:.0f}])" if reduction else "")
+            )
+        turned = f"{scores['turned_clips_of_these']} of {scores['clips_mostly_right']}"
+        rows.append((*cells, f"{scores['pa_mpjpe']:.1f}", turned, f"{scores['bone_deviation']:.1f}"))
     header = ("", "MPJPE mm", "acceleration error, mm a frame squared", "PA-MPJPE mm")
     return table((*header, "clips with a flipped frame", "bone lengths, deviation mm"), rows)
 
 
 def moved() -> str:
     """How far real people's joints went between two sweeps; see real.py."""
-    rows = [(one["person"], f"{one['mm']:.0f}") for one in _read("real")["tracks"]]
+    rows = [(entry["person"], f"{entry['mm']:.0f}") for entry in _read("real")["tracks"]]
     return table(("person", "mean over joints, mm"), rows)
 
 
 def detector(dataset: str, *groups: str) -> str:
     """Recall of people in whole scans by false people a scan; see `lidarpose evaluate detector`."""
-    result = next(one for one in _read("detector")["results"] if one["dataset"] == dataset)
+    result = next(candidate for candidate in _read("detector")["results"] if candidate["dataset"] == dataset)
     rows = [row for row in result["rows"] if row["figure"] == "recall" and row["group"] in groups]
     cells: dict[tuple[str, str], dict[str, str]] = {}
     for row in rows:
@@ -307,17 +319,17 @@ def detector(dataset: str, *groups: str) -> str:
         name = row["group"] if row["of"] == "all" else f"{row['group']}: {row['of']}"
         cells.setdefault((name, f"{row['count']:,}"), {})[row["at"]] = value
     header = ("recall, % (false people a scan)", "people", *result["thresholds"])
-    return table(header, [(*key, *(own[at] for at in result["thresholds"])) for key, own in cells.items()])
+    return table(header, [(*key, *(row_cells[at] for at in result["thresholds"])) for key, row_cells in cells.items()])
 
 
 def detected_boxes() -> str:
     """Poses in boxes of the detector beside those in labeled ones; see `lidarpose evaluate detector`."""
-    result = next(one for one in _read("detector")["results"] if one["dataset"] == "heldout")
+    result = next(candidate for candidate in _read("detector")["results"] if candidate["dataset"] == "heldout")
     figures = {name: f"mpjpe_{name}" for name in ("found", "given", "difference")}
     rows = []
     for at, words in (("1", "one false person a scan"), ("default", "the default score")):
-        of = {row["figure"]: row for row in result["rows"] if row["at"] == at}
-        cells = [of[figure] for figure in figures.values()]
+        row_by_figure = {row["figure"]: row for row in result["rows"] if row["at"] == at}
+        cells = [row_by_figure[figure] for figure in figures.values()]
         values = [f"{cell['value']:.1f} [{cell['low']:.1f}, {cell['high']:.1f}]" for cell in cells]
         rows.append((words, f"{cells[0]['count']:,}", *values))
     return table(("people found at", "people", "MPJPE in found boxes, mm", "in labeled boxes", "difference"), rows)
@@ -325,7 +337,7 @@ def detected_boxes() -> str:
 
 def calibration() -> str:
     """Whether confidence and visibility can be taken at their word; see calibration.py."""
-    rows = [(one["what"], f"{one['ece']:.3f}", f"{one['auroc']:.3f}") for one in _read("calibration")["stated"]]
+    rows = [(entry["what"], f"{entry['ece']:.3f}", f"{entry['auroc']:.3f}") for entry in _read("calibration")["stated"]]
     return table(("", "expected calibration error", "AUROC"), rows)
 
 
@@ -333,7 +345,8 @@ def spread() -> str:
     """What `spread` predicts beside the truth; see calibration.py."""
     report = _read("calibration")
     rows = [
-        (one["of"], f"{one['share']:.1f} %", f"{one['stated']:.1f}", f"{one['true']:.1f}") for one in report["spread"]
+        (entry["of"], f"{entry['share']:.1f} %", f"{entry['stated']:.1f}", f"{entry['true']:.1f}")
+        for entry in report["spread"]
     ]
     rows.append(("rank correlation of the two", "", "", f"{report['rank']:.2f}"))
     return table(("`spread`", "joints", "predicted, mm", "true, mm"), rows)
@@ -341,7 +354,7 @@ def spread() -> str:
 
 def rejection(model: str) -> str:
     report = _read("test_time")[model]["rejection"]
-    rows = [(f"{one['kept']:.0f} %", f"{one['people']:.1f}", f"{one['joints']:.1f}") for one in report]
+    rows = [(f"{entry['kept']:.0f} %", f"{entry['people']:.1f}", f"{entry['joints']:.1f}") for entry in report]
     return table(
         ("kept", "people with the highest mean confidence: mm", "joints with the highest confidence: mm"), rows
     )
@@ -373,37 +386,47 @@ def paper(name: str) -> str:
 
 def tables() -> dict[str, Callable[[], str]]:
     """What makes each table, by name."""
-    every = [run | _labels(run["variant"]) for run in _read(RUNS)]
-    runs, later = ([run for run in every if bool(run["begun"]) == begun] for begun in (False, True))
-    longer = [run for run in runs if run["people"] == LONGER]
-    asked = {name: (runs, {name}) for name in {run["study"] for run in runs}}
-    asked |= {
+    all_runs = [run | _labels(run["variant"]) for run in _read(RUNS)]
+    runs, later_runs = (
+        [run for run in all_runs if bool(run["begun"]) == is_continued] for is_continued in (False, True)
+    )
+    longer_runs = [run for run in runs if run["people"] == LONGER]
+    studies = {name: (runs, {name}) for name in {run["study"] for run in runs}}
+    studies |= {
         "more": (runs, _MORE),
-        "longer": (longer, {run["study"] for run in longer} - {"paper"}),
-        "continued": (later, None),
+        "longer": (longer_runs, {run["study"] for run in longer_runs} - {"paper"}),
+        "continued": (later_runs, None),
     }
-    made = {f"study {name}": lambda some=some: table(*changed.study(*some)) for name, some in asked.items()}
-    made["noise"], made["noise continued"] = partial(changed.noise, runs), partial(changed.noise, later)
-    made["scaling"] = lambda: table(*changed.scaling(runs, _longest()))
-    made["against the paper"] = lambda: table(*changed.against_paper(runs))
-    made["speed"] = lambda: table(*timed.medians(_read("speed")))
-    made["speed ratios"] = lambda: table(*timed.ratios(_read("speed")["targets"]))
-    made |= {"calibration": calibration, "spread": spread, "real moved": moved, "clips": clips}
+    makers = {
+        f"study {name}": lambda arguments=arguments: table(*changed.study(*arguments))
+        for name, arguments in studies.items()
+    }
+    makers["noise"], makers["noise continued"] = partial(changed.noise, runs), partial(changed.noise, later_runs)
+    makers["scaling"] = lambda: table(*changed.scaling(runs, _longest()))
+    makers["against the paper"] = lambda: table(*changed.against_paper(runs))
+    makers["speed"] = lambda: table(*timed.medians(_read("speed")))
+    makers["speed ratios"] = lambda: table(*timed.ratios(_read("speed")["targets"]))
+    makers |= {"calibration": calibration, "spread": spread, "real moved": moved, "clips": clips}
     for group in ("points", "kind", "sensor", "activity", "condition", "distance, m"):
-        own = ("all", "points", "mounted, all") if group == "points" else (group, f"{group}, 50 points and more")
-        made |= {f"detector {name} by {group}": partial(detector, name, *own) for name in ("heldout", "real")}
-    made |= {"visibility": visibility, "real": real, "tracks": tracks, "detected boxes": detected_boxes}
-    made |= {f"paper {path.stem}": partial(paper, path.stem) for path in sorted((SCORES / "paper").glob("*.json"))}
-    made["headline"] = partial(headline, *BUNDLED)
-    made |= {"readme": readme, "conditions": conditions}
-    made |= {
+        recall_groups = (
+            ("all", "points", "mounted, all") if group == "points" else (group, f"{group}, 50 points and more")
+        )
+        makers |= {
+            f"detector {name} by {group}": partial(detector, name, *recall_groups) for name in ("heldout", "real")
+        }
+    makers |= {"visibility": visibility, "real": real, "tracks": tracks, "detected boxes": detected_boxes}
+    makers |= {f"paper {path.stem}": partial(paper, path.stem) for path in sorted((SCORES / "paper").glob("*.json"))}
+    makers["headline"] = partial(headline, "lidarpose-bench", **_FIRST)
+    makers["headline bench-2"] = partial(headline, "lidarpose-bench-2", **_SECOND)
+    makers |= {"readme": readme, "conditions": conditions}
+    makers |= {
         f"bench-2 by {group}": partial(second_bench, group) for group in ("condition", "poses", "family", "sensor")
     }
-    made["bench-2 persons"] = persons
-    made["stability"] = lambda: table(("", "undisturbed", *5 * ("",)), disturbed.curves(DEFAULT))
-    made["stability sensors"] = lambda: table(("sensor", "points", "MPJPE mm"), disturbed.sensors(DEFAULT))
-    made["stability ends"] = lambda: table(("", "mean, mm", "deviation"), disturbed.ends(DEFAULT))
-    made["strays"] = partial(
+    makers["bench-2 persons"] = persons
+    makers["stability"] = lambda: table(("", "undisturbed", *5 * ("",)), disturbed.curves(DEFAULT))
+    makers["stability sensors"] = lambda: table(("sensor", "points", "MPJPE mm"), disturbed.sensors(DEFAULT))
+    makers["stability ends"] = lambda: table(("", "mean, mm", "deviation"), disturbed.ends(DEFAULT))
+    makers["strays"] = partial(
         strays,
         paper="the paper's design, faster rates, 98,304 people",
         ours="ours: `tiny` without convolutions, 98,304 people",
@@ -411,17 +434,17 @@ def tables() -> dict[str, Callable[[], str]]:
         small="`small` as it ships",
     )
     for model in BUNDLED:
-        made |= {f"{model} card": partial(card, model), f"{model} progress": partial(progress, model)}
+        makers |= {f"{model} card": partial(card, model), f"{model} progress": partial(progress, model)}
         groups = dict.fromkeys(["all+condition", *(line.group for line in own_lines(_scored(model).results[0]))])
-        made |= {f"{model} by {group}": partial(shipped, model, group) for group in groups}
-        made |= {f"{model} extras": partial(extras, model), f"{model} rejection": partial(rejection, model)}
-    return made
+        makers |= {f"{model} by {group}": partial(shipped, model, group) for group in groups}
+        makers |= {f"{model} extras": partial(extras, model), f"{model} rejection": partial(rejection, model)}
+    return makers
 
 
 def written(page: str) -> str:
     """The page, its tables made anew. Raises KeyError for a table that nothing makes."""
-    made = tables()
-    return _MARKED.sub(lambda match: match[1] + "\n" + made[match[2]]() + "\n" + match[3], page)
+    makers = tables()
+    return _MARKED.sub(lambda match: match[1] + "\n" + makers[match[2]]() + "\n" + match[3], page)
 
 
 def main() -> None:
@@ -436,11 +459,11 @@ def main() -> None:
         return
     for path in PAGES:
         page = path.read_text()
-        new = written(page)
-        if options.check and new != page:
+        new_page = written(page)
+        if options.check and new_page != page:
             sys.exit(f"{path.name} is not what docs/scores say: run benchmarks/results.py")
         if not options.check:
-            write_atomic(path, new)
+            write_atomic(path, new_page)
 
 
 if __name__ == "__main__":

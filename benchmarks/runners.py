@@ -49,36 +49,36 @@ def crops(number: int, rng: np.random.Generator) -> list[Example]:
     halves: tuple[list, list] = [], []
     index = 0
     while min(map(len, halves)) < number // 2:
-        one = example(generator.person(1, index, hard=math.sqrt(rng.random())).sample, rng)
-        halves[len(one.points) > CROP_POINTS].append(one)
+        person = example(generator.person(1, index, hard=math.sqrt(rng.random())).sample, rng)
+        halves[len(person.points) > CROP_POINTS].append(person)
         index += 1
     return halves[0][: number // 2] + halves[1][: number // 2]
 
 
 def of_points(people: list[Example], n: int, number: int, rng: np.random.Generator) -> list[Example]:
     """The `number` people whose points are nearest to n in number, brought to exactly n."""
-    near = sorted(people, key=lambda e: abs(math.log(len(e.points) / n)))[:number]
-    near = [near[k % len(near)] for k in rng.permutation(number)]
-    return [_resampled(one, n, rng) for one in near]
+    nearest_people = sorted(people, key=lambda e: abs(math.log(len(e.points) / n)))[:number]
+    nearest_people = [nearest_people[k % len(nearest_people)] for k in rng.permutation(number)]
+    return [_resampled(person, n, rng) for person in nearest_people]
 
 
-def _resampled(one: Example, n: int, rng: np.random.Generator) -> Example:
-    have = len(one.points)
-    kept = rng.permutation(have)[:n]
-    more = rng.integers(have, size=n - len(kept))
-    doubled = one.points[more] + rng.normal(0, SPREAD, (len(more), 3)).astype(np.float32)
+def _resampled(person: Example, n: int, rng: np.random.Generator) -> Example:
+    num_points = len(person.points)
+    kept_rows = rng.permutation(num_points)[:n]
+    repeated_rows = rng.integers(num_points, size=n - len(kept_rows))
+    repeated_points = person.points[repeated_rows] + rng.normal(0, SPREAD, (len(repeated_rows), 3)).astype(np.float32)
     return replace(
-        one,
-        points=np.concatenate([one.points[kept], doubled]),
-        part=one.part[np.concatenate([kept, more])],
+        person,
+        points=np.concatenate([person.points[kept_rows], repeated_points]),
+        part=person.part[np.concatenate([kept_rows, repeated_rows])],
     )
 
 
 def batches(people: list[Example], size: int, number: int) -> list[list[Example]]:
     """`number` batches of `size`, sorted by voxels as `train.data_loader` sorts a chunk; every k-th of too many."""
     order = sorted(people, key=lambda e: len(np.unique(np.floor(e.points * 10), axis=0)))
-    picked = [order[k * len(order) // (size * number)] for k in range(size * number)]
-    return [picked[k * size : (k + 1) * size] for k in range(number)]
+    selected_people = [order[k * len(order) // (size * number)] for k in range(size * number)]
+    return [selected_people[k * size : (k + 1) * size] for k in range(number)]
 
 
 class Runner:
@@ -152,16 +152,16 @@ class Ours(Runner):
 
     def voxelize(self, people: list[Example]):
         return voxelize(
-            np.concatenate([one.points for one in people]),
-            np.array([len(one.points) for one in people]),
+            np.concatenate([person.points for person in people]),
+            np.array([len(person.points) for person in people]),
             grid=self.config.grid,
             max_voxels=self.config.max_voxels,
-            view=np.stack([one.view for one in people]),
+            view=np.stack([person.view for person in people]),
             neighbors=self.config.convolution,
         )
 
     def tables(self, people):
-        return Batch.from_arrays(self.plan(people).arrays(), self.device)
+        return Batch.from_arrays(self.voxelize(people).arrays(), self.device)
 
     @torch.inference_mode()
     def joints(self, tables):
@@ -197,7 +197,7 @@ class Onnx(Runner):
 
         super().__init__(f"{ours.name} ONNX", None)
         self.parameters = ours.parameters
-        self.plan = ours.plan
+        self.voxelize = ours.voxelize
         self.file, self.backend = onnx, backend
         self.session = onnx.open_onnx(path, threads=threads)[0]
         self.decoder = decode.decoder("window")
@@ -205,7 +205,7 @@ class Onnx(Runner):
         self.outputs = [name for name in onnx.OUTPUTS if name != "part"]
 
     def tables(self, people):
-        arrays = self.plan(people).arrays()
+        arrays = self.voxelize(people).arrays()
         return {self.file.input_name(name): array for name, array in arrays.items()}
 
     def joints(self, tables):
@@ -237,7 +237,7 @@ class Predict(Runner):
         self.predictor, self.parameters = predictor, parameters
 
     def tables(self, people):
-        return [one.points for one in people]
+        return [person.points for person in people]
 
     def joints(self, tables):
         return [self.predictor.predict(points) for points in tables]
@@ -260,7 +260,7 @@ class Paper(Runner):
         self.order = self.config.order_in(BODY26)
 
     def _tables(self, people: list[Example]):
-        return self.build([one.points for one in people], self.config, layout=self.layout)
+        return self.build([person.points for person in people], self.config, layout=self.layout)
 
     def tables(self, people):
         return self.tensors(self._tables(people), self.device)
@@ -271,8 +271,8 @@ class Paper(Runner):
 
     def lesson(self, people):
         tables = self._tables(people)
-        part = np.concatenate([one.part for one in people])[tables.kept]
-        true = np.stack([one.joints for one in people])
+        part = np.concatenate([person.part for person in people])[tables.kept]
+        true = np.stack([person.joints for person in people])
         # the place of each of this skeleton's joints among the network's, turned round
         place = np.argsort(self.order)
         return tables, torch.as_tensor(true[:, place]), torch.as_tensor(part, dtype=torch.int64)
@@ -280,23 +280,23 @@ class Paper(Runner):
     def loss(self, lesson):
         tables, true, part = lesson
         true, part = true.to(self.device), part.to(self.device)
-        out = self.network(self.tensors(tables, self.device))
-        heads = (out.joints(), out.coordinates, out.inter)
-        return sum(_distance(joints, true) for joints in heads) + nn.functional.cross_entropy(out.parts, part)
+        outputs = self.network(self.tensors(tables, self.device))
+        heads = (outputs.joints(), outputs.coordinates, outputs.inter)
+        return sum(_distance(joints, true) for joints in heads) + nn.functional.cross_entropy(outputs.parts, part)
 
 
 class Baseline(Runner):
     """One of `backbones`."""
 
     def tables(self, people):
-        return self.network.prepare([one.points for one in people])
+        return self.network.prepare([person.points for person in people])
 
     @torch.inference_mode()
     def joints(self, tables):
         return self.network(tables).numpy()
 
     def lesson(self, people):
-        return self.tables(people), torch.as_tensor(np.stack([one.joints for one in people]))
+        return self.tables(people), torch.as_tensor(np.stack([person.joints for person in people]))
 
     def loss(self, lesson):
         tables, true = lesson
@@ -312,17 +312,19 @@ def baselines(size: str) -> dict[str, Callable[[], nn.Module]]:
     """By name, the networks that stand beside a size of ours, with as many parameters."""
     kinds = {"ViT": GroupedViT, "PointNet++": PointNet2}
     parameters = count(PoseNet(preset(size)))
-    made = {f"{name} as {size}": (lambda kind=kind: kind.of_parameters(parameters)) for name, kind in kinds.items()}
-    return {DRAFT if size == "small" else f"{DRAFT} as {size}": lambda: Draft.of_parameters(parameters)} | made
+    factories = {
+        f"{name} as {size}": (lambda kind=kind: kind.of_parameters(parameters)) for name, kind in kinds.items()
+    }
+    return {DRAFT if size == "small" else f"{DRAFT} as {size}": lambda: Draft.of_parameters(parameters)} | factories
 
 
 def runner(name: str, device: str = "cpu") -> Runner:
     """A runner by name, but for those of a file. Raises ImportError where its code is not there."""
     if name in SIZES:
         return Paper(device) if name == "paper" else Ours(name, device)
-    beside = baselines("tiny") | baselines("small")
+    factories = baselines("tiny") | baselines("small")
     torch.manual_seed(0)
-    return Baseline(name, beside[name](), device)
+    return Baseline(name, factories[name](), device)
 
 
 def runners_of(options: argparse.Namespace, folder: Path, left_out: list[str]) -> list[Runner]:
@@ -332,16 +334,16 @@ def runners_of(options: argparse.Namespace, folder: Path, left_out: list[str]) -
         names.append(size)
         if size in ("tiny", "small") and options.device == "cpu":
             names += baselines(size)
-    made = []
+    runners = []
     for name in names:
         try:
-            made.append(runner(name, options.device))
+            runners.append(runner(name, options.device))
         except ImportError as error:
             left_out.append(f"{name}: cannot be imported ({error})")
             continue
-        if isinstance(made[-1], Ours) and options.device == "cpu" and not options.no_onnx:
-            made += _from_files(made[-1], folder, options.threads, left_out)
-    return made
+        if isinstance(runners[-1], Ours) and options.device == "cpu" and not options.no_onnx:
+            runners += _from_files(runners[-1], folder, options.threads, left_out)
+    return runners
 
 
 def _from_files(ours: Ours, folder: Path, threads: int, left_out: list[str]) -> Iterator[Runner]:
@@ -354,9 +356,9 @@ def _from_files(ours: Ours, folder: Path, threads: int, left_out: list[str]) -> 
         say(f"exporting {ours.name} to ONNX")
         save_checkpoint(weights, ours.network, card={})
         export(weights, path)
-        whole, bare = Onnx(ours, path, threads), Session(ours, path, threads)
-        bare.name += ", session"
-        yield from (whole, bare)
+        onnx_runner, session_runner = Onnx(ours, path, threads), Session(ours, path, threads)
+        session_runner.name += ", session"
+        yield from (onnx_runner, session_runner)
     # whatever an exporter or a runtime raises: the other rows are worth having without this one
     except Exception as error:
         left_out.append(f"{ours.name} ONNX: {reason(error)}")
@@ -368,10 +370,10 @@ def _from_files(ours: Ours, folder: Path, threads: int, left_out: list[str]) -> 
 
             if backend == "onnx" and "backend" not in inspect.signature(load).parameters:
                 raise ImportError("this version's predictor has no ONNX backend")
-            wanted = {"backend": backend, "threads": threads}
-            known = inspect.signature(load).parameters
-            chosen = {name: value for name, value in wanted.items() if name in known}
-            yield Predict(f"tiny predict(), {backend}", load(weights, tta=1, **chosen), ours.parameters)
+            load_options = {"backend": backend, "threads": threads}
+            load_parameters = inspect.signature(load).parameters
+            supported_options = {name: value for name, value in load_options.items() if name in load_parameters}
+            yield Predict(f"tiny predict(), {backend}", load(weights, tta=1, **supported_options), ours.parameters)
         except Exception as error:
             left_out.append(f"tiny predict(), {backend}: {reason(error)}")
 

@@ -17,12 +17,14 @@ def rate(seconds: float) -> str:
 
 def medians(found: dict) -> Rows:
     """Latency, people a second forward and in training, by points."""
-    seconds = {(one["section"], one["network"], one["points"]): one["median_s"] for one in found["times"]}
+    seconds = {(entry["section"], entry["network"], entry["points"]): entry["median_s"] for entry in found["times"]}
     rows = []
 
-    def add(section: str, unit: str, points: int | str, told: Callable[[float], str]) -> None:
-        own = [seconds.get((section, name, points)) for name in NETWORKS]
-        rows.append((f"{section}, {unit}", shown(points), *("-" if value is None else told(value) for value in own)))
+    def add(section: str, unit: str, points: int | str, format_value: Callable[[float], str]) -> None:
+        values = [seconds.get((section, name, points)) for name in NETWORKS]
+        rows.append(
+            (f"{section}, {unit}", shown(points), *("-" if value is None else format_value(value) for value in values))
+        )
 
     for points in POINTS:
         add("latency", "ms", points, lambda value: f"{1e3 * value:.2f}")
@@ -34,23 +36,25 @@ def medians(found: dict) -> Rows:
 
 def ratios(targets: list[dict]) -> Rows:
     """Single figures of network.py, by the medians and by the best rounds, without what was asked of them."""
-    rows = [(one["what"], *_figures(one)) for one in targets]
+    rows = [(target["what"], *_figures(target)) for target in targets]
     return ("", "by medians", "by best rounds"), rows
 
 
 def asked(targets: list[dict]) -> Rows:
     """Targets of network.py, and what came of them; figures are None where nothing was measured."""
     rows = []
-    for one in targets:
-        due = f"{'at most' if one['most'] else 'at least'} {one['target']:g} {one['unit']}".strip()
-        met = {None: "not measured", True: "yes", False: "**no**"}[one["met"]]
-        rows.append((one["what"], due, *_figures(one), met))
+    for target in targets:
+        requirement = f"{'at most' if target['most'] else 'at least'} {target['target']:g} {target['unit']}".strip()
+        verdict = {None: "not measured", True: "yes", False: "**no**"}[target["met"]]
+        rows.append((target["what"], requirement, *_figures(target), verdict))
     return ("", "asked", "by medians", "by best rounds", "met by medians"), rows
 
 
-def _figures(one: dict) -> list[str]:
+def _figures(target: dict) -> list[str]:
     """By the medians and by the best rounds."""
-    return ["-" if one[name] is None else f"{one[name]:,.2f} {one['unit']}".strip() for name in ("figure", "best")]
+    return [
+        "-" if target[name] is None else f"{target[name]:,.2f} {target['unit']}".strip() for name in ("figure", "best")
+    ]
 
 
 def shown(points: int | str) -> str:

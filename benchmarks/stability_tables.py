@@ -13,8 +13,8 @@ FOLDER = Path(__file__).parents[1] / "docs" / "scores" / "stability"
 @lru_cache
 def read(name: str) -> dict:
     """The study of a network."""
-    (found,) = json.loads((FOLDER / f"{name}.json").read_text())["studies"]
-    return found
+    (study,) = json.loads((FOLDER / f"{name}.json").read_text())["studies"]
+    return study
 
 
 def curves(name: str) -> list[tuple[str, ...]]:
@@ -23,9 +23,9 @@ def curves(name: str) -> list[tuple[str, ...]]:
     for curve in _curves(name).values():
         if curve["name"] == "sensors":
             continue
-        whole, *points = curve["points"]
+        undisturbed, *points = curve["points"]
         cells = [f"{point['label']}: {_error(point)}" for point in points]
-        rows.append((curve["title"], f"{whole['mpjpe']:.1f}", *cells))
+        rows.append((curve["title"], f"{undisturbed['mpjpe']:.1f}", *cells))
     return rows
 
 
@@ -44,9 +44,9 @@ def ends(name: str) -> list[tuple[str, ...]]:
 
 def strays(name: str) -> tuple[str, ...]:
     """Undisturbed, and what each amount of stray points adds, with its interval."""
-    whole, *points = _curves(name)["clusters"]["points"]
-    added = (f"{p['increase']:+.1f} [{p['increase_low']:.1f}, {p['increase_high']:.1f}]" for p in points)
-    return f"{whole['mpjpe']:.1f}", *added
+    undisturbed, *points = _curves(name)["clusters"]["points"]
+    increases = (f"{p['increase']:+.1f} [{p['increase_low']:.1f}, {p['increase_high']:.1f}]" for p in points)
+    return f"{undisturbed['mpjpe']:.1f}", *increases
 
 
 def amounts(name: str) -> tuple[str, ...]:
@@ -59,5 +59,5 @@ def _curves(name: str) -> dict[str, dict]:
 
 
 def _error(point: dict) -> str:
-    lost = f" ({point['no_pose']})" if point["no_pose"] else ""
-    return f"{point['mpjpe']:.1f}{lost}"
+    no_pose_text = f" ({point['no_pose']})" if point["no_pose"] else ""
+    return f"{point['mpjpe']:.1f}{no_pose_text}"

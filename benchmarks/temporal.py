@@ -51,17 +51,17 @@ def spline_basis(fraction: np.ndarray) -> np.ndarray:
 
 def frames_left_out(frames: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """(T,) bool: the frames of a clip at another rate or shorter, and those of them in which the person is seen."""
-    every = rng.choice([1, 1, 2, 3])
-    there = np.zeros(frames, bool)
-    there[rng.integers(every) :: every] = True
+    stride = rng.choice([1, 1, 2, 3])
+    is_present = np.zeros(frames, bool)
+    is_present[rng.integers(stride) :: stride] = True
     start, stop = np.sort(rng.integers(frames + 1, size=2))
-    if rng.random() < 0.5 and there[start:stop].sum() >= 3:
-        there[:start] = there[stop:] = False
-    seen = there.copy()
+    if rng.random() < 0.5 and is_present[start:stop].sum() >= 3:
+        is_present[:start] = is_present[stop:] = False
+    is_seen = is_present.copy()
     if rng.random() < 0.5:
         start = rng.integers(frames)
-        seen[start : start + rng.integers(1, 5)] = False
-    return there, seen
+        is_seen[start : start + rng.integers(1, 5)] = False
+    return is_present, is_seen
 
 
 def smoothed(clips: dict[str, np.ndarray], index: int, there: np.ndarray, seen: np.ndarray) -> dict | None:
@@ -76,12 +76,12 @@ def smoothed(clips: dict[str, np.ndarray], index: int, there: np.ndarray, seen: 
     )
     if track.seen.sum() < 2:
         return None
-    given, steady = settled(track), smooth(track)
+    settled_track, steady_track = settled(track), smooth(track)
     clip = {name: np.full(value.shape, np.nan) for name, value in values.items()}
     clip |= {"steady": clip["joints"].copy(), "steady_spread": clip["spread"].copy()}
     for name in _GIVEN:
-        clip[name][part] = getattr(given, name)
-    clip["steady"][part], clip["steady_spread"][part] = steady.joints, steady.spread
+        clip[name][part] = getattr(settled_track, name)
+    clip["steady"][part], clip["steady_spread"][part] = steady_track.joints, steady_track.spread
     clip["known"] = np.isfinite(clip["steady"]).all((1, 2))
     clip["there"] = there & clip["known"]
     return clip | {"true": clips["true"][index].astype(float)} if clip["there"].sum() > 1 else None
@@ -108,8 +108,8 @@ def inputs(clips: dict[str, np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
     R_world_local = np.stack([np.cross(y, z), y, z], -1)
     root = np.nanmean(steady[:, :, _PELVIS], 1)[:, None, None]
     joints, steady, true = ((clips[k] - root) @ R_world_local[:, None] for k in ("joints", "steady", "true"))
-    there, pelvis = clips["there"], steady[:, :, [_PELVIS]]
-    read = (
+    is_present, pelvis = clips["there"], steady[:, :, [_PELVIS]]
+    feature_parts = (
         (steady - pelvis) / 0.3,
         pelvis / 0.3,
         (joints - steady) / 0.1,
@@ -119,19 +119,19 @@ def inputs(clips: dict[str, np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
         np.log(clips["steady_spread"] / 0.06),
         np.isfinite(joints).all((2, 3)),
     )
-    features = np.nan_to_num(np.concatenate([part.reshape(*there.shape, -1) for part in read], -1))
-    times = np.broadcast_to(np.arange(there.shape[1]) / CLIP_HZ, there.shape)
-    known = np.where(there, times, np.nan)
-    first, last = np.nanmin(known, 1, keepdims=True), np.nanmax(known, 1, keepdims=True)
-    counts = clips["known"] & (times >= first) & (times <= last)
+    features = np.nan_to_num(np.concatenate([part.reshape(*is_present.shape, -1) for part in feature_parts], -1))
+    times = np.broadcast_to(np.arange(is_present.shape[1]) / CLIP_HZ, is_present.shape)
+    known_times = np.where(is_present, times, np.nan)
+    first, last = np.nanmin(known_times, 1, keepdims=True), np.nanmax(known_times, 1, keepdims=True)
+    is_counted = clips["known"] & (times >= first) & (times <= last)
     basis = spline_basis((times - first) / (last - first))
     arrays = [
-        features * there[..., None],
+        features * is_present[..., None],
         times - (first + last) / 2,
-        there,
+        is_present,
         basis,
         np.nan_to_num(true - steady),
-        counts,
+        is_counted,
     ]
     return [a if a.dtype == bool else a.astype(np.float32) for a in arrays], R_world_local
 
@@ -173,10 +173,10 @@ def train(clips: dict[str, np.ndarray], seed: int, epochs: int) -> SplineNet:
     """The moving average of a network that learned the clips; an epoch is half of them, or of their mirror images."""
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
-    both = zip(inputs(clips)[0], inputs(mirrored(clips))[0], strict=True)
-    data = [torch.from_numpy(np.concatenate(pair)) for pair in both]
-    seen = data[0][data[2]]
-    net = SplineNet(seen.mean(0), seen.std(0) + 0.05)
+    pairs = zip(inputs(clips)[0], inputs(mirrored(clips))[0], strict=True)
+    data = [torch.from_numpy(np.concatenate(pair)) for pair in pairs]
+    seen_features = data[0][data[2]]
+    net = SplineNet(seen_features.mean(0), seen_features.std(0) + 0.05)
     average = copy.deepcopy(net)
     groups = [[p for p in net.parameters() if (p.ndim > 1) == matrix] for matrix in (True, False)]
     optimizer = torch.optim.AdamW(
@@ -189,18 +189,18 @@ def train(clips: dict[str, np.ndarray], seed: int, epochs: int) -> SplineNet:
     for step in range(steps):
         for group in optimizer.param_groups:
             group["lr"] = RATE * min(1, (step + 1) / 100) * (0.5 + 0.5 * math.cos(math.pi * step / steps))
-        picked = torch.from_numpy(rng.integers(len(data[0]), size=BATCH))
-        *read, wanted, counts = (values[picked] for values in data)
-        distance = ((net(*read) - wanted) ** 2).sum(-1).add(1e-4).sqrt()
-        loss = ((distance * weight).mean(-1) * counts).sum() / counts.sum()
+        rows = torch.from_numpy(rng.integers(len(data[0]), size=BATCH))
+        *net_inputs, target, is_counted = (values[rows] for values in data)
+        distance = ((net(*net_inputs) - target) ** 2).sum(-1).add(1e-4).sqrt()
+        loss = ((distance * weight).mean(-1) * is_counted).sum() / is_counted.sum()
         optimizer.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(net.parameters(), 0.3)
         optimizer.step()
         with torch.no_grad():
             keep = min(AVERAGE, (step + 1) / (step + 10))
-            for mean, now in zip(average.parameters(), net.parameters(), strict=True):
-                mean.lerp_(now, 1 - keep)
+            for mean, parameter in zip(average.parameters(), net.parameters(), strict=True):
+                mean.lerp_(parameter, 1 - keep)
     return average.eval()
 
 
@@ -208,17 +208,17 @@ def train(clips: dict[str, np.ndarray], seed: int, epochs: int) -> SplineNet:
 def corrected(net: SplineNet, clips: dict[str, np.ndarray]) -> np.ndarray:
     """(C, T, J, 3) m, NaN where the smoother has nothing."""
     shifts = []
-    for each in (clips, mirrored(clips)):
-        (*read, _, _), R_world_local = inputs(each)
-        shift = net(*map(torch.from_numpy, read)).numpy().astype(float)
+    for variant in (clips, mirrored(clips)):
+        (*net_inputs, _, _), R_world_local = inputs(variant)
+        shift = net(*map(torch.from_numpy, net_inputs)).numpy().astype(float)
         shifts.append(shift @ R_world_local[:, None].swapaxes(-1, -2))
     joints = clips["steady"] + (shifts[0] + (shifts[1] * _MIRROR)[:, :, _FLIP]) / 2
     bones = rigid_bones(BODY26)
-    for clip, seen, spread in zip(joints, clips["known"], clips["steady_spread"], strict=True):
-        variance = known_spread(spread, seen, len(BODY26))[seen] ** 2
-        alike = measured(clip[seen], np.full_like(variance, 1e-6), bones)
-        lengths = lengths_of(alike.sum(0), bones, BODY26.flip)
-        clip[seen] = keep_lengths(clip[seen], variance, bones, lengths)
+    for clip, is_seen, spread in zip(joints, clips["known"], clips["steady_spread"], strict=True):
+        variance = known_spread(spread, is_seen, len(BODY26))[is_seen] ** 2
+        bone_sums = measured(clip[is_seen], np.full_like(variance, 1e-6), bones)
+        lengths = lengths_of(bone_sums.sum(0), bones, BODY26.flip)
+        clip[is_seen] = keep_lengths(clip[is_seen], variance, bones, lengths)
     return joints
 
 
@@ -231,34 +231,42 @@ def main() -> None:
     parser.add_argument("--motions", type=int, default=1, help="also by motion, of which the judged clips had so many")
     options = parser.parse_args()
 
-    with np.load(options.train) as stored:
-        clips = dict(stored)
+    with np.load(options.train) as archive:
+        clips = dict(archive)
     count, frames = clips["true"].shape[:2]
-    whole = np.ones(frames, bool)
-    ways = [(i, whole, whole) for i in range(count)]
-    ways += [(i, *frames_left_out(frames, np.random.default_rng([0, i]))) for i in range(count)]
-    learned = stacked([clip for way in ways if (clip := smoothed(clips, *way)) is not None])
-    with np.load(options.judge) as stored:
-        clips = dict(stored)
-    judged = {i: clip for i in range(len(clips["true"])) if (clip := smoothed(clips, i, whole, whole)) is not None}
-    motion, judged = np.array(list(judged)) % options.motions, stacked(list(judged.values()))
-    base = np.stack([nearest_seen(joints) for joints in judged["steady"]])
-    print(f"{len(learned['true'])} clips to learn, {len(base)} to judge")
+    all_frames = np.ones(frames, bool)
+    selections = [(i, all_frames, all_frames) for i in range(count)]
+    selections += [(i, *frames_left_out(frames, np.random.default_rng([0, i]))) for i in range(count)]
+    training_clips = stacked([clip for selection in selections if (clip := smoothed(clips, *selection)) is not None])
+    with np.load(options.judge) as archive:
+        clips = dict(archive)
+    test_clips = {
+        i: clip for i in range(len(clips["true"])) if (clip := smoothed(clips, i, all_frames, all_frames)) is not None
+    }
+    motion, test_clips = np.array(list(test_clips)) % options.motions, stacked(list(test_clips.values()))
+    base = np.stack([nearest_seen(joints) for joints in test_clips["steady"]])
+    print(f"{len(training_clips['true'])} clips to learn, {len(base)} to judge")
     for seed in [None, *options.seeds]:
         joints = base
         if seed is not None:
-            joints = np.stack([nearest_seen(each) for each in corrected(train(learned, seed, options.epochs), judged)])
-        values = figures(joints, base, judged["true"])
-        less, bent = values["mpjpe_less"], values["acceleration_less"]
+            joints = np.stack(
+                [
+                    nearest_seen(clip_joints)
+                    for clip_joints in corrected(train(training_clips, seed, options.epochs), test_clips)
+                ]
+            )
+        values = figures(joints, base, test_clips["true"])
+        mpjpe_less, acceleration_less = values["mpjpe_less"], values["acceleration_less"]
         name = "smoothed" if seed is None else f"seed {seed}"
         print(
-            f"{name:9s} MPJPE {values['mpjpe']['value']:5.2f} mm, less {less[0]:4.1f} % [{less[1]:.1f}, {less[2]:.1f}]"
-            f"  acceleration {values['acceleration']['value']:5.2f}, less {bent[0]:4.1f} % [{bent[1]:.1f}, "
-            f"{bent[2]:.1f}]  turned {values['turned_percent']:.2f} %  bones "
+            f"{name:9s} MPJPE {values['mpjpe']['value']:5.2f} mm, less {mpjpe_less[0]:4.1f} % "
+            f"[{mpjpe_less[1]:.1f}, {mpjpe_less[2]:.1f}]"
+            f"  acceleration {values['acceleration']['value']:5.2f}, less {acceleration_less[0]:4.1f} % "
+            f"[{acceleration_less[1]:.1f}, {acceleration_less[2]:.1f}]  turned {values['turned_percent']:.2f} %  bones "
             f"{values['bone_deviation']:.1f} mm  by motion",
             *(
-                f"{figures(joints[own], base[own], judged['true'][own])['mpjpe']['value']:.1f}"
-                for own in (motion == k for k in range(options.motions))
+                f"{figures(joints[mask], base[mask], test_clips['true'][mask])['mpjpe']['value']:.1f}"
+                for mask in (motion == k for k in range(options.motions))
             ),
             flush=True,
         )

@@ -64,9 +64,9 @@ def rejection(predictions) -> list[dict]:
     ):
         order = np.argsort(-score)
         rows += [value[order[: max(round(share * len(order)), 1)]].mean() for share in (1.0, 0.9, 0.8, 0.7, 0.5)]
-    kept = (100, 90, 80, 70, 50)
-    found = zip(kept, people, joints, strict=True)
-    return [{"kept": k, "people": round(float(p), 2), "joints": round(float(j), 2)} for k, p, j in found]
+    kept_percent = (100, 90, 80, 70, 50)
+    levels = zip(kept_percent, people, joints, strict=True)
+    return [{"kept": k, "people": round(float(p), 2), "joints": round(float(j), 2)} for k, p, j in levels]
 
 
 def main() -> None:
@@ -76,19 +76,19 @@ def main() -> None:
     parser.add_argument("--limit", type=int, help="only so many people")
     options = parser.parse_args()
     model = load(options.weights, threads=1, tta=1)
-    ways = []
-    for way in WAYS:
-        started = time.process_time()
-        done = evaluation.run(Shown(model, way), ["bench"], limit=options.limit)
-        seconds = time.process_time() - started
-        if way is USUAL:
-            kept = rejection(done.evaluations[0].predictions)
-        ways.append({"what": way.what, "usual": way is USUAL, "seconds": round(seconds, 2)})
-        ways[-1]["figures"] = figures(done.scores.results[0])
-        print(f"{way.what:<52} {ways[-1]['figures']['all']['value']:.1f} mm  {seconds:.1f} s", flush=True)
-    found = json.loads(options.out.read_text()) if options.out.is_file() else {}
-    found[Path(options.weights).stem] = {"ways": ways, "rejection": kept}
-    write_atomic(options.out, json.dumps(found, indent=1) + "\n")
+    results = []
+    for setting in WAYS:
+        start = time.process_time()
+        run_result = evaluation.run(Shown(model, setting), ["bench"], limit=options.limit)
+        seconds = time.process_time() - start
+        if setting is USUAL:
+            rejection_rows = rejection(run_result.evaluations[0].predictions)
+        results.append({"what": setting.what, "usual": setting is USUAL, "seconds": round(seconds, 2)})
+        results[-1]["figures"] = figures(run_result.scores.results[0])
+        print(f"{setting.what:<52} {results[-1]['figures']['all']['value']:.1f} mm  {seconds:.1f} s", flush=True)
+    stored_results = json.loads(options.out.read_text()) if options.out.is_file() else {}
+    stored_results[Path(options.weights).stem] = {"ways": results, "rejection": rejection_rows}
+    write_atomic(options.out, json.dumps(stored_results, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -63,22 +63,22 @@ def with_stop(bodies, rng):
 
 def walkers_of(plan, path, rng):
     """People whose ways cross: of the starts that keep them apart, the one that brings them nearest to the others."""
-    walkers, ways = [], []
+    walkers, walks = [], []
     while len(walkers) < PEOPLE:
         bodies = streets._draw_pedestrian(FRAMES, rng)
         if bodies.kinds[0] == "idle" and rng.random() < 0.7:
             continue
-        bodies, best, nearest = with_stop(bodies, rng), None, np.inf
+        bodies, best_walker, best_distance = with_stop(bodies, rng), None, np.inf
         for _ in range(60):
             place, _ = streets._draw_start(plan, bodies, rng)
-            way = streets._path((bodies, place))
-            apart = min((np.linalg.norm(way - other, axis=1).min() for other in ways), default=0.6)
-            clear = np.linalg.norm(way - path[:, :2], axis=1).min() > CLEAR and np.linalg.norm(way[0]) < NEAR
-            if clear and APART < apart < nearest:
-                best, nearest = (bodies, place), apart
-        if best:
-            walkers.append(best)
-            ways.append(streets._path(best))
+            walk = streets._path((bodies, place))
+            distance = min((np.linalg.norm(walk - other, axis=1).min() for other in walks), default=0.6)
+            is_clear = np.linalg.norm(walk - path[:, :2], axis=1).min() > CLEAR and np.linalg.norm(walk[0]) < NEAR
+            if is_clear and APART < distance < best_distance:
+                best_walker, best_distance = (bodies, place), distance
+        if best_walker:
+            walkers.append(best_walker)
+            walks.append(streets._path(best_walker))
     return walkers
 
 
@@ -87,18 +87,19 @@ def recording(seed, index):
     rng = np.random.default_rng([seed, index])
     device = named_sensor(SENSORS[index % len(SENSORS)])
     plan = streets._draw_plan(device, rng)
-    still = union(streets._scenery(plan, rng)).moved((0, 0, 0), plan.turn)
+    scenery = union(streets._scenery(plan, rng)).moved((0, 0, 0), plan.turn)
     path = sensor_path(plan, rng)
     walkers = walkers_of(plan, path, rng)
     normals = rng.standard_normal(256, np.float32)
     for frame, (x, y, yaw) in enumerate(path):
         R_sensor_world = rotation_about("z", -yaw)
-        here = np.array([x, y, 0.0])
-        seen = [
-            (b, Place(feet=R_sensor_world @ (p.feet - here), yaw=p.yaw - yaw, distance=p.distance)) for b, p in walkers
+        sensor_position = np.array([x, y, 0.0])
+        placed_walkers = [
+            (b, Place(feet=R_sensor_world @ (p.feet - sensor_position), yaw=p.yaw - yaw, distance=p.distance))
+            for b, p in walkers
         ]
-        scene = still.moved(-R_sensor_world @ here, -yaw)
-        yield streets._scan_turn(device, scene, seen, frame, normals, rng), (x, y, yaw)
+        scene = scenery.moved(-R_sensor_world @ sensor_position, -yaw)
+        yield streets._scan_turn(device, scene, placed_walkers, frame, normals, rng), (x, y, yaw)
 
 
 def to_world(boxes, pose):
@@ -120,10 +121,11 @@ def stored(seed, index, cache):
     if not path.exists():
         frames = []
         for frame, pose in recording(seed, index):
-            found = detect(frame.points, min_score=LEAST_SCORE)
+            detected_boxes = detect(frame.points, min_score=LEAST_SCORE)
             points = np.bincount(frame.person[frame.person >= 0], minlength=PEOPLE).tolist()
             people, boxes = (
-                [b.to_dict() | {"score": b.score} for b in to_world(some, pose)] for some in (frame.boxes, found)
+                [b.to_dict() | {"score": b.score} for b in to_world(group, pose)]
+                for group in (frame.boxes, detected_boxes)
             )
             frames.append({"people": people, "points": points, "boxes": boxes, "sensor": list(map(float, pose))})
         write_atomic(path, json.dumps(frames))
@@ -162,42 +164,42 @@ class Nearest:
     def update(self, time, boxes, weak_boxes):
         ids = []
         for number, box in enumerate([*boxes, *weak_boxes]):
-            near = {
+            distance_by_id = {
                 i: np.linalg.norm(box.center[:2] - place)
-                for i, (seen, place) in self.tracks.items()
-                if i not in ids and time - seen <= 2
+                for i, (last_time, place) in self.tracks.items()
+                if i not in ids and time - last_time <= 2
             }
-            best = min(near, key=near.get, default=-1)
-            if best < 0 or near[best] > 1:
+            best_id = min(distance_by_id, key=distance_by_id.get, default=-1)
+            if best_id < 0 or distance_by_id[best_id] > 1:
                 is_weak = number >= len(boxes)
-                best, self.next_id = (-1 if is_weak else self.next_id), self.next_id + (not is_weak)
-            ids.append(best)
-            if best >= 0:
-                self.tracks[best] = (time, box.center[:2])
+                best_id, self.next_id = (-1 if is_weak else self.next_id), self.next_id + (not is_weak)
+            ids.append(best_id)
+            if best_id >= 0:
+                self.tracks[best_id] = (time, box.center[:2])
         return ids
 
 
 def evaluated(frames, boxes, ids):
     """What trackeval needs of a street: boxes within 0.5 m of people who do not count are left out."""
-    numbers = {name: k for k, name in enumerate(sorted({i for some in ids for i in some}))}
-    gt_ids, own_ids, similarities = [], [], []
-    for frame, some, own in zip(frames, boxes, ids, strict=True):
+    number_of_id = {name: k for k, name in enumerate(sorted({i for frame_ids in ids for i in frame_ids}))}
+    gt_ids, tracker_ids, similarities = [], [], []
+    for frame, frame_boxes, own_frame_ids in zip(frames, boxes, ids, strict=True):
         places = np.array([p["center"][:2] for p in frame["people"]])
-        near = np.linalg.norm(places - frame["sensor"][:2], axis=1) < RANGE
-        counts = near & (np.array(frame["points"]) >= LEAST_POINTS)
-        distance = distances(frame, some)
+        is_near = np.linalg.norm(places - frame["sensor"][:2], axis=1) < RANGE
+        is_counted = is_near & (np.array(frame["points"]) >= LEAST_POINTS)
+        distance = distances(frame, frame_boxes)
         # people who count first
         person, box = assign(
-            np.where(distance < MATCH_RADIUS, distance - MATCH_RADIUS - 10.0 * counts[:, None], np.inf)
+            np.where(distance < MATCH_RADIUS, distance - MATCH_RADIUS - 10.0 * is_counted[:, None], np.inf)
         )
-        kept = np.setdiff1d(np.arange(len(some)), box[~counts[person]])
-        gt_ids.append(np.flatnonzero(counts))
-        own_ids.append(np.array([numbers[own[k]] for k in kept], int))
-        similarities.append(np.maximum(1 - distance[counts][:, kept] / (2 * MATCH_RADIUS), 0))
+        kept_boxes = np.setdiff1d(np.arange(len(frame_boxes)), box[~is_counted[person]])
+        gt_ids.append(np.flatnonzero(is_counted))
+        tracker_ids.append(np.array([number_of_id[own_frame_ids[k]] for k in kept_boxes], int))
+        similarities.append(np.maximum(1 - distance[is_counted][:, kept_boxes] / (2 * MATCH_RADIUS), 0))
     return {
-        "num_timesteps": len(frames), "num_gt_ids": PEOPLE, "num_tracker_ids": len(numbers),
-        "num_gt_dets": sum(map(len, gt_ids)), "num_tracker_dets": sum(map(len, own_ids)),
-        "gt_ids": gt_ids, "tracker_ids": own_ids, "similarity_scores": similarities,
+        "num_timesteps": len(frames), "num_gt_ids": PEOPLE, "num_tracker_ids": len(number_of_id),
+        "num_gt_dets": sum(map(len, gt_ids)), "num_tracker_dets": sum(map(len, tracker_ids)),
+        "gt_ids": gt_ids, "tracker_ids": tracker_ids, "similarity_scores": similarities,
     }  # fmt: skip
 
 
@@ -216,52 +218,60 @@ def scored(sequences):
 
 def true_ids(frames, boxes):
     """Each box has its person's number, and false ones their own."""
-    ids, false = [], PEOPLE
-    for frame, some in zip(frames, boxes, strict=True):
-        distance = distances(frame, some)
+    ids, next_id = [], PEOPLE
+    for frame, frame_boxes in zip(frames, boxes, strict=True):
+        distance = distances(frame, frame_boxes)
         person, box = assign(np.where(distance < MATCH_RADIUS, distance - MATCH_RADIUS, np.inf))
-        own = false + np.arange(len(some))
-        own[box] = person
-        false += len(some)
-        ids.append(own.tolist())
+        frame_ids = next_id + np.arange(len(frame_boxes))
+        frame_ids[box] = person
+        next_id += len(frame_boxes)
+        ids.append(frame_ids.tolist())
     return ids
 
 
 def tracked(frames, boxes, weak, tracker, poses_known=True):
     """The boxes that are somebody's, and whose; without poses the tracker sees them in the sensor's frame."""
-    written, ids = [], []
-    for number, (some, doubtful) in enumerate(zip(boxes, weak, strict=True)):
-        given = [some, doubtful] if poses_known else [to_sensor(b, frames[number]["sensor"]) for b in (some, doubtful)]
-        own = tracker.update(number / HZ, *given)
-        kept = [(box, k) for box, k in zip(some + doubtful, own, strict=True) if k >= 0]
-        written.append([box for box, _ in kept])
-        ids.append([k for _, k in kept])
-    return evaluated(frames, written, ids)
+    track_boxes, ids = [], []
+    for number, (frame_boxes, weak_boxes) in enumerate(zip(boxes, weak, strict=True)):
+        tracker_boxes = (
+            [frame_boxes, weak_boxes]
+            if poses_known
+            else [to_sensor(b, frames[number]["sensor"]) for b in (frame_boxes, weak_boxes)]
+        )
+        frame_ids = tracker.update(number / HZ, *tracker_boxes)
+        pairs = [(box, k) for box, k in zip(frame_boxes + weak_boxes, frame_ids, strict=True) if k >= 0]
+        track_boxes.append([box for box, _ in pairs])
+        ids.append([k for _, k in pairs])
+    return evaluated(frames, track_boxes, ids)
 
 
 def figures(recordings):
     """Rows: boxes, who numbers them, and the figures over all streets."""
-    least = round(float(Detector().header["default_score"]), 2)
+    default_score = round(float(Detector().header["default_score"]), 2)
     rng = np.random.default_rng(0)
-    none = [[[] for _ in frames] for frames in recordings]
-    given = [[noisy(frame, rng) for frame in frames] for frames in recordings]
-    sure = [[found(frame, least) for frame in frames] for frames in recordings]
-    weak = [[found(frame, WEAK_SCORE, least) for frame in frames] for frames in recordings]
+    no_boxes = [[[] for _ in frames] for frames in recordings]
+    noisy_boxes = [[noisy(frame, rng) for frame in frames] for frames in recordings]
+    sure_boxes = [[found(frame, default_score) for frame in frames] for frames in recordings]
+    weak_boxes = [[found(frame, WEAK_SCORE, default_score) for frame in frames] for frames in recordings]
     rows = []
-    for name, boxes, doubtful in (
-        ("true, with noise and drop-outs", given, none),
-        (f"found, score {least:g} and more", sure, none),
-        (f"found, and down to {WEAK_SCORE:g} where a track goes on", sure, weak),
+    for name, boxes, doubtful_boxes in (
+        ("true, with noise and drop-outs", noisy_boxes, no_boxes),
+        (f"found, score {default_score:g} and more", sure_boxes, no_boxes),
+        (f"found, and down to {WEAK_SCORE:g} where a track goes on", sure_boxes, weak_boxes),
     ):
-        every = list(zip(recordings, boxes, doubtful, strict=True))
-        for by, tracker in (("nearest place", Nearest), ("tracker", Tracker)):
-            rows.append({"boxes": name, "by": by, **scored([tracked(*street, tracker()) for street in every])})
-        if doubtful is none:
-            true = [evaluated(frames, some, true_ids(frames, some)) for frames, some, _ in every]
-            rows.append({"boxes": name, "by": "the truth", **scored(true)})
+        sequences = list(zip(recordings, boxes, doubtful_boxes, strict=True))
+        for numbering, tracker in (("nearest place", Nearest), ("tracker", Tracker)):
+            rows.append(
+                {"boxes": name, "by": numbering, **scored([tracked(*street, tracker()) for street in sequences])}
+            )
+        if doubtful_boxes is no_boxes:
+            true_sequences = [
+                evaluated(frames, street_boxes, true_ids(frames, street_boxes)) for frames, street_boxes, _ in sequences
+            ]
+            rows.append({"boxes": name, "by": "the truth", **scored(true_sequences)})
         else:
-            local = [tracked(*street, Tracker(), poses_known=False) for street in every]
-            rows.append({"boxes": name, "by": "tracker, the sensor's poses unknown", **scored(local)})
+            sensor_sequences = [tracked(*street, Tracker(), poses_known=False) for street in sequences]
+            rows.append({"boxes": name, "by": "tracker, the sensor's poses unknown", **scored(sensor_sequences)})
     return rows
 
 

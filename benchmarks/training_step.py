@@ -36,14 +36,14 @@ def main() -> None:
     config = preset(options.size)
     generator = Generator(scene=scene_config("wild"), measure=False)
     generator.person(0, 0)
-    made_in: dict[int, list[float]] = {1: [], 2: []}
+    times_by_threads: dict[int, list[float]] = {1: [], 2: []}
     for seed in range(1, ROUNDS + 1):
-        for blas, times in made_in.items():
+        for blas, times in times_by_threads.items():
             with threadpool_limits(limits=blas, user_api="blas"):
-                started = time.perf_counter()
+                start = time.perf_counter()
                 people = [generator.person(10 * seed + blas, i) for i in range(options.people)]
-                times.append((time.perf_counter() - started) / len(people) * 1e3)
-    for blas, times in made_in.items():
+                times.append((time.perf_counter() - start) / len(people) * 1e3)
+    for blas, times in times_by_threads.items():
         print(f"a person made, {blas} BLAS threads: {np.median(times):.2f} ms")
     rng = np.random.default_rng(0)
     arrays = PoseNetObjective(config=config).collate([example(person.sample, rng) for person in people])
@@ -55,24 +55,24 @@ def main() -> None:
         networks[precision] = network, optimizers(network, Pretrain(size=options.size))
     rows: dict[str, list[np.ndarray]] = {precision: [] for precision in networks}
     for _ in range(ROUNDS + 1):
-        for precision, (network, made) in networks.items():
+        for precision, (network, network_optimizers) in networks.items():
             times = [time.perf_counter()]
             with torch.autocast("cpu", torch.bfloat16, enabled=precision == "bf16"):
                 loss = total(losses(network(batch), targets))
             times.append(time.perf_counter())
             loss.backward()
             times.append(time.perf_counter())
-            for optimizer in made:
+            for optimizer in network_optimizers:
                 optimizer.step()
                 times.append(time.perf_counter())
                 optimizer.zero_grad()
             rows[precision].append(np.diff(times) * 1e3)
-    names = ["forward and loss", "backward", *(type(optimizer).__name__ for optimizer in made)]
+    names = ["forward and loss", "backward", *(type(optimizer).__name__ for optimizer in network_optimizers)]
     # the first round warms up
-    least = {precision: np.min(values[1:], axis=0) for precision, values in rows.items()}
-    for name, single, half in zip(names, *least.values(), strict=True):
+    best_times = {precision: np.min(values[1:], axis=0) for precision, values in rows.items()}
+    for name, single, half in zip(names, *best_times.values(), strict=True):
         print(f"{name}: {single:.1f} ms a step of {options.people} people, {half:.1f} in bf16")
-    single, half = (values.sum() for values in least.values())
+    single, half = (values.sum() for values in best_times.values())
     print(f"a step in float32 takes {single / half:.2f} times as long as in bf16")
 
 

@@ -26,13 +26,20 @@ CLEAN = "clean"
 def compared(error: np.ndarray, hidden: np.ndarray, condition: np.ndarray, name: str) -> tuple[float, float, int]:
     """Mean errors, mm: of a condition's people, of clean ones of whom as much is hidden; how many of the condition."""
     bins = np.digitize(hidden, EDGES)
-    theirs = clean = 0.0
+    condition_sum = clean_sum = 0.0
     people = 0
     for k in np.unique(bins):
-        own, other = error[(bins == k) & (condition == name)], error[(bins == k) & (condition == CLEAN)]
-        if min(len(own), len(other)) >= LEAST:
-            theirs, clean, people = theirs + own.sum(), clean + other.mean() * len(own), people + len(own)
-    return theirs / people, clean / people, people
+        condition_errors, clean_errors = (
+            error[(bins == k) & (condition == name)],
+            error[(bins == k) & (condition == CLEAN)],
+        )
+        if min(len(condition_errors), len(clean_errors)) >= LEAST:
+            condition_sum, clean_sum, people = (
+                condition_sum + condition_errors.sum(),
+                clean_sum + clean_errors.mean() * len(condition_errors),
+                people + len(condition_errors),
+            )
+    return condition_sum / people, clean_sum / people, people
 
 
 def main() -> None:
@@ -42,28 +49,40 @@ def main() -> None:
     options = parser.parse_args()
     columns = ["condition", "hidden", "moving", "error_mm"]
     rows = pq.read_table(options.folder / "poses.parquet", columns=columns).to_pydict()
-    own = ~np.array(rows["moving"], bool)
-    error = np.array([np.mean(one) for one, alone in zip(rows["error_mm"], own, strict=True) if alone])
-    hidden, condition = np.array(rows["hidden"], float)[own], np.array(rows["condition"])[own]
+    is_counted = ~np.array(rows["moving"], bool)
+    error = np.array(
+        [
+            np.mean(joint_errors)
+            for joint_errors, is_scored in zip(rows["error_mm"], is_counted, strict=True)
+            if is_scored
+        ]
+    )
+    hidden, condition = np.array(rows["hidden"], float)[is_counted], np.array(rows["condition"])[is_counted]
     rng = np.random.default_rng(0)
-    found = []
+    entries = []
     for name in sorted(set(condition) - {CLEAN}):
-        theirs, clean, people = compared(error, hidden, condition, name)
+        condition_error, clean_error, people = compared(error, hidden, condition, name)
         ratios = []
         for _ in range(ROUNDS):
-            drawn = rng.integers(len(error), size=len(error))
-            a, b, _ = compared(error[drawn], hidden[drawn], condition[drawn], name)
+            sample_rows = rng.integers(len(error), size=len(error))
+            a, b, _ = compared(error[sample_rows], hidden[sample_rows], condition[sample_rows], name)
             ratios.append(a / b)
         low, high = np.percentile(ratios, [2.5, 97.5])
-        entry = {"condition": name, "people": people, "mm": theirs, "clean": clean, "ratio": theirs / clean}
-        found.append({k: round(v, 3) if isinstance(v, float) else v for k, v in entry.items()})
-        found[-1] |= {"low": round(low, 3), "high": round(high, 3)}
-        ratio = f"x {theirs / clean:.2f} [{low:.2f}, {high:.2f}]"
-        print(f"{name:<10} {theirs:6.1f} mm, clean {clean:6.1f}: {ratio}, {people} people")
+        entry = {
+            "condition": name,
+            "people": people,
+            "mm": condition_error,
+            "clean": clean_error,
+            "ratio": condition_error / clean_error,
+        }
+        entries.append({k: round(v, 3) if isinstance(v, float) else v for k, v in entry.items()})
+        entries[-1] |= {"low": round(low, 3), "high": round(high, 3)}
+        ratio = f"x {condition_error / clean_error:.2f} [{low:.2f}, {high:.2f}]"
+        print(f"{name:<10} {condition_error:6.1f} mm, clean {clean_error:6.1f}: {ratio}, {people} people")
     scores = json.loads((options.folder / "scores.json").read_text())
-    stored = json.loads(options.out.read_text()) if options.out.is_file() else {}
-    stored[scores["weights"]["name"]] = found
-    write_atomic(options.out, json.dumps(stored, indent=1) + "\n")
+    results = json.loads(options.out.read_text()) if options.out.is_file() else {}
+    results[scores["weights"]["name"]] = entries
+    write_atomic(options.out, json.dumps(results, indent=1) + "\n")
 
 
 if __name__ == "__main__":

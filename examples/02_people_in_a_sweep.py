@@ -20,7 +20,7 @@ assert isinstance(device, lidarpose.Sensor)  # not a rosette
 bodies = draw_bodies(None, captured=0.0, count=3, seed=1, block=0)
 places = np.array([[6.0, 1.0], [-4.0, 5.0], [2.0, -9.0]])
 feet = np.column_stack([places, np.full(3, -device.height)]).astype(np.float32)
-meshes = [Mesh(vertices, bodies.faces).moved(at) for vertices, at in zip(bodies.vertices, feet, strict=True)]
+meshes = [Mesh(vertices, bodies.faces).moved(foot) for vertices, foot in zip(bodies.vertices, feet, strict=True)]
 scene = union([*meshes, quad(15.0, np.zeros(2)).moved(np.array([0, 0, -device.height]))])
 points = scan(scene.vertices, scene.faces, device).points
 np.save("sweep.npy", points)
@@ -35,8 +35,8 @@ with open("people.json", "w") as file:
 
 # ---- the people, searched for
 
-found = lidarpose.detect("sweep.npy")
-for box in found:
+boxes = lidarpose.detect("sweep.npy")
+for box in boxes:
     print(f"found at {box.center.round(1)} m with a score of {box.score:.2f}")
 
 # ---- their poses, in boxes from elsewhere; without boxes, in those that are found

@@ -1,8 +1,11 @@
 """The networks that the paper compares with: layer sizes as published, padding, order of points."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 from lidarpose.models.baselines.baseline_config import CLOUDS, LidarcapConfig, LpformerConfig, NeConfig, PrnConfig
 from lidarpose.models.baselines.lidarcap import (
@@ -13,7 +16,7 @@ from lidarpose.models.baselines.lidarcap import (
     tree_partition,
 )
 from lidarpose.models.baselines.lpformer import V2V, Lpformer
-from lidarpose.models.baselines.ne import Ne
+from lidarpose.models.baselines.ne import Exchange, Ne
 from lidarpose.models.baselines.point_ops import ball_query, farthest_points, nearest_neighbors
 from lidarpose.models.baselines.point_transformer_v2 import Rows
 from lidarpose.models.baselines.prn import Prn, PrnNeck, VoteHead
@@ -128,6 +131,33 @@ def test_graph_is_normalized_and_splits_by_the_root():
     knee, hip, ankle = 4, 1, 7
     assert graph[2, hip, knee] > 0 and graph[1, ankle, knee] > 0 and graph[0, knee, knee] > 0
     assert graph[1, hip, knee] == graph[2, ankle, knee] == 0
+
+
+def kinds(layers):
+    return [
+        f"{type(layer).__name__} {layer.p}" if isinstance(layer, nn.Dropout) else type(layer).__name__
+        for layer in layers
+    ]
+
+
+def test_layers_stand_in_the_published_order():
+    """What counting parameters does not see."""
+    config = {"lpformer": LpformerConfig(), "lidarcap": LidarcapConfig(), "ne": NeConfig()}
+    assert kinds(build(config["lpformer"]).parts) == ["Linear", "ReLU", "Linear", "Linear"]
+    for name in ("lidarcap", "ne"):
+        first, *others = build(replace(config[name], width_divisor=8)).rotations.layers
+        assert kinds(first.time)[-1] == "Dropout 0.0" and first.residual is None
+        assert all(kinds(layer.time)[-1] == "Dropout 0.5" and layer.residual for layer in others)
+    exchange = Exchange(16, 8)
+    assert kinds(exchange.mlp) == ["Linear", "GELU", "Dropout 0.1", "Linear", "Dropout 0.1"]
+    assert all(attention.dropout == 0 for attention in exchange.attention)
+    # what is dropped of attention's output, besides whole clips
+    clouds = torch.randn(3, 64, 16, 16)
+    with torch.no_grad(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lidarpose.models.baselines.ne.drop_path", lambda branch, *_: branch)
+        outputs = [exchange._attend(0, *clouds) for _ in range(2)]
+    shares = [(output == 0).float().mean().item() for output in outputs]
+    assert all(0.07 < share < 0.13 for share in shares) and not torch.equal(*outputs)
 
 
 # ---- order and padding

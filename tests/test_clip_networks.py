@@ -19,7 +19,7 @@ from lidarpose.data.shards import shard_path, shard_writer
 from lidarpose.eval import robustness, run
 from lidarpose.eval.dataset import open_eval_dataset
 from lidarpose.eval.protocols import EvalSetup, eval_setup
-from lidarpose.geometry import UP_AXES
+from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
 from lidarpose.inference.inputs import Clips
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.inference.torch_backend import ClipBackend
@@ -213,6 +213,29 @@ def test_a_run_on_clips_is_evaluated_and_predicts(name, folder, clips, tmp_path,
     assert np.isfinite(person["joints"]).all() and len(person["joints"]) == len(SMPL24)
 
 
+def test_a_clip_turns_as_one_and_its_rotations_with_it(clips):
+    """Points, joints, surroundings and the pelvis turn by one angle; forward kinematics gives the joints as turned."""
+    clip = clips[0]
+    plain = clip_example(clip, np.random.default_rng(4), refined=0.0)
+    turned = clip_example(clip, np.random.default_rng(4), refined=0.0, turn=True)
+    bones = [np.stack([frame.joints[1] - frame.joints[0] for frame in one.frames]) for one in (plain, turned)]
+    angles = [np.arctan2(bone[:, 1], bone[:, 0]) for bone in bones]
+    angle = (angles[1] - angles[0])[0]
+    R = rotation_about("z", angle)
+    assert abs(np.sin(angle)) > 0.01
+    for before, after in zip(plain.frames, turned.frames, strict=True):
+        np.testing.assert_allclose(after.points, before.points @ R.T, atol=1e-5)
+        np.testing.assert_allclose(after.joints, before.joints @ R.T, atol=1e-5)
+    for name, clouds in plain.clouds.items():
+        for before, after in zip(clouds, turned.clouds[name], strict=True):
+            np.testing.assert_allclose(after, before @ R.T, atol=1e-5)
+    roots = [axis_angle_to_matrix(one.rotations[:, 0]) for one in (plain, turned)]
+    np.testing.assert_allclose(roots[1], R @ roots[0], atol=1e-5)
+    np.testing.assert_array_equal(turned.rotations[:, 1:], plain.rotations[:, 1:])
+    again = clip_example(clip, np.random.default_rng(5), refined=0.0, turn=True)
+    assert np.abs(again.frames[0].joints - turned.frames[0].joints).max() > 0.01
+
+
 def test_settings_that_clips_cannot_have_are_refused(folder, tmp_path):
     with refused("lidarcap learns from clips: .* by --shards"):
         make_setup(recipe(Pretrain, "lidarcap"))
@@ -222,7 +245,7 @@ def test_settings_that_clips_cannot_have_are_refused(folder, tmp_path):
         make_setup(recipe(Finetune, "lidarcap", data=(str(folder),), split="all", head="coordinates"))
     with refused("keep_anchors is of the paper's network"):
         make_setup(recipe(Finetune, "lidarcap", data=(str(folder),), split="all", keep_anchors=False))
-    with refused("leave --mix at 0 and --augment at none"):
+    with refused("leave --mix at 0, and --augment at none or turn"):
         make_setup(recipe(Finetune, "ne", data=(str(folder),), split="all", mix=0.25))
     with refused("the joints of lidarcap are SMPL's 24"):
         replace(LidarcapConfig(), joints=BODY26.joints)

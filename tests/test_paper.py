@@ -314,6 +314,15 @@ def test_wrong_words_are_one_line(tmp_path, monkeypatch, capsys, words, told):
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
+@pytest.mark.parametrize("words", [["fig6"], ["table1", "--table-only"]])
+def test_a_folder_that_the_command_made_is_its_own(tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("lidarpose.paper.figures.draw_people", lambda panels, path, **_: path.write_bytes(b"x"))
+    for _ in range(2):
+        assert main(["paper", *words]) == 0
+    assert main(["paper", "table4", "--dry-run"]) == 0
+
+
 # --- steps
 
 
@@ -443,7 +452,8 @@ def test_cells_in_words():
         _entry(row="d", state="not run", reason="its command was not run", published=60.0),
         _entry(row="e", low=None, high=None),
     ]  # fmt: skip
-    page = markdown({"title": "T", "target": "stand-in", "cells": entries})
+    page = markdown({"title": "T", "target": "stand-in", "people": 2000, "hours": 1.5, "cells": entries})
+    assert "Budget: 2,000 people a stage of training, 1.5 hours a row." in page
     for line in (
         "| a | 100.0 [95.0, 105.0] (paper 51.6) |",
         "| b | 110.0 [100.0, 120.0], 2 of 2 seeds, *undertrained* |",

@@ -39,13 +39,15 @@ def test_fields_of_the_scene_by_name():
     masked = scene.changed(("keep=0.6",)).noise
     assert (masked.mask, masked.mask_keep) == (1.0, (0.6, 0.6))
     assert scene.changed(()) == scene
+    assert scene.changed(("sensors=os1-64:hdl-64e",)) == replace(scene, sensors=("os1-64", "hdl-64e"))
 
 
 @pytest.mark.parametrize(
     "setting, told",
     [
         ("kep=1", "unknown setting of the scene 'kep'"),
-        ("sensors=os1-64", "unknown setting"),
+        ("sensors=os1-65", "unknown sensor 'os1-65'"),
+        ("sensors=", "unknown sensor ''"),
         ("noise=1", "unknown setting"),
         ("keep", "expected keep=a number or two"),
         ("keep=1.2", "keep must be between 0 and 1"),

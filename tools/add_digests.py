@@ -16,14 +16,14 @@ from lidarpose.models.checkpoint import DIGEST, with_digest
 def add_digests(path: Path) -> None:
     """Rewrites a checkpoint, and its .onnx file where there is one beside it."""
     write_atomic(path, with_digest(path.read_bytes()))
-    twin = path.with_suffix(".onnx")
-    if not twin.is_file():
+    onnx_path = path.with_suffix(".onnx")
+    if not onnx_path.is_file():
         return
-    model = onnx.load(twin)
+    model = onnx.load(onnx_path)
     metadata = {entry.key: entry.value for entry in model.metadata_props}
     metadata |= {onnx_files.SOURCE: content_digest(path, expected="a checkpoint"), DIGEST: onnx_files.NO_DIGEST}
     onnx.helper.set_model_props(model, metadata)
-    write_atomic(twin, onnx_files.with_digest(model.SerializeToString(deterministic=True)))
+    write_atomic(onnx_path, onnx_files.with_digest(model.SerializeToString(deterministic=True)))
 
 
 def main() -> None:

@@ -74,23 +74,25 @@ def main() -> None:
     to_apose = apose_rotations(people, pivots)
     rest_joints = rest_pivots(pivots, to_apose)
     shapes = decimation_shapes(people)
-    full = undo_apose(people, pivots, rest_joints, to_apose, people_index=shapes)
-    kept, faces = collapse(full, people.faces, importance(people.weights), target=options.vertices, pinned=people.nose)
-    vertices = undo_apose(people, pivots, rest_joints, to_apose, vertex_index=kept)
+    full_vertices = undo_apose(people, pivots, rest_joints, to_apose, people_index=shapes)
+    kept_vertices, faces = collapse(
+        full_vertices, people.faces, importance(people.weights), target=options.vertices, pinned=people.nose
+    )
+    vertices = undo_apose(people, pivots, rest_joints, to_apose, vertex_index=kept_vertices)
     head_shift = rest_joints[:, [SMPL24.index("head")]] - pivots[:, [SMPL24.index("head")]]
     joints = np.concatenate([rest_joints, people.head_points + head_shift], 1)
     vertices -= rest_joints[:, :1]
     joints -= rest_joints[:, :1]
 
-    index, weight = strongest_four(people.weights[kept])
+    index, weight = strongest_four(people.weights[kept_vertices])
     template, morphs, coefficients = principal_components(vertices, joints, options.components)
-    count = len(kept)
+    count = len(kept_vertices)
     height = np.ptp(vertices[..., 2], axis=1)
-    part = people.weights[kept][faces].sum(1).argmax(-1) + 1
+    part = people.weights[kept_vertices][faces].sum(1).argmax(-1) + 1
     options.output.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = options.output.with_suffix(".unfinished.npz")
+    temporary_path = options.output.with_suffix(".unfinished.npz")
     np.savez_compressed(
-        unfinished,
+        temporary_path,
         faces=faces.astype(np.uint16),
         face_part=part.astype(np.uint8),
         weight_index=index.astype(np.uint8),
@@ -105,14 +107,14 @@ def main() -> None:
         height=height.astype(np.float32),
         bmi=(people.mass / height**2).astype(np.float32),
     )
-    unfinished.replace(options.output)
+    temporary_path.replace(options.output)
     print(f"{options.output}: {options.output.stat().st_size / 1e3:.0f} kB, {count} vertices, {len(faces)} faces")
-    rebuilt = template + np.tensordot(coefficients, morphs, 1)
-    error = np.linalg.norm(rebuilt - np.concatenate([vertices, joints], 1), axis=-1) * 1e3
+    reconstruction = template + np.tensordot(coefficients, morphs, 1)
+    error = np.linalg.norm(reconstruction - np.concatenate([vertices, joints], 1), axis=-1) * 1e3
     print(f"components: mean {error.mean():.2f} mm, max {error.max():.1f} mm, joints {error[:, count:].mean():.2f} mm")
     # half-edge collapses cut convex places, so the light mesh is a little thinner than the original
-    thinner = 1 - signed_volume(vertices[shapes], faces).sum() / signed_volume(full, people.faces).sum()
-    print(f"volume lost: {100 * thinner:.2f} %")
+    volume_loss = 1 - signed_volume(vertices[shapes], faces).sum() / signed_volume(full_vertices, people.faces).sum()
+    print(f"volume lost: {100 * volume_loss:.2f} %")
     print("faces a part:", dict(zip(BODY26.joints, np.bincount(part, minlength=25)[1:].tolist(), strict=False)))
 
 
@@ -153,13 +155,13 @@ def sample_anny(*, adults: int, children: int, seed: int) -> AnnyPeople:
             morphological_age_distribution=torch.distributions.Uniform(low, high),
             gender_distribution=sex,
         )
-        age, chosen = population.sample(count)
+        age, phenotype = population.sample(count)
         ages.append(age.numpy())
-        phenotypes.append(torch.stack([chosen[label] for label in model.phenotype_labels], 1))
+        phenotypes.append(torch.stack([phenotype[label] for label in model.phenotype_labels], 1))
     phenotypes = torch.cat(phenotypes)
     with torch.no_grad():
-        none = torch.zeros(len(phenotypes), 0)
-        coefficients = model._get_phenotype_blendshape_coefficients(phenotypes, none, none)
+        no_changes = torch.zeros(len(phenotypes), 0)
+        coefficients = model._get_phenotype_blendshape_coefficients(phenotypes, no_changes, no_changes)
         rest = model.get_rest_model(coefficients)
         coco = anny.KeypointsRegressor.coco(model)
         keypoints = dict(
@@ -209,14 +211,14 @@ def largest_part(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]
     """Vertices (V,) and renumbered faces of the largest connected part: the body without eyes and tongue."""
     label = np.arange(count)
     while True:
-        lowest = label[faces].min(1)
-        new = label.copy()
+        lowest_label = label[faces].min(1)
+        new_label = label.copy()
         for column in faces.T:
-            np.minimum.at(new, column, lowest)
-        new = new[new]
-        if (new == label).all():
+            np.minimum.at(new_label, column, lowest_label)
+        new_label = new_label[new_label]
+        if (new_label == label).all():
             break
-        label = new
+        label = new_label
     body = np.flatnonzero(label == np.bincount(label[faces[:, 0]]).argmax())
     number = np.full(count, -1)
     number[body] = np.arange(len(body))
@@ -226,10 +228,10 @@ def largest_part(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]
 
 def keep_four(weights: np.ndarray) -> np.ndarray:
     """(V, 24) weights of which only each row's four largest stay, scaled to sum 1."""
-    small = np.argsort(weights, 1)[:, :-4]
-    kept = weights.copy()
-    np.put_along_axis(kept, small, 0.0, 1)
-    return kept / kept.sum(1, keepdims=True)
+    small_columns = np.argsort(weights, 1)[:, :-4]
+    kept_weights = weights.copy()
+    np.put_along_axis(kept_weights, small_columns, 0.0, 1)
+    return kept_weights / kept_weights.sum(1, keepdims=True)
 
 
 def strongest_four(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -264,17 +266,17 @@ def smpl_pivots(people: AnnyPeople) -> np.ndarray:
         }
     for joint, width in (("hip", HIP_WIDTH), ("shoulder", SHOULDER_WIDTH)):
         left, right = pivot[f"left_{joint}"], pivot[f"right_{joint}"]
-        middle, across = (left + right) / 2, left - right
-        across = across * width / np.linalg.norm(across, axis=-1)[adult].mean()
-        pivot[f"left_{joint}"], pivot[f"right_{joint}"] = middle + across / 2, middle - across / 2
+        middle, width_vector = (left + right) / 2, left - right
+        width_vector = width_vector * width / np.linalg.norm(width_vector, axis=-1)[adult].mean()
+        pivot[f"left_{joint}"], pivot[f"right_{joint}"] = middle + width_vector / 2, middle - width_vector / 2
     hips = (pivot["left_hip"] + pivot["right_hip"]) / 2
     trunk = np.linalg.norm(pivot["neck"] - hips, axis=-1)
     pivot["pelvis"] = hips + (PELVIS_ABOVE_HIPS * trunk / trunk[adult].mean())[:, None] * [0.0, 0, 1]
     curve = np.stack([heads[bone] for bone in ("root", "spine04", "spine03", "spine02", "spine01", "neck01")], 1)
     for joint, share in SPINE_SHARES.items():
-        level = pivot["pelvis"][:, 2] + share * (pivot["neck"] - pivot["pelvis"])[:, 2]
+        height = pivot["pelvis"][:, 2] + share * (pivot["neck"] - pivot["pelvis"])[:, 2]
         pivot[joint] = np.stack(
-            [[np.interp(z, c[:, 2], c[:, k]) for k in range(3)] for z, c in zip(level, curve, strict=True)]
+            [[np.interp(z, c[:, 2], c[:, k]) for k in range(3)] for z, c in zip(height, curve, strict=True)]
         )
     return np.stack([pivot[joint] for joint in SMPL24.joints], 1)
 
@@ -285,32 +287,34 @@ def apose_rotations(people: AnnyPeople, pivots: np.ndarray) -> np.ndarray:
     Arms: upper arm, forearm and hand along +-y, elbows that bend forwards, palms down. Legs: straight down seen from
     the front (from the side they keep their natural line), feet along +x.
     """
-    at = {name: pivots[:, j] for j, name in enumerate(SMPL24.joints)}
+    joint_position = {name: pivots[:, j] for j, name in enumerate(SMPL24.joints)}
     rotation = {name: np.broadcast_to(np.eye(3), (len(pivots), 3, 3)) for name in SMPL24.joints}
     for side, end, sign in (("left", "L", 1.0), ("right", "R", -1.0)):
         out, up = np.array([0.0, sign, 0]), np.array([0.0, 0, 1])
         upper = people.heads[f"lowerarm01.{end}"] - people.heads[f"upperarm01.{end}"]
-        fore = at[f"{side}_wrist"] - at[f"{side}_elbow"]
-        hand = at[f"{side}_hand"] - at[f"{side}_wrist"]
+        fore = joint_position[f"{side}_wrist"] - joint_position[f"{side}_elbow"]
+        hand = joint_position[f"{side}_hand"] - joint_position[f"{side}_wrist"]
         # the elbow's axis is bent enough in the A-pose (about 40 degrees) to be read from the two bones
         axis = sign * np.cross(fore, upper)
         to_index = people.heads[f"finger2-1.{end}"] - people.heads[f"finger5-1.{end}"]
         back_of_hand = sign * np.cross(to_index, hand)
         # from shoulder to elbow with the shipped pivot, which lies further out than anny's bone
-        rotation[f"{side}_shoulder"] = frame(at[f"{side}_elbow"] - at[f"{side}_shoulder"], axis) @ frame(out, up).T
-        straight = frame(fore, axis) @ frame(out, up).T
-        palm = frame(hand, back_of_hand)
+        rotation[f"{side}_shoulder"] = (
+            frame(joint_position[f"{side}_elbow"] - joint_position[f"{side}_shoulder"], axis) @ frame(out, up).T
+        )
+        elbow_rotation = frame(fore, axis) @ frame(out, up).T
+        hand_frame = frame(hand, back_of_hand)
         # pronation is shared between elbow and wrist, as the forearm's two bones do it
-        along = frame(fore, back_of_hand) @ frame(out, up).T
-        rotation[f"{side}_elbow"] = half_way(straight, along)
-        rotation[f"{side}_wrist"] = rotation[f"{side}_hand"] = palm @ frame(out, up).T
-        for joint, above, below in (
-            ("hip", people.keypoints[f"{side}_hip"], at[f"{side}_knee"]),
-            ("knee", at[f"{side}_knee"], at[f"{side}_ankle"]),
+        pronated_rotation = frame(fore, back_of_hand) @ frame(out, up).T
+        rotation[f"{side}_elbow"] = half_way(elbow_rotation, pronated_rotation)
+        rotation[f"{side}_wrist"] = rotation[f"{side}_hand"] = hand_frame @ frame(out, up).T
+        for joint, upper_end, lower_end in (
+            ("hip", people.keypoints[f"{side}_hip"], joint_position[f"{side}_knee"]),
+            ("knee", joint_position[f"{side}_knee"], joint_position[f"{side}_ankle"]),
         ):
-            bone = below - above
+            bone = lower_end - upper_end
             rotation[f"{side}_{joint}"] = rotation_about("x", np.arctan2(bone[:, 1], -bone[:, 2]))
-        foot = at[f"{side}_foot"] - at[f"{side}_ankle"]
+        foot = joint_position[f"{side}_foot"] - joint_position[f"{side}_ankle"]
         rotation[f"{side}_ankle"] = rotation[f"{side}_foot"] = rotation_about("z", np.arctan2(foot[:, 1], foot[:, 0]))
     return np.stack([rotation[name] for name in SMPL24.joints], 1)
 
@@ -341,21 +345,21 @@ def rest_pivots(pivots: np.ndarray, to_apose: np.ndarray) -> np.ndarray:
 
 def undo_apose(people, pivots, rest_joints, to_apose, *, people_index=None, vertex_index=None) -> np.ndarray:
     """(n, V, 3) T-pose vertices that linear blend skinning with `to_apose` brings exactly to the A-pose."""
-    pick = slice(None) if people_index is None else people_index
-    keep = slice(None) if vertex_index is None else vertex_index
-    weights, out = people.weights[keep], []
+    people_rows = slice(None) if people_index is None else people_index
+    vertex_rows = slice(None) if vertex_index is None else vertex_index
+    weights, vertices = people.weights[vertex_rows], []
     parents = np.array(SMPL24.parents)
-    for apose, pivot, rest, turned in zip(
-        people.vertices[pick], pivots[pick], rest_joints[pick], to_apose[pick], strict=True
+    for apose, pivot, rest, rotations in zip(
+        people.vertices[people_rows], pivots[people_rows], rest_joints[people_rows], to_apose[people_rows], strict=True
     ):
-        local = turned.copy()
-        local[1:] = np.swapaxes(turned[parents[1:]], -1, -2) @ turned[1:]
-        _, reached = forward_kinematics(SMPL24.parents, rest[None], local[None], pivot[:1])
-        assert np.abs(reached[0] - pivot).max() < 1e-9
-        shift = pivot - np.einsum("jab,jb->ja", turned, rest)
-        blend = np.einsum("vj,jab->vab", weights, turned)
-        out.append(np.linalg.solve(blend, (apose[keep] - weights @ shift)[..., None])[..., 0])
-    return np.stack(out)
+        local = rotations.copy()
+        local[1:] = np.swapaxes(rotations[parents[1:]], -1, -2) @ rotations[1:]
+        _, posed_joints = forward_kinematics(SMPL24.parents, rest[None], local[None], pivot[:1])
+        assert np.abs(posed_joints[0] - pivot).max() < 1e-9
+        shift = pivot - np.einsum("jab,jb->ja", rotations, rest)
+        blend = np.einsum("vj,jab->vab", weights, rotations)
+        vertices.append(np.linalg.solve(blend, (apose[vertex_rows] - weights @ shift)[..., None])[..., 0])
+    return np.stack(vertices)
 
 
 def decimation_shapes(people: AnnyPeople) -> np.ndarray:

@@ -26,37 +26,43 @@ def collapse(
     quadric = _quadrics(shapes, faces, factor)
     point = np.concatenate([shapes, np.ones(shapes.shape[:2] + (1,))], -1).swapaxes(0, 1)
     stamp = np.zeros(len(point), int)
-    alive = np.ones(len(point), bool)
+    is_alive = np.ones(len(point), bool)
 
-    def entries(gone, stays):
-        """Heap entries of collapses of `gone` (E,) into `stays` (E,); stamps tell whether they are still true."""
-        total = quadric[gone] + quadric[stays]
-        error = np.einsum("eki,ekij,ekj->e", point[stays], total, point[stays])
-        length = ((mesh.position[gone] - mesh.position[stays]) ** 2).sum(-1)
+    def entries(source, destination):
+        """Heap entries of collapses of `source` (E,) into `destination` (E,); stamps tell if they are still true."""
+        total = quadric[source] + quadric[destination]
+        error = np.einsum("eki,ekij,ekj->e", point[destination], total, point[destination])
+        length = ((mesh.position[source] - mesh.position[destination]) ** 2).sum(-1)
         cost = error + LENGTH_SHARE * np.einsum("ekii->e", total[..., :3, :3]) * length
-        return list(zip(*(x.tolist() for x in (cost, gone, stays, stamp[gone], stamp[stays])), strict=True))
+        return list(
+            zip(*(x.tolist() for x in (cost, source, destination, stamp[source], stamp[destination])), strict=True)
+        )
 
     # in a closed surface each edge is run along once in each direction
     heap = entries(faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel())
     heapq.heapify(heap)
-    left = len(point)
-    while left > target:
-        _, gone, stays, gone_stamp, stays_stamp = heapq.heappop(heap)
-        if not (alive[gone] and alive[stays]) or stamp[gone] != gone_stamp or stamp[stays] != stays_stamp:
+    remaining = len(point)
+    while remaining > target:
+        _, source, destination, source_stamp, destination_stamp = heapq.heappop(heap)
+        if (
+            not (is_alive[source] and is_alive[destination])
+            or stamp[source] != source_stamp
+            or stamp[destination] != destination_stamp
+        ):
             continue
-        if gone == pinned or not mesh.allows(gone, stays):
+        if source == pinned or not mesh.allows(source, destination):
             continue
-        mesh.collapse(gone, stays)
-        alive[gone] = False
-        quadric[stays] += quadric[gone]
-        stamp[stays] += 1
-        left -= 1
-        around = np.array(sorted(mesh.neighbors(stays)))
-        same = np.full(len(around), stays)
-        for entry in entries(same, around) + entries(around, same):
+        mesh.collapse(source, destination)
+        is_alive[source] = False
+        quadric[destination] += quadric[source]
+        stamp[destination] += 1
+        remaining -= 1
+        neighbors = np.array(sorted(mesh.neighbors(destination)))
+        destinations = np.full(len(neighbors), destination)
+        for entry in entries(destinations, neighbors) + entries(neighbors, destinations):
             heapq.heappush(heap, entry)
-    kept = np.flatnonzero(alive)
-    return kept, np.searchsorted(kept, mesh.faces())
+    kept_vertices = np.flatnonzero(is_alive)
+    return kept_vertices, np.searchsorted(kept_vertices, mesh.faces())
 
 
 def _quadrics(shapes: np.ndarray, faces: np.ndarray, factor: np.ndarray) -> np.ndarray:
@@ -88,30 +94,33 @@ class _Mesh:
     def neighbors(self, v: int) -> set[int]:
         return {w for f in self.around[v] for w in self.triangles[f]} - {v}
 
-    def allows(self, gone: int, stays: int) -> bool:
+    def allows(self, source: int, destination: int) -> bool:
         """Whether the surface stays closed, unfolded, and without slivers."""
-        near_gone, near_stays = self.neighbors(gone), self.neighbors(stays)
-        if len(near_gone & near_stays) != 2 or len(near_gone | near_stays) - 2 > MAX_VALENCE:
+        source_neighbors, destination_neighbors = self.neighbors(source), self.neighbors(destination)
+        if (
+            len(source_neighbors & destination_neighbors) != 2
+            or len(source_neighbors | destination_neighbors) - 2 > MAX_VALENCE
+        ):
             return False
-        for f in self.around[gone] - self.around[stays]:
-            old = np.array(self.triangles[f])
-            p, q = self.position[old], self.position[np.where(old == gone, stays, old)]
+        for f in self.around[source] - self.around[destination]:
+            corners = np.array(self.triangles[f])
+            p, q = self.position[corners], self.position[np.where(corners == source, destination, corners)]
             a, b = np.cross(p[1] - p[0], p[2] - p[0]), np.cross(q[1] - q[0], q[2] - q[0])
             size, sides = np.linalg.norm(b), ((q - q[[1, 2, 0]]) ** 2).sum()
             if a @ b < MIN_COSINE * np.linalg.norm(a) * size or 2 * np.sqrt(3) * size < MIN_ROUNDNESS * sides:
                 return False
         return True
 
-    def collapse(self, gone: int, stays: int) -> None:
-        for f in list(self.around[gone]):
+    def collapse(self, source: int, destination: int) -> None:
+        for f in list(self.around[source]):
             face = self.triangles[f]
-            if stays in face:
+            if destination in face:
                 for v in face:
                     self.around[v].discard(f)
             else:
-                self.triangles[f] = tuple(stays if v == gone else v for v in face)
-                self.around[stays].add(f)
-        self.around[gone].clear()
+                self.triangles[f] = tuple(destination if v == source else v for v in face)
+                self.around[destination].add(f)
+        self.around[source].clear()
 
     def faces(self) -> np.ndarray:
         return np.array([self.triangles[f] for f in sorted(set().union(*self.around))])

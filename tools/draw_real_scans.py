@@ -98,8 +98,8 @@ def draw_points(
     ax, points: np.ndarray, camera: Camera, *, ground: float, size: float, largest: float, person: np.ndarray
 ) -> None:
     image, depth = camera.project(points)
-    visible = (depth > 0.4) & (np.abs(image[:, 0]) < 0.55)
-    order = np.flatnonzero(visible)[np.argsort(-depth[visible])]
+    is_visible = (depth > 0.4) & (np.abs(image[:, 0]) < 0.55)
+    order = np.flatnonzero(is_visible)[np.argsort(-depth[is_visible])]
     colors = height_colors(points, depth, ground)
     colors[person] = (0.93, 0.93, 0.88, 0.9)
     area = np.clip(size / depth**2, 0.5, largest) * np.where(person, 2.0, 1.0)
@@ -142,8 +142,8 @@ def draw(scans: dict[str, np.ndarray], poses: dict) -> Figure:
 
 
 def draw_scene(ax, points: np.ndarray, poses, boxes: list[dict], camera: Camera, ground: float) -> None:
-    person = np.any([near_box(points, box, 0.0) & (points[:, 2] > ground + 0.12) for box in boxes], axis=0)
-    draw_points(ax, points, camera, ground=ground, size=60, largest=3, person=person)
+    is_person = np.any([near_box(points, box, 0.0) & (points[:, 2] > ground + 0.12) for box in boxes], axis=0)
+    draw_points(ax, points, camera, ground=ground, size=60, largest=3, person=is_person)
     for pose in poses:
         draw_skeleton(ax, pose, camera, width=2.0)
         head, _ = camera.project(pose.joints[15] + (0, 0, 0.38))
@@ -158,10 +158,10 @@ def draw_card(ax, points: np.ndarray, pose, box: dict, ground: float) -> None:
     eye = center + 4.0 * np.array([np.cos(bearing), np.sin(bearing), 0.16])
     camera = Camera(eye=tuple(eye), target=tuple(center - (0, 0, 0.24)), focal=3.1)
     low = ax.get_ylim()[0]
-    local = points[near_box(points, box, 0.25)]
-    local = local[camera.project(local)[0][:, 1] > low + 0.38]
-    person = near_box(local, box, 0.0) & (local[:, 2] > ground + 0.12)
-    draw_points(ax, local, camera, ground=ground, size=60, largest=7, person=person)
+    near_points = points[near_box(points, box, 0.25)]
+    near_points = near_points[camera.project(near_points)[0][:, 1] > low + 0.38]
+    is_person = near_box(near_points, box, 0.0) & (near_points[:, 2] > ground + 0.12)
+    draw_points(ax, near_points, camera, ground=ground, size=60, largest=7, person=is_person)
     draw_skeleton(ax, pose, camera, width=2.6)
     ax.text(0, low + 0.27, pose.id, color=INK, fontsize=9, ha="center", weight="bold")
     text = f"{pose.num_points} points, {distance:.1f} m\nconfidence {pose.confidence.mean():.2f}"

@@ -46,23 +46,25 @@ def scene_crops(index: int) -> list[Crop]:
     """Points (n, 3) m about the center, view (5,), labels (2,), group 1, of the detections of a scene."""
     scene = detection_scene(SEED, index)
     detections = Detector(threads=1).detect(scene.points, scene.origin, max_range=MAX_RANGE, limit=MOST_POSED)
-    seen = np.flatnonzero(np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes)) >= MIN_POINTS)
-    people = np.array([scene.boxes[row].center[:2] for row in seen]).reshape(-1, 2)
+    visible_people = np.flatnonzero(
+        np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes)) >= MIN_POINTS
+    )
+    people = np.array([scene.boxes[row].center[:2] for row in visible_people]).reshape(-1, 2)
     crops: list[Crop] = []
     for center, size in zip(detections.centers, detections.sizes, strict=True):
-        inside = inside_column(scene.points, center, size)
-        if inside.sum() < MIN_POINTS:
+        is_inside = inside_column(scene.points, center, size)
+        if is_inside.sum() < MIN_POINTS:
             continue
-        away = np.hypot(*(people - center[:2]).T)
-        owner = scene.person[inside]
-        if len(away) and away.min() < OWN:
-            others = int(((owner >= 0) & (owner != seen[away.argmin()])).sum())
-            label = (1.0, second_person_label(others, len(owner)))
-        elif away.min(initial=np.inf) > OTHER and (owner >= 0).mean() <= NOBODYS:
+        distances = np.hypot(*(people - center[:2]).T)
+        owner = scene.person[is_inside]
+        if len(distances) and distances.min() < OWN:
+            num_others = int(((owner >= 0) & (owner != visible_people[distances.argmin()])).sum())
+            label = (1.0, second_person_label(num_others, len(owner)))
+        elif distances.min(initial=np.inf) > OTHER and (owner >= 0).mean() <= NOBODYS:
             label = (0.0, 0.0)
         else:
             continue
-        (cloud,), view = apply(IDENTITY, [scene.points[inside]], center[None], scene.origin)
+        (cloud,), view = apply(IDENTITY, [scene.points[is_inside]], center[None], scene.origin)
         crops.append((cloud, view[0], np.array(label), 1))
     return crops
 
@@ -79,11 +81,11 @@ def make_crops(out: Path, scenes: int, samples: int, motion: str | None, workers
     rng = np.random.default_rng(SEED)
     crops: list[Crop] = []
     with multiprocessing.get_context("forkserver").Pool(workers) as pool:
-        for make, count in ((scene_crops, scenes), (partial(sample_crops, source=source), samples)):
-            for done, made in enumerate(pool.imap(make, range(count), chunksize=8)):
-                crops += made
-                if done % 200 == 0:
-                    print(f"{done} of {count}, {len(crops):,} crops", flush=True)
+        for make_crop, count in ((scene_crops, scenes), (partial(sample_crops, source=source), samples)):
+            for number, new_crops in enumerate(pool.imap(make_crop, range(count), chunksize=8)):
+                crops += new_crops
+                if number % 200 == 0:
+                    print(f"{number} of {count}, {len(crops):,} crops", flush=True)
     clouds = [c if len(c) <= MOST_POINTS else rng.permutation(c)[:MOST_POINTS] for c, *_ in crops]
     _, view, label, group = zip(*crops, strict=True)
     arrays = {"points": np.concatenate(clouds).astype(np.float32), "count": [len(cloud) for cloud in clouds]}
@@ -98,7 +100,7 @@ def head_inputs(network: PoseNet, crops: dict[str, np.ndarray]) -> torch.Tensor:
     inputs: list[torch.Tensor] = []
     clouds = np.split(crops["points"], np.cumsum(crops["count"])[:-1])
     order = np.argsort(crops["count"], kind="stable")
-    handle = network.person.hidden.register_forward_pre_hook(lambda _, given: inputs.append(given[0]))
+    handle = network.person.hidden.register_forward_pre_hook(lambda _, arguments: inputs.append(arguments[0]))
     for start in range(0, len(order), 64):
         rows = order[start : start + 64]
         arrays = voxelize_people([clouds[k] for k in rows], crops["view"][rows].astype(np.float32), network.config)
@@ -120,18 +122,18 @@ def fit(path: Path, model: Path, out: Path) -> None:
     kind = 2 * group + label[:, 0].long()
     weight = (1 / torch.bincount(kind, minlength=4).clamp(min=1))[kind]
     weight = weight / weight.mean()
-    held = torch.rand(len(x)) < HELD_OUT
+    is_held_out = torch.rand(len(x)) < HELD_OUT
     head = network.person
     optimizer = torch.optim.AdamW([*head.hidden.parameters(), *head.out.parameters()], RATE, weight_decay=1e-3)
-    rows = torch.nonzero(~held)[:, 0]
+    rows = torch.nonzero(~is_held_out)[:, 0]
     steps = EPOCHS * -(-len(rows) // BATCH)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps)
     for _ in range(EPOCHS):
-        for part in rows[torch.randperm(len(rows))].split(BATCH):
-            truth = label[part]
-            logit = head.out(head.hidden(x[part]))
-            missed = F.binary_cross_entropy_with_logits(logit, truth.nan_to_num(0), reduction="none")
-            loss = (missed * ~truth.isnan() * weight[part, None]).sum(1).mean()
+        for batch_rows in rows[torch.randperm(len(rows))].split(BATCH):
+            truth = label[batch_rows]
+            logit = head.out(head.hidden(x[batch_rows]))
+            entropy = F.binary_cross_entropy_with_logits(logit, truth.nan_to_num(0), reduction="none")
+            loss = (entropy * ~truth.isnan() * weight[batch_rows, None]).sum(1).mean()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -139,8 +141,11 @@ def fit(path: Path, model: Path, out: Path) -> None:
     with torch.no_grad():
         logit = head.out(head.hidden(x))
     for number, name in enumerate(("people and objects", "detections")):
-        own = held & (group == number)
-        print(f"{name}: AUROC of a person {auroc(logit[own, 0], label[own, 0]):.4f}, {int(own.sum()):,} crops held out")
+        is_in_group = is_held_out & (group == number)
+        print(
+            f"{name}: AUROC of a person {auroc(logit[is_in_group, 0], label[is_in_group, 0]):.4f}, "
+            f"{int(is_in_group.sum()):,} crops held out"
+        )
     save_checkpoint(out, network, card=header.card)
 
 

@@ -26,17 +26,17 @@ def scene_columns(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     scene = detection_scene(SEED, index)
     points, origin = scene.points.astype(float), scene.origin
     up = estimate_up(points, origin)
-    turn = np.eye(3) if up is None else rotation_between(up, np.array([0.0, 0.0, 1.0]))
-    points, origin = points @ turn.T, turn @ origin
+    rotation = np.eye(3) if up is None else rotation_between(up, np.array([0.0, 0.0, 1.0]))
+    points, origin = points @ rotation.T, rotation @ origin
     points = points[np.hypot(*(points - origin)[:, :2].T) < RANGE + 6]
     ground = estimate_ground(points, origin) or without_ground(points, origin)
     places, features = columns(points, heights_above(points, ground))
-    near = np.hypot(*(places - origin[:2]).T) < RANGE
-    seen = np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes)) >= 5
-    people = np.array([(turn @ box.center)[:2] for box in scene.boxes]).reshape(-1, 2)
-    gaps = np.where(seen, np.hypot(*(places[near][:, None] - people).transpose(2, 0, 1)), 99.0)
-    gaps = np.concatenate([gaps, np.full((len(gaps), 1), 99.0)], 1)
-    return features[near], gaps.min(1), gaps.argmin(1) + 1000 * index
+    is_near = np.hypot(*(places - origin[:2]).T) < RANGE
+    is_visible = np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes)) >= 5
+    people = np.array([(rotation @ box.center)[:2] for box in scene.boxes]).reshape(-1, 2)
+    distances = np.where(is_visible, np.hypot(*(places[is_near][:, None] - people).transpose(2, 0, 1)), 99.0)
+    distances = np.concatenate([distances, np.full((len(distances), 1), 99.0)], 1)
+    return features[is_near], distances.min(1), distances.argmin(1) + 1000 * index
 
 
 def fit(features: np.ndarray, distance: np.ndarray, person: np.ndarray) -> dict[str, np.ndarray]:
@@ -45,11 +45,11 @@ def fit(features: np.ndarray, distance: np.ndarray, person: np.ndarray) -> dict[
     x = torch.tensor((features - mean) / deviation, dtype=torch.float32)
     is_person = torch.tensor(distance < 0.35)
     weight = torch.where(is_person, (~is_person).sum() / is_person.sum() / 2, 1.0)
-    used = torch.tensor(np.flatnonzero((distance < 0.35) | (distance > 0.6)))
+    training_rows = torch.tensor(np.flatnonzero((distance < 0.35) | (distance > 0.6)))
     net = torch.nn.Sequential(torch.nn.Linear(x.shape[1], HIDDEN), torch.nn.ReLU(), torch.nn.Linear(HIDDEN, 1))
     optimizer = torch.optim.Adam(net.parameters(), 3e-3, weight_decay=1e-5)
     for _ in range(EPOCHS):
-        for rows in used[torch.randperm(len(used))].split(2048):
+        for rows in training_rows[torch.randperm(len(training_rows))].split(2048):
             loss = torch.nn.functional.binary_cross_entropy_with_logits(
                 net(x[rows])[:, 0], is_person[rows].float(), weight[rows]
             )
@@ -58,12 +58,12 @@ def fit(features: np.ndarray, distance: np.ndarray, person: np.ndarray) -> dict[
             optimizer.step()
     with torch.no_grad():
         logit = net(x)[:, 0].numpy()
-    own = distance < 0.5
-    best = np.full(person.max() + 1, -np.inf)
-    np.maximum.at(best, person[own], logit[own])
-    least = np.quantile(best[np.isfinite(best)], LOST)
-    print(f"{np.mean(logit > least):.2f} of {len(logit):,} columns stay, with {1 - LOST:.3f} of the people")
-    arrays = {"mean": mean, "deviation": deviation, "least": least}
+    is_own_column = distance < 0.5
+    best_logit = np.full(person.max() + 1, -np.inf)
+    np.maximum.at(best_logit, person[is_own_column], logit[is_own_column])
+    least_logit = np.quantile(best_logit[np.isfinite(best_logit)], LOST)
+    print(f"{np.mean(logit > least_logit):.2f} of {len(logit):,} columns stay, with {1 - LOST:.3f} of the people")
+    arrays = {"mean": mean, "deviation": deviation, "least": least_logit}
     for name, layer in (("hidden_", net[0]), ("", net[2])):
         arrays |= {f"{name}weight": layer.weight.detach().numpy().T, f"{name}bias": layer.bias.detach().numpy()}
     arrays |= {"weight": arrays["weight"][:, 0], "bias": arrays["bias"][0]}

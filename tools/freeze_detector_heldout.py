@@ -29,7 +29,7 @@ def main() -> None:
         "name": "detector-heldout-1",
         "family": "heldout",
         "seed": SEED,
-        "left_out": sorted([*LEFT_OUT, *(name for name, thing in THINGS.items() if thing.left_out)]),
+        "left_out": sorted([*LEFT_OUT, *(name for name, kind in THINGS.items() if kind.left_out)]),
         "indices": list(range(COUNT)),
         "kinds": [scene.kind for scene in scenes],
         "sensors": [scene.sensor for scene in scenes],

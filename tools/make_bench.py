@@ -98,7 +98,7 @@ def schema() -> pa.Schema:
 def conditions() -> dict[str, SceneConfig]:
     """clean: nothing but the sensor's own noise and a detector's box 3 cm off; each other one adds its own trouble."""
     wild = scene_config("wild")
-    whole = replace(wild.noise, mask=0.0, clutter=0.0, missing_part=0.0)
+    lossless_noise = replace(wild.noise, mask=0.0, clutter=0.0, missing_part=0.0)
     clean = replace(
         wild,
         sensors=(*SENSORS, *ROSETTES[:2]),
@@ -106,13 +106,13 @@ def conditions() -> dict[str, SceneConfig]:
         clutter=0.0,
         occluder=0.0,
         company=0.0,
-        noise=whole,
+        noise=lossless_noise,
         crop=CropErrors(jitter=0.03, loose=0.0, cut=0.0),
     )
     return {
         "clean": clean,
-        "occluded": replace(clean, occluder=1.0, noise=replace(whole, mask=0.5, missing_part=0.25)),
-        "cluttered": replace(clean, clutter=1.0, noise=replace(whole, clutter=0.5)),
+        "occluded": replace(clean, occluder=1.0, noise=replace(lossless_noise, mask=0.5, missing_part=0.25)),
+        "cluttered": replace(clean, clutter=1.0, noise=replace(lossless_noise, clutter=0.5)),
         "crop": replace(clean, crop=CropErrors(jitter=0.16, loose=0.25, cut=0.35)),
         "company": replace(clean, company=1.0),
         "merged": replace(clean, merged=1.0),
@@ -164,13 +164,13 @@ def people(data: Path) -> Iterator[dict]:
         banks[source] = {start: PoseBank.of_motion(motion.of((start,))) for start in clips}
     seed = count(SEED)
     for condition, scene in conditions().items():
-        for source, wanted in SOURCES.items():
-            found = {
+        for source, num_people in SOURCES.items():
+            streams = {
                 start: _drawn(condition, source, SUBJECTS.get(source, {}).get(start, ""), scene, bank, next(seed))
                 for start, bank in banks[source].items()
             }
-            each = wanted // 2 if condition in ("sparse", "integrated") else wanted
-            yield from (next(found[start]) for start in islice(cycle(found), each))
+            quota = num_people // 2 if condition in ("sparse", "integrated") else num_people
+            yield from (next(streams[start]) for start in islice(cycle(streams), quota))
 
 
 def _drawn(
@@ -182,8 +182,13 @@ def _drawn(
         person = generator.person(seed, index)
         sample, facts = person.sample, person.facts
         # a rosette's frame may be of 0.1 s
-        held = condition in sample.conditions or condition not in ("merged", "accumulated", "sparse", "integrated")
-        if held and LEAST <= len(sample.points) <= MOST and np.count_nonzero(sample.part) >= LEAST_BODY:
+        has_condition = condition in sample.conditions or condition not in (
+            "merged",
+            "accumulated",
+            "sparse",
+            "integrated",
+        )
+        if has_condition and LEAST <= len(sample.points) <= MOST and np.count_nonzero(sample.part) >= LEAST_BODY:
             yield _row(
                 sample, sample.pose.joints, person=True, condition=condition, poses=source,
                 family=family or FAMILIES.get(facts.kind, facts.kind), kind=facts.kind, sensor=facts.sensor,
@@ -195,8 +200,8 @@ def objects() -> Iterator[dict]:
     """Crops without a person, half of them of kinds of things that training never sees."""
     for left_out in (False, True):
         crops = (draw_object(conditions()["cluttered"], SEED, index, left_out=left_out) for index in count())
-        found = (crop for crop in crops if LEAST <= len(crop[0].points) <= MOST)
-        for sample, kind in islice(found, OBJECTS // 2):
+        usable_crops = (crop for crop in crops if LEAST <= len(crop[0].points) <= MOST)
+        for sample, kind in islice(usable_crops, OBJECTS // 2):
             center = cast("Box", sample.box).center
             yield _row(
                 sample, np.full((len(BODY26), 3), np.nan), person=False, condition="object", poses="", family=kind,

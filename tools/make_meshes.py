@@ -82,7 +82,7 @@ def prism(sides: int, *, top: float = 1.0) -> Mesh:
     top."""
     angle = np.arange(sides) * (2 * np.pi / sides)
     ring = np.column_stack([np.cos(angle), np.sin(angle)])
-    levels = [np.column_stack([ring * wide, np.full(sides, z)]) for z, wide in ((0.0, 1.0), (1.0, top))]
+    levels = [np.column_stack([ring * scale, np.full(sides, z)]) for z, scale in ((0.0, 1.0), (1.0, top))]
     vertices = np.concatenate(levels + [[[0, 0, 1.0]]])
     k = np.arange(sides)
     n = (k + 1) % sides
@@ -108,16 +108,16 @@ def disc_wheels(radius: float, x: tuple, half: float, wide: float, *, sides: int
     """Small solid wheels about the y axis, on the ground, two at each x."""
     disc = tube(sides).scaled((radius, radius, wide))
     turn = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float32)
-    upright = Mesh(disc.vertices @ turn + np.float32([0, wide / 2, radius]), disc.faces)
-    return union([upright.moved((at, side * half, 0)) for at in x for side in (-1, 1)])
+    wheel = Mesh(disc.vertices @ turn + np.float32([0, wide / 2, radius]), disc.faces)
+    return union([wheel.moved((wheel_x, side * half, 0)) for wheel_x in x for side in (-1, 1)])
 
 
 def rim(radius: float, half: float, *, sides: int) -> Mesh:
     """A wheel about the y axis that one sees through: a ring with the tread outside and two flanks, closed."""
     turn = 2 * np.pi * np.arange(sides) / sides
     circle = np.stack([np.cos(turn), 0 * turn, np.sin(turn)], 1)
-    aside = np.array([0, half, 0])
-    rings = [circle * radius - aside, circle * radius + aside, circle * (radius - 0.045)]
+    offset = np.array([0, half, 0])
+    rings = [circle * radius - offset, circle * radius + offset, circle * (radius - 0.045)]
     k = np.arange(sides)
     n = (k + 1) % sides
     faces = []
@@ -208,8 +208,8 @@ def pack() -> Mesh:
 
 def ball() -> Mesh:
     """Of radius 1 about the origin."""
-    around = np.linspace(-np.pi / 2, np.pi / 2, 6)[1:-1]
-    return turned(tuple((float(np.sin(a)), float(np.cos(a))) for a in around), 8, tips=(-1.0, 1.0))
+    angles = np.linspace(-np.pi / 2, np.pi / 2, 6)[1:-1]
+    return turned(tuple((float(np.sin(a)), float(np.cos(a))) for a in angles), 8, tips=(-1.0, 1.0))
 
 
 def umbrella() -> Mesh:
@@ -231,12 +231,12 @@ def pram() -> Mesh:
     """Its handle at x = 0 and z = 1, the rest ahead of it; wheels on the ground."""
     basket, hood = rectangle(0.30, 1.0, 0.18), rectangle(0.30, 0.62, 0.2)
     body = hull(layers(*((z, basket * s + [(1 - s) * 0.65, 0]) for z, s in ((0.48, 0.75), (0.78, 1.1)))))
-    folded = hull(layers(*((z, hood * [w, 1] + [0.3 * (1 - w), 0]) for z, w in ((0.76, 1.2), (1.05, 0.7)))))
+    hood_mesh = hull(layers(*((z, hood * [w, 1] + [0.3 * (1 - w), 0]) for z, w in ((0.76, 1.2), (1.05, 0.7)))))
     rods = []
     for y in (-0.24, 0.24):
         rods += [rod((0.0, y, 1.0), (0.98, y, 0.13)), rod((0.8, y, 0.5), (0.2, y, 0.13))]
     handle = box((0.03, 0.5, 0.03)).moved((0, 0, 0.985))
-    return union([body, folded, *rods, handle, disc_wheels(0.13, (0.2, 0.98), 0.26, 0.04, sides=4)])
+    return union([body, hood_mesh, *rods, handle, disc_wheels(0.13, (0.2, 0.98), 0.26, 0.04, sides=4)])
 
 
 def trolley() -> Mesh:
@@ -250,12 +250,12 @@ def trolley() -> Mesh:
 
 def wheelchair() -> Mesh:
     """One sits 0.5 above the origin; without its foot rests."""
-    flat = [((0.06, 0, 0.45), (0.46, 0.44, 0.05)), ((-0.2, 0, 0.5), (0.04, 0.44, 0.42))]
+    panels = [((0.06, 0, 0.45), (0.46, 0.44, 0.05)), ((-0.2, 0, 0.5), (0.04, 0.44, 0.42))]
     for y in (-0.235, 0.235):
-        flat += [((0.06, y, 0.68), (0.34, 0.05, 0.035)), ((-0.2, y, 0.2), (0.03, 0.03, 0.75))]
-        flat += [((-0.27, y, 0.94), (0.15, 0.03, 0.03)), ((0.28, y, 0.14), (0.03, 0.03, 0.55))]
+        panels += [((0.06, y, 0.68), (0.34, 0.05, 0.035)), ((-0.2, y, 0.2), (0.03, 0.03, 0.75))]
+        panels += [((-0.27, y, 0.94), (0.15, 0.03, 0.03)), ((0.28, y, 0.14), (0.03, 0.03, 0.55))]
     wheels = [rim(0.3, 0.025, sides=10).moved((-0.08, y, 0.3)) for y in (-0.3, 0.3)]
-    return union([blocks(*flat), *wheels, disc_wheels(0.08, (0.32,), 0.235, 0.03, sides=6)])
+    return union([blocks(*panels), *wheels, disc_wheels(0.08, (0.32,), 0.235, 0.03, sides=6)])
 
 
 def bicycle() -> Mesh:

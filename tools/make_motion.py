@@ -45,8 +45,8 @@ def clip_name(name: str) -> str:
 
 def is_of(name: str, subjects: list[str]) -> bool:
     """Whether a clip is of one of the subjects; of anybody where none is named."""
-    wanted = {subject.zfill(3) if subject.isdecimal() else subject for subject in subjects}
-    return not wanted or name.partition("_")[0] in wanted
+    subject_names = {subject.zfill(3) if subject.isdecimal() else subject for subject in subjects}
+    return not subject_names or name.partition("_")[0] in subject_names
 
 
 def read_clips(
@@ -82,9 +82,9 @@ def read_clips(
                     raise InputError(f"{path}: there are two clips {name}; give each recording once")
                 frames = motion.frames(c)
                 clips[name] = mean_adult(motion.rotations[frames], motion.translation[frames])
-    missing = [subject for subject in subjects if not any(is_of(name, [subject]) for name in clips)]
-    if missing or not clips:
-        what = f"clip of subject {', '.join(missing)}" if missing else f"{', '.join(SUFFIXES)} file"
+    missing_subjects = [subject for subject in subjects if not any(is_of(name, [subject]) for name in clips)]
+    if missing_subjects or not clips:
+        what = f"clip of subject {', '.join(missing_subjects)}" if missing_subjects else f"{', '.join(SUFFIXES)} file"
         raise InputError(f"{', '.join(map(str, folders))}: no {what} there")
     return dict(sorted(clips.items()))
 

@@ -27,11 +27,11 @@ GOLDEN = Path(__file__).parents[1] / "tests" / "golden_poses.json"
 
 def average(network: nn.Module, old: nn.Module, share: float) -> None:
     """Keeps a share of an older network's weights, in place. What the older one has not stays."""
-    before = old.state_dict()
+    old_weights = old.state_dict()
     with torch.no_grad():
         for name, value in network.state_dict().items():
-            if name in before:
-                value.lerp_(before[name], share)
+            if name in old_weights:
+                value.lerp_(old_weights[name], share)
 
 
 def main() -> None:
@@ -50,21 +50,21 @@ def main() -> None:
         return
     with open(options.scores) as file:
         scores = json.load(file)
-    measured = {}
+    card_scores = {}
     for condition in ("sensor known", "sensor unknown"):
         for group in ("all", "upright, whole, uncluttered"):
             figures = scores[condition]["groups"][group]
-            measured[f"{condition}, {group}"] = f"MPJPE {figures['mpjpe']} mm of {figures['people']} people"
-    measured["measured on"] = f"benchmarks/heldout.py, subjects {scores['subjects']}, seed {scores['seed']}, human15"
+            card_scores[f"{condition}, {group}"] = f"MPJPE {figures['mpjpe']} mm of {figures['people']} people"
+    card_scores["measured on"] = f"benchmarks/heldout.py, subjects {scores['subjects']}, seed {scores['seed']}, human15"
     note = {"note": options.note} if options.note else {}
     out = Path(options.out)
     # both or none: twins of different weights would not load
     with tempfile.TemporaryDirectory() as folder:
-        made = Path(folder) / out.name
-        save_checkpoint(made, network, card=header.card | note | {"scores": measured}, half=True)
-        export(made, made.with_suffix(".onnx"))
+        temporary_path = Path(folder) / out.name
+        save_checkpoint(temporary_path, network, card=header.card | note | {"scores": card_scores}, half=True)
+        export(temporary_path, temporary_path.with_suffix(".onnx"))
         for path in (out, out.with_suffix(".onnx")):
-            write_atomic(path, (made.parent / path.name).read_bytes())
+            write_atomic(path, (temporary_path.parent / path.name).read_bytes())
     golden = json.loads(GOLDEN.read_text())
     pose = load(out.with_suffix(".onnx"), tta=1).predict(golden["points"], sensor_origin=golden["sensor_origin"])
     golden["joints"][out.stem] = pose.joints.round(4).tolist()

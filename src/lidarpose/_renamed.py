@@ -47,13 +47,13 @@ class RenamedModules(MetaPathFinder, Loader):
     """Imports a module by its old path: the module object is that of the new path."""
 
     def find_spec(self, fullname: str, path=None, target=None) -> ModuleSpec | None:
-        old = fullname.removeprefix("lidarpose.")
-        return ModuleSpec(fullname, self) if old != fullname and old in RENAMED else None
+        old_path = fullname.removeprefix("lidarpose.")
+        return ModuleSpec(fullname, self) if old_path != fullname and old_path in RENAMED else None
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        new = "lidarpose." + RENAMED[spec.name.removeprefix("lidarpose.")]
-        warnings.warn(f"{spec.name} is now {new}", DeprecationWarning, stacklevel=2)
-        module = importlib.import_module(new)
+        new_path = "lidarpose." + RENAMED[spec.name.removeprefix("lidarpose.")]
+        warnings.warn(f"{spec.name} is now {new_path}", DeprecationWarning, stacklevel=2)
+        module = importlib.import_module(new_path)
         # importlib sets the spec of what it gets here to the old one
         spec.loader_state = module.__spec__
         return module

@@ -43,15 +43,15 @@ def missing_extra(error: ModuleNotFoundError, what: str, extra: str | None = Non
 
     extra: the one to name where several bring the module.
     """
-    brings = _EXTRA_OF.get((error.name or "").partition(".")[0])
-    return error if brings is None else MissingExtra(what, extra or brings)
+    known_extra = _EXTRA_OF.get((error.name or "").partition(".")[0])
+    return error if known_extra is None else MissingExtra(what, extra or known_extra)
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> InputError:
     """The error for a name that is not in a closed list, with the nearest names first."""
     known = list(known)
-    near = difflib.get_close_matches(str(name), known, n=2, cutoff=0.5)
-    hint = f"did you mean {' or '.join(near)}? " if near else ""
+    matches = difflib.get_close_matches(str(name), known, n=2, cutoff=0.5)
+    hint = f"did you mean {' or '.join(matches)}? " if matches else ""
     return InputError(f"unknown {kind} {name!r}: {hint}known are {', '.join(known)}")
 
 
@@ -68,10 +68,10 @@ def check_int(name: str, value: Any, *, least: int, most: int | None = None, hin
 def check_finite(name: str, value: Any) -> None:
     """Raises InputError unless `value` is a finite number, Python's or numpy's."""
     try:
-        good = isfinite(value)
+        is_finite = isfinite(value)
     except (TypeError, ValueError, OverflowError):
-        good = False
-    if not good:
+        is_finite = False
+    if not is_finite:
         raise InputError(f"{name} must be a finite number, got {value!r}")
 
 
@@ -86,8 +86,8 @@ def check_name(kind: str, name: object, known: Iterable[str]) -> None:
 
 def first_names(names: Sequence[str], most: int = 3) -> str:
     """ "a, b, c and 2 more"."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+    suffix = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + suffix
 
 
 def counted(number: int, one: str, many: str | None = None) -> str:

@@ -31,12 +31,16 @@ def rotation_vector(matrix: np.ndarray) -> np.ndarray:
     angle = np.arctan2(sine, (np.trace(m, axis1=-2, axis2=-1)[..., None] - 1) / 2)
     axis = unit(skew)
     # half a turn has no skew part: R = 2 a a^T - 1, of which the column with the largest diagonal is along the axis
-    half = (sine < 1e-3) & (angle > 1)
-    if half.any():
+    is_half_turn = (sine < 1e-3) & (angle > 1)
+    if is_half_turn.any():
         square = (m + np.swapaxes(m, -1, -2)) / 2 + np.eye(3)
-        largest = np.diagonal(square, axis1=-2, axis2=-1).argmax(-1)
-        along = unit(np.take_along_axis(square, largest[..., None, None], -1)[..., 0])
-        axis = np.where(half, np.where((along * skew).sum(-1, keepdims=True) < 0, -along, along), axis)
+        largest_column = np.diagonal(square, axis1=-2, axis2=-1).argmax(-1)
+        half_turn_axis = unit(np.take_along_axis(square, largest_column[..., None, None], -1)[..., 0])
+        axis = np.where(
+            is_half_turn,
+            np.where((half_turn_axis * skew).sum(-1, keepdims=True) < 0, -half_turn_axis, half_turn_axis),
+            axis,
+        )
     return axis * angle
 
 
@@ -61,8 +65,8 @@ def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     axis = np.cross(a, b)
     s = np.linalg.norm(axis, axis=-1)
     # opposite directions: any axis across a will do
-    across = np.cross(a, np.where(np.abs(a[..., :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0]))
-    axis = np.where((s < 1e-9)[..., None], unit(across), axis / np.maximum(s, 1e-12)[..., None])
+    perpendicular = np.cross(a, np.where(np.abs(a[..., :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0]))
+    axis = np.where((s < 1e-9)[..., None], unit(perpendicular), axis / np.maximum(s, 1e-12)[..., None])
     return axis_angle_to_matrix(axis * np.arctan2(s, c)[..., None])
 
 
@@ -146,9 +150,9 @@ def rotation_from_up(up: str | Sequence[float]) -> np.ndarray:
 
 def upright_axis(up: str | Sequence[float]) -> str:
     """The axis, a key of `UP_AXES`, that is nearest to what is up, as of `rotation_from_up`."""
-    upright = rotation_from_up(up)[2]
-    axis = int(np.abs(upright).argmax())
-    return "-" * bool(upright[axis] < 0) + "xyz"[axis]
+    direction = rotation_from_up(up)[2]
+    axis = int(np.abs(direction).argmax())
+    return "-" * bool(direction[axis] < 0) + "xyz"[axis]
 
 
 def rotation_of_boxes(up: str | Sequence[float]) -> np.ndarray:

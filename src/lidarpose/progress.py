@@ -77,16 +77,16 @@ class Progress:
 
     def line(self) -> str:
         """The progress in words."""
-        of = "" if self.total is None else f" of {self.total:,}"
+        total = "" if self.total is None else f" of {self.total:,}"
         seconds = time.monotonic() - self._started
         rate = (self.done - (self._first or 0)) / max(seconds, 1e-9)
         speed = f", {rate:,.1f}/s" if rate > 0 else ""
-        left = ""
+        remaining = ""
         if self.total is not None and rate > 0:
-            minutes, rest = divmod(round(max(self.total - self.done, 0) / rate), 60)
-            left = f", {minutes // 60}:{minutes % 60:02d}:{rest:02d} left"
+            minutes, remaining_seconds = divmod(round(max(self.total - self.done, 0) / rate), 60)
+            remaining = f", {minutes // 60}:{minutes % 60:02d}:{remaining_seconds:02d} left"
         name = f"{self.label}: " if self.label else ""
-        return f"{name}{self.done:,}{of} {self.unit}{speed}{left}{f', {self._note}' if self._note else ''}"
+        return f"{name}{self.done:,}{total} {self.unit}{speed}{remaining}{f', {self._note}' if self._note else ''}"
 
     def _watch(self) -> None:
         while not self._ended.wait(BAR_EVERY if self._bar is not None else LINE_EVERY):

@@ -85,10 +85,12 @@ class Pose:
 
     def to(self, skeleton: Skeleton) -> "Pose":
         """The same pose with the joints of another skeleton, picked by name."""
-        pick = self.skeleton.map_to(skeleton)
+        indices = self.skeleton.map_to(skeleton)
         values = {name: getattr(self, name) for name in PER_JOINT}
-        picked: dict[str, Any] = {name: None if value is None else value[..., pick] for name, value in values.items()}
-        return replace(self, joints=self.joints[..., pick, :], skeleton=skeleton, **picked)
+        joint_values: dict[str, Any] = {
+            name: None if value is None else value[..., indices] for name, value in values.items()
+        }
+        return replace(self, joints=self.joints[..., indices, :], skeleton=skeleton, **joint_values)
 
 
 def facing(pose: Pose | None) -> np.ndarray | None:
@@ -103,9 +105,9 @@ def facing(pose: Pose | None) -> np.ndarray | None:
     axis = np.zeros(3)
     for joint in ("hip", "shoulder"):
         if f"left_{joint}" in names and f"right_{joint}" in names:
-            across = pose.joints[names.index(f"left_{joint}")] - pose.joints[names.index(f"right_{joint}")]
-            if np.isfinite(across).all():
-                axis = axis + across
+            right_to_left = pose.joints[names.index(f"left_{joint}")] - pose.joints[names.index(f"right_{joint}")]
+            if np.isfinite(right_to_left).all():
+                axis = axis + right_to_left
     length = np.hypot(axis[0], axis[1])
     if length < 0.3 * np.linalg.norm(axis) or length < 0.02:
         return None
@@ -129,11 +131,11 @@ class Box:
 
     def __post_init__(self):
         for name in ("center", "size"):
-            given = getattr(self, name)
+            raw_value = getattr(self, name)
             try:
-                value = np.array(given, float)
+                value = np.array(raw_value, float)
             except (TypeError, ValueError):
-                raise InputError(f"Box.{name} must be three finite numbers in meters, got {given!r}") from None
+                raise InputError(f"Box.{name} must be three finite numbers in meters, got {raw_value!r}") from None
             if value.shape != (3,) or not (np.abs(value) < FARTHEST).all():
                 raise InputError(
                     f"Box.{name} must be three finite numbers in meters, below {FARTHEST:g}, got {value.tolist()}"
@@ -313,12 +315,12 @@ def _as_arrays(self: Pose | Sample, *names: str) -> None:
         if value is None or isinstance(value, np.ndarray):
             continue
         try:
-            made = np.asarray(value)
+            array = np.asarray(value)
         except (TypeError, ValueError):
-            made = np.empty(0, object)
-        if made.dtype.kind not in "fiub":
+            array = np.empty(0, object)
+        if array.dtype.kind not in "fiub":
             raise InputError(f"{type(self).__name__}.{name} must be an array of numbers, got {type(value).__name__}")
-        object.__setattr__(self, name, made)
+        object.__setattr__(self, name, array)
 
 
 # edge of the cells in which a cloud's density is evened out before its center is taken, meters

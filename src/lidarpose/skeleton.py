@@ -90,16 +90,16 @@ class Skeleton:
 
     def map_to(self, other: "Skeleton") -> np.ndarray:
         """(len(other),) int: for each joint of `other` its index here. Raises where a joint is missing."""
-        missing = [name for name in other.joints if name not in self.joints]
-        if missing:
-            raise InputError(f"skeleton {self.name} has no {', '.join(missing)}, which {other.name} needs")
+        missing_joints = [name for name in other.joints if name not in self.joints]
+        if missing_joints:
+            raise InputError(f"skeleton {self.name} has no {', '.join(missing_joints)}, which {other.name} needs")
         return np.array([self.index(name) for name in other.joints])
 
 
 def _mirrored(name: str) -> str:
-    for side, across in (("left_", "right_"), ("right_", "left_")):
+    for side, other_side in (("left_", "right_"), ("right_", "left_")):
         if name.startswith(side):
-            return across + name.removeprefix(side)
+            return other_side + name.removeprefix(side)
     return name
 
 
@@ -108,8 +108,8 @@ def _tree(name: str, edges: str, extra: str = "") -> Skeleton:
     pairs = [word.partition("<") for word in edges.split()]
     joints = tuple(joint for joint, _, _ in pairs)
     parents = tuple(joints.index(parent) if parent else -1 for _, _, parent in pairs)
-    drawn = tuple((joints.index(b), joints.index(a)) for a, _, b in (w.partition("<") for w in extra.split()))
-    return Skeleton(name=name, joints=joints, parents=parents, extra_bones=drawn)
+    extra_bones = tuple((joints.index(b), joints.index(a)) for a, _, b in (w.partition("<") for w in extra.split()))
+    return Skeleton(name=name, joints=joints, parents=parents, extra_bones=extra_bones)
 
 
 _SMPL = """pelvis left_hip<pelvis right_hip<pelvis spine1<pelvis left_knee<left_hip right_knee<right_hip

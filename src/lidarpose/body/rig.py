@@ -79,9 +79,9 @@ class Rig:
     @property
     def dense_weight(self) -> np.ndarray:
         """(V, 24) float32: how much each joint moves each vertex; rows sum to 1."""
-        dense = np.zeros((len(self.weight), len(SMPL24)), np.float32)
-        np.add.at(dense, (np.arange(len(dense))[:, None], self.weight_index), self.weight)
-        return dense
+        weights = np.zeros((len(self.weight), len(SMPL24)), np.float32)
+        np.add.at(weights, (np.arange(len(weights))[:, None], self.weight_index), self.weight)
+        return weights
 
     def rest(self, coefficients: np.ndarray) -> "RestBody":
         """The T-posed bodies of shape coefficients (n, S); zeros are the mean person of the table."""
@@ -113,14 +113,14 @@ class RestBody:
 def load_rig() -> Rig:
     """The shipped body; read once."""
     with resources.files(__package__).joinpath("assets/body.npz").open("rb") as file:
-        stored = dict(np.load(file, allow_pickle=False))
+        arrays = dict(np.load(file, allow_pickle=False))
     for name in ("template", "morphs", "joint_template", "joint_morphs", "coefficients", "age", "height", "bmi"):
-        stored[name] = np.ascontiguousarray(stored[name], np.float32)
-    stored["weight"] = stored["weight"].astype(np.float32) / np.float32(255)
+        arrays[name] = np.ascontiguousarray(arrays[name], np.float32)
+    arrays["weight"] = arrays["weight"].astype(np.float32) / np.float32(255)
     for name in ("faces", "weight_index"):
-        stored[name] = np.ascontiguousarray(stored[name], np.int32)
-    stored["sex"] = np.where(stored.pop("female"), "female", "male")
-    return Rig(parents=np.array(SMPL24.parents, np.int32), **stored)
+        arrays[name] = np.ascontiguousarray(arrays[name], np.int32)
+    arrays["sex"] = np.where(arrays.pop("female"), "female", "male")
+    return Rig(parents=np.array(SMPL24.parents, np.int32), **arrays)
 
 
 def forward_kinematics(
@@ -167,8 +167,8 @@ def without_yaw(rotations: np.ndarray) -> np.ndarray:
 def mean_adult_joints() -> np.ndarray:
     """(24, 3) m: the joints of the shipped body's mean adult in the T-pose, SMPL's order; read-only."""
     rig = load_rig()
-    mean = rig.coefficients[rig.age >= ADULT_AGE].mean(0, keepdims=True)
-    joints = rig.rest(mean).joints[0, : len(SMPL24)].astype(float)
+    mean_coefficients = rig.coefficients[rig.age >= ADULT_AGE].mean(0, keepdims=True)
+    joints = rig.rest(mean_coefficients).joints[0, : len(SMPL24)].astype(float)
     joints.flags.writeable = False
     return joints
 
@@ -214,28 +214,28 @@ def sample_people(rng: np.random.Generator, n: int) -> People:
     """Draws n people: 88 % adults of 18 to 80 years, 12 % children of 4 to 18, half of them female."""
     rig = load_rig()
     probability, neighbors = _sampling_table()
-    first = rng.choice(len(probability), size=n, p=probability)
-    second = neighbors[first, rng.integers(0, neighbors.shape[1], n)]
+    first_row = rng.choice(len(probability), size=n, p=probability)
+    second_row = neighbors[first_row, rng.integers(0, neighbors.shape[1], n)]
     share = rng.uniform(0.0, 0.5, n).astype(np.float32)
 
     def mix(table: np.ndarray) -> np.ndarray:
         s = share.reshape(-1, *[1] * (table.ndim - 1))
-        return (1 - s) * table[first] + s * table[second]
+        return (1 - s) * table[first_row] + s * table[second_row]
 
-    mixed = {name: mix(getattr(rig, name)) for name in ("coefficients", "age", "height", "bmi")}
-    return People(sex=rig.sex[first], **mixed)
+    mixture = {name: mix(getattr(rig, name)) for name in ("coefficients", "age", "height", "bmi")}
+    return People(sex=rig.sex[first_row], **mixture)
 
 
 @cache
 def _sampling_table() -> tuple[np.ndarray, np.ndarray]:
     """Probability (N,) of each row of the rig's table, and its nearest rows (N, NEIGHBORS) of the same sex."""
     rig = load_rig()
-    adult, log_bmi = rig.age >= ADULT_AGE, np.log(rig.bmi)
-    weight = np.where(adult, np.interp(rig.age, [OLD_FROM, OLD_TO], [1.0, OLD_SHARE]), 1.0)
+    adult_mask, log_bmi = rig.age >= ADULT_AGE, np.log(rig.bmi)
+    weight = np.where(adult_mask, np.interp(rig.age, [OLD_FROM, OLD_TO], [1.0, OLD_SHARE]), 1.0)
     neighbors = np.empty((len(weight), NEIGHBORS), int)
     for sex in ("male", "female"):
-        for is_adult, share, years in ((True, 1 - CHILD_SHARE, 15), (False, CHILD_SHARE, 3)):
-            rows = np.flatnonzero((rig.sex == sex) & (adult == is_adult))
+        for is_adult, share, age_unit in ((True, 1 - CHILD_SHARE, 15), (False, CHILD_SHARE, 3)):
+            rows = np.flatnonzero((rig.sex == sex) & (adult_mask == is_adult))
             if is_adult:
                 median, spread = BMI[sex]
                 weight[rows] *= _density_ratio(rig.height[rows], *HEIGHT[sex])
@@ -243,7 +243,7 @@ def _sampling_table() -> tuple[np.ndarray, np.ndarray]:
             weight[rows] = np.minimum(weight[rows], WEIGHT_CAP * weight[rows].mean())
             weight[rows] *= share / 2 / weight[rows].sum()
             # one unit each: 5 cm, 10 % of BMI, 15 years (3 for children, who change faster)
-            features = np.stack([rig.height[rows] / 0.05, log_bmi[rows] / 0.1, rig.age[rows] / years], -1)
+            features = np.stack([rig.height[rows] / 0.05, log_bmi[rows] / 0.1, rig.age[rows] / age_unit], -1)
             distance = ((features[:, None] - features) ** 2).sum(-1)
             np.fill_diagonal(distance, np.inf)
             neighbors[rows] = rows[np.argsort(distance, 1)[:, :NEIGHBORS]]
@@ -252,9 +252,9 @@ def _sampling_table() -> tuple[np.ndarray, np.ndarray]:
 
 def _density_ratio(value: np.ndarray, mean: float, spread: float) -> np.ndarray:
     """Density of a normal distribution over that of the normal distribution fitted to `value`."""
-    target = (value - mean) / spread
-    fitted = (value - value.mean()) / value.std()
-    return np.exp((fitted**2 - target**2) / 2)
+    target_score = (value - mean) / spread
+    fitted_score = (value - value.mean()) / value.std()
+    return np.exp((fitted_score**2 - target_score**2) / 2)
 
 
 def clothing(rng: np.random.Generator, n: int, rig: Rig | None = None) -> np.ndarray:
@@ -274,15 +274,15 @@ def clothing(rng: np.random.Generator, n: int, rig: Rig | None = None) -> np.nda
     """
     from lidarpose.body.rig_kernels import fold_clothing
 
-    dense, scalp, template = _regions(load_rig() if rig is None else rig)
-    offset = _outfit(rng, n) @ dense.T
+    dense_weight, scalp, template = _regions(load_rig() if rig is None else rig)
+    offset = _outfit(rng, n) @ dense_weight.T
     hair = rng.uniform(0.0, 0.03, (n, 1)) + rng.choice([0.0, 0.012], (n, 1), p=[0.8, 0.2])
     offset += hair.astype(np.float32) * scalp
     # folds: a few waves of 15 to 60 cm length that thicken and thin the cloth by about a quarter
-    waves = 4
-    direction = rng.normal(size=(n, waves, 3))
-    direction /= np.linalg.norm(direction, axis=-1, keepdims=True) * rng.uniform(0.15, 0.6, (n, waves, 1))
-    phase = rng.random((n, waves))
+    wave_count = 4
+    direction = rng.normal(size=(n, wave_count, 3))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True) * rng.uniform(0.15, 0.6, (n, wave_count, 1))
+    phase = rng.random((n, wave_count))
     fold_clothing(template, direction.astype(np.float32), phase.astype(np.float32), FOLD_GAIN, offset)
     return np.clip(offset, 0, MAX_CLOTHING)
 
@@ -290,38 +290,38 @@ def clothing(rng: np.random.Generator, n: int, rig: Rig | None = None) -> np.nda
 @cache
 def _regions(rig: Rig) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Dense weights (V, 24), hair's share of each vertex (V,), and the mean body's vertices (V, 3)."""
-    dense = rig.dense_weight
+    dense_weight = rig.dense_weight
     from_center = rig.template - rig.joint_template[BODY26.index("head_center")]
     # hair: above and behind a plane that rises forwards from below the ears to the brow, 4 cm of transition
-    behind = from_center @ np.array([-0.6, 0.0, 0.8], np.float32)
-    scalp = np.clip(behind / 0.04 + 0.5, 0, 1) * dense[:, SMPL24.index("head")]
-    return dense, scalp.astype(np.float32), rig.template
+    plane_distance = from_center @ np.array([-0.6, 0.0, 0.8], np.float32)
+    scalp = np.clip(plane_distance / 0.04 + 0.5, 0, 1) * dense_weight[:, SMPL24.index("head")]
+    return dense_weight, scalp.astype(np.float32), rig.template
 
 
 def _outfit(rng: np.random.Generator, n: int) -> np.ndarray:
     """(n, 24) float32 m: what a person wears on each joint's part of the body."""
     top = _pick(rng, n, [0.12, 0.40, 0.36, 0.12], [(0.0, 0.005), (0.006, 0.018), (0.014, 0.028), (0.026, 0.038)])
-    thick = top > 0.014
-    sleeve = top * np.where(thick | (rng.random(n) < 0.4), rng.uniform(0.5, 0.9, n), 0.0)
+    is_thick = top > 0.014
+    sleeve = top * np.where(is_thick | (rng.random(n) < 0.4), rng.uniform(0.5, 0.9, n), 0.0)
     leg_kind = rng.choice(4, size=n, p=[0.22, 0.52, 0.13, 0.13])
-    tight, shorts, skirt = leg_kind == 0, leg_kind == 2, leg_kind == 3
+    is_tight, has_shorts, has_skirt = leg_kind == 0, leg_kind == 2, leg_kind == 3
     thigh = np.select(
-        [tight, skirt], [rng.uniform(0.001, 0.006, n), rng.uniform(0.015, 0.035, n)], rng.uniform(0.008, 0.02, n)
+        [is_tight, has_skirt], [rng.uniform(0.001, 0.006, n), rng.uniform(0.015, 0.035, n)], rng.uniform(0.008, 0.02, n)
     )
-    shank = np.select([tight, shorts, skirt], [thigh, 0.0, 0.0], thigh * rng.uniform(0.8, 1.4, n))
-    shank = np.where(skirt & (rng.random(n) < 0.3), thigh, shank)
+    shank = np.select([is_tight, has_shorts, has_skirt], [thigh, 0.0, 0.0], thigh * rng.uniform(0.8, 1.4, n))
+    shank = np.where(has_skirt & (rng.random(n) < 0.3), thigh, shank)
     # long coats reach over the thighs
     thigh = np.where((top > 0.024) & (rng.random(n) < 0.6), np.maximum(thigh, 0.9 * top), thigh)
     neck = np.where(rng.random(n) < 0.15, rng.uniform(0.01, 0.03, n), 0.3 * top)
-    glove = np.where(thick & (rng.random(n) < 0.2), rng.uniform(0.002, 0.006, n), 0.0)
+    glove = np.where(is_thick & (rng.random(n) < 0.2), rng.uniform(0.002, 0.006, n), 0.0)
     shoe = rng.uniform(0.004, 0.014, n)
-    worn = {
+    thickness = {
         "pelvis": np.maximum(0.9 * top, 0.8 * thigh), "hip": thigh, "knee": shank, "ankle": shoe, "foot": shoe,
         "spine1": 1.05 * top, "spine2": top, "spine3": 0.9 * top, "neck": neck, "collar": 0.8 * top,
         "shoulder": np.maximum(0.75 * top, sleeve), "elbow": sleeve, "wrist": glove, "hand": glove,
     }  # fmt: skip
-    bare = np.zeros(n)
-    return np.stack([worn.get(name.split("_")[-1], bare) for name in SMPL24.joints], -1).astype(np.float32)
+    no_cloth = np.zeros(n)
+    return np.stack([thickness.get(name.split("_")[-1], no_cloth) for name in SMPL24.joints], -1).astype(np.float32)
 
 
 def _pick(rng: np.random.Generator, n: int, shares: list[float], ranges: list[tuple[float, float]]) -> np.ndarray:

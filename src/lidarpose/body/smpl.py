@@ -130,14 +130,14 @@ class SmplBody:
         rotations = np.asarray(rotations, float)
         if rotations.shape[1:] != (24, 3, 3):
             raise InputError(f"rotations must be ({len(vertices)}, 24, 3, 3), got {rotations.shape}")
-        local = self._all_rotations(_R_LEVEL_SMPL.T @ rotations @ _R_LEVEL_SMPL, len(vertices))
+        local_rotations = self._all_rotations(_R_LEVEL_SMPL.T @ rotations @ _R_LEVEL_SMPL, len(vertices))
         root = self._checked_translation(translation, len(vertices)) @ _R_LEVEL_SMPL
         nose, ears = self._head_vertices
         points = np.stack([vertices[:, nose], vertices[:, ears].mean(1)], 1) - joints[:, None, _HEAD]
-        posed, positions, global_rotations = self._posed(vertices, joints, local, root)
-        head = positions[:, None, _HEAD] + points @ np.swapaxes(global_rotations[:, _HEAD], -1, -2)
-        body26 = np.concatenate([positions[:, :_SHARED], self._hands(positions), head], 1)
-        return tuple((x @ _R_LEVEL_SMPL.T).astype(np.float32) for x in (posed, body26))
+        posed_vertices, positions, global_rotations = self._posed(vertices, joints, local_rotations, root)
+        head_points = positions[:, None, _HEAD] + points @ np.swapaxes(global_rotations[:, _HEAD], -1, -2)
+        body26 = np.concatenate([positions[:, :_SHARED], self._hands(positions), head_points], 1)
+        return tuple((x @ _R_LEVEL_SMPL.T).astype(np.float32) for x in (posed_vertices, body26))
 
     # its name before 0.3
     pose_house = pose_level
@@ -149,12 +149,16 @@ class SmplBody:
         # raises for betas that cannot be
         self.rest(betas[:1])
         count = betas.shape[1]
-        owned = on_smpl(self.weights, self.parents)
-        index = np.argsort(-owned, 1, kind="stable")[:, :4]
-        weight = np.take_along_axis(owned, index, 1)
-        level = [self._level_rest(shape) for shape in (self.template, *np.moveaxis(self.shapes[..., :count], -1, 0))]
+        joint_weights = on_smpl(self.weights, self.parents)
+        index = np.argsort(-joint_weights, 1, kind="stable")[:, :4]
+        weight = np.take_along_axis(joint_weights, index, 1)
+        level_shapes = [
+            self._level_rest(shape) for shape in (self.template, *np.moveaxis(self.shapes[..., :count], -1, 0))
+        ]
         # a unit of a coefficient moves vertices and joints alike
-        vertices, joints = (np.ascontiguousarray(np.stack(part), np.float32) for part in zip(*level, strict=True))
+        vertices, joints = (
+            np.ascontiguousarray(np.stack(arrays), np.float32) for arrays in zip(*level_shapes, strict=True)
+        )
         return Rig(
             faces=self.faces.copy(),
             face_part=self.face_part.copy(),
@@ -174,8 +178,8 @@ class SmplBody:
         the pelvis; linear in the vertices."""
         joints = self.regressor @ vertices
         nose, ears = self._head_vertices
-        head = np.stack([vertices[nose], vertices[ears].mean(0)])
-        body26 = np.concatenate([joints[:_SHARED], self._hands(joints[None])[0], head])
+        head_points = np.stack([vertices[nose], vertices[ears].mean(0)])
+        body26 = np.concatenate([joints[:_SHARED], self._hands(joints[None])[0], head_points])
         return (vertices - joints[0]) @ _R_LEVEL_SMPL.T, (body26 - joints[0]) @ _R_LEVEL_SMPL.T
 
     def _posed(
@@ -183,17 +187,19 @@ class SmplBody:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Vertices (n, V, 3), joints (n, J, 3) and their global rotations; Eq. 9 and 2 to 4."""
         global_rotations, positions = forward_kinematics(self.parents, joints, rotations, root)
-        bend = (rotations[:, 1:] - np.eye(3)).reshape(len(rotations), -1)
-        shift = positions - (global_rotations @ joints[..., None])[..., 0]
+        pose_features = (rotations[:, 1:] - np.eye(3)).reshape(len(rotations), -1)
+        translations = positions - (global_rotations @ joints[..., None])[..., 0]
         # a bone's motion as rows (R | t), so that one product blends both
-        motion = np.concatenate([global_rotations, shift[..., None]], -1).reshape(len(positions), len(self.parents), 12)
-        posed = np.empty_like(vertices)
+        motion = np.concatenate([global_rotations, translations[..., None]], -1).reshape(
+            len(positions), len(self.parents), 12
+        )
+        posed_vertices = np.empty_like(vertices)
         # one person at a time: the blended motions of all would fill the memory
-        for i, rest in enumerate(vertices):
+        for i, rest_vertices in enumerate(vertices):
             blend = (self.weights @ motion[i]).reshape(-1, 3, 4)
-            rest = rest + self.pose_shapes @ bend[i]
-            posed[i] = (blend[..., :3] @ rest[..., None])[..., 0] + blend[..., 3]
-        return posed, positions, global_rotations
+            rest_vertices = rest_vertices + self.pose_shapes @ pose_features[i]
+            posed_vertices[i] = (blend[..., :3] @ rest_vertices[..., None])[..., 0] + blend[..., 3]
+        return posed_vertices, positions, global_rotations
 
     @staticmethod
     def _checked_translation(translation: np.ndarray | None, count: int) -> np.ndarray:
@@ -208,23 +214,23 @@ class SmplBody:
             rotations = np.asarray(rotations, float)
         except (TypeError, ValueError):
             raise InputError("rotations must be an array of numbers") from None
-        total = len(self.parents)
-        if rotations.shape in ((count, 72), (count, 3 * total)):
+        joint_count = len(self.parents)
+        if rotations.shape in ((count, 72), (count, 3 * joint_count)):
             rotations = rotations.reshape(count, -1, 3)
-        if rotations.shape in ((count, 24, 3), (count, total, 3)):
+        if rotations.shape in ((count, 24, 3), (count, joint_count, 3)):
             rotations = axis_angle_to_matrix(rotations)
-        if rotations.shape not in ((count, 24, 3, 3), (count, total, 3, 3)) or not np.isfinite(rotations).all():
+        if rotations.shape not in ((count, 24, 3, 3), (count, joint_count, 3, 3)) or not np.isfinite(rotations).all():
             raise InputError(
-                f"rotations must be finite, ({count}, {total} or 24, 3, 3) or axis-angles ({count}, {total} or 24, 3), "
-                f"got {rotations.shape}"
+                f"rotations must be finite, ({count}, {joint_count} or 24, 3, 3) or axis-angles "
+                f"({count}, {joint_count} or 24, 3), got {rotations.shape}"
             )
-        if rotations.shape[1] == total:
+        if rotations.shape[1] == joint_count:
             return rotations
-        full = np.broadcast_to(np.eye(3), (count, total, 3, 3)).copy()
-        full[:, :_SHARED] = rotations[:, :_SHARED]
+        all_rotations = np.broadcast_to(np.eye(3), (count, joint_count, 3, 3)).copy()
+        all_rotations[:, :_SHARED] = rotations[:, :_SHARED]
         for wrist, hand in _HANDS.items():
-            full[:, self._fingers(wrist)] = rotations[:, hand, None]
-        return full
+            all_rotations[:, self._fingers(wrist)] = rotations[:, hand, None]
+        return all_rotations
 
     def _hands(self, joints: np.ndarray) -> np.ndarray:
         """The hands (n, 2, 3) of joints (n, J, 3): the mean of the fingers' bases, without the thumb's."""
@@ -261,33 +267,38 @@ def load_body(path: str | os.PathLike) -> SmplBody:
         names = sorted(map(str, arrays))
     else:
         raise file_error(path, "expected a body of the SMPL family, .npz or .pkl")
-    missing = [key for key in _KEYS if key not in arrays]
-    if missing:
-        listed = ", ".join(names[:12]) or "nothing"
-        raise file_error(path, f"is no body of the SMPL family: {', '.join(missing)} missing; it has {listed}")
+    missing_keys = [key for key in _KEYS if key not in arrays]
+    if missing_keys:
+        name_list = ", ".join(names[:12]) or "nothing"
+        raise file_error(path, f"is no body of the SMPL family: {', '.join(missing_keys)} missing; it has {name_list}")
     return _body(path, arrays)
 
 
-def _body(path: object, raw: Mapping) -> SmplBody:
-    arrays = {key: _numbers(path, key, raw[key]) for key in _KEYS}
-    template, shapes, bends, regressor, weights, tree, faces = (arrays[key] for key in _KEYS)
+def _body(path: object, content: Mapping) -> SmplBody:
+    arrays = {key: _numbers(path, key, content[key]) for key in _KEYS}
+    template, shapes, pose_shapes, regressor, weights, tree, faces = (arrays[key] for key in _KEYS)
     if template.ndim != 2 or template.shape[1] != 3 or tree.ndim != 2 or len(tree) != 2:
         raise file_error(path, f"needs v_template (V, 3), kintree_table (2, J), got {template.shape}, {tree.shape}")
-    count, total = len(template), tree.shape[1]
+    vertex_count, joint_count = len(template), tree.shape[1]
     shape_count = shapes.shape[-1] if shapes.ndim == 3 else 0
     expected = {
-        "shapedirs": (count, 3, shape_count), "posedirs": (count, 3, 9 * (total - 1)), "J_regressor": (total, count),
-        "weights": (count, total), "f": (len(faces) if faces.ndim else 0, 3),
-    }  # fmt: skip
+        "shapedirs": (vertex_count, 3, shape_count),
+        "posedirs": (vertex_count, 3, 9 * (joint_count - 1)),
+        "J_regressor": (joint_count, vertex_count),
+        "weights": (vertex_count, joint_count),
+        "f": (len(faces) if faces.ndim else 0, 3),
+    }
     for key, shape in expected.items():
         if arrays[key].shape != shape or not arrays[key].size:
-            want = "(V, 3, S)" if key == "shapedirs" else "(F, 3)" if key == "f" else shape
+            shape_text = "(V, 3, S)" if key == "shapedirs" else "(F, 3)" if key == "f" else shape
             raise file_error(
-                path, f"{key} must be {want} for {count} vertices, {total} joints; got {arrays[key].shape}"
+                path,
+                f"{key} must be {shape_text} for {vertex_count} vertices, {joint_count} joints; "
+                f"got {arrays[key].shape}",
             )
     parents = _parents(path, tree)
-    if (faces != np.round(faces)).any() or faces.min() < 0 or faces.max() >= count:
-        raise file_error(path, f"f must be whole numbers of vertices, 0 to {count - 1}")
+    if (faces != np.round(faces)).any() or faces.min() < 0 or faces.max() >= vertex_count:
+        raise file_error(path, f"f must be whole numbers of vertices, 0 to {vertex_count - 1}")
     for key, rows in (("weights", weights), ("J_regressor", regressor)):
         if np.abs(rows.sum(1) - 1).max() > _SUM_TOLERANCE:
             raise file_error(path, f"the rows of {key} must sum to 1; was the file changed?")
@@ -301,8 +312,8 @@ def _body(path: object, raw: Mapping) -> SmplBody:
     return SmplBody(
         template=template,
         # small numbers: half the memory costs nanometers
-        shapes=shapes[..., : _EXPRESSIONS.get((total, shape_count), shape_count)].astype(np.float32),
-        pose_shapes=bends.astype(np.float32),
+        shapes=shapes[..., : _EXPRESSIONS.get((joint_count, shape_count), shape_count)].astype(np.float32),
+        pose_shapes=pose_shapes.astype(np.float32),
         regressor=regressor,
         weights=weights,
         parents=parents,
@@ -327,20 +338,20 @@ def _numbers(path: object, key: str, value: object) -> np.ndarray:
 
 def _parents(path: object, tree: np.ndarray) -> np.ndarray:
     """(J,) from kintree_table, whose first row has the parents; the root's is -1 as an unsigned number of any width."""
-    total = tree.shape[1]
-    parents = np.where(np.arange(total) == 0, -1, np.clip(tree[0], -1, total)).astype(int)
-    ordered = total >= 24 and (parents[1:] >= 0).all() and (parents < np.arange(total)).all()
-    hands = ordered and all((parents[_SHARED:] == wrist).any() for wrist in _HANDS)
-    if not ordered or tuple(parents[:_SHARED]) != SMPL24.parents[:_SHARED] or not hands:
-        raise file_error(path, f"kintree_table must begin with SMPL's joints and have hands, got {total} joints")
+    joint_count = tree.shape[1]
+    parents = np.where(np.arange(joint_count) == 0, -1, np.clip(tree[0], -1, joint_count)).astype(int)
+    is_ordered = joint_count >= 24 and (parents[1:] >= 0).all() and (parents < np.arange(joint_count)).all()
+    has_hands = is_ordered and all((parents[_SHARED:] == wrist).any() for wrist in _HANDS)
+    if not is_ordered or tuple(parents[:_SHARED]) != SMPL24.parents[:_SHARED] or not has_hands:
+        raise file_error(path, f"kintree_table must begin with SMPL's joints and have hands, got {joint_count} joints")
     return parents
 
 
 def on_smpl(weights: np.ndarray, parents: np.ndarray) -> np.ndarray:
     """(V, 24): what belongs to SMPL's joints; what hangs on a wrist is its hand, what hangs on the head is the head."""
-    owner = np.empty(len(parents), int)
+    smpl_joint = np.empty(len(parents), int)
     for j, parent in enumerate(parents):
-        owner[j] = j if j < _SHARED else _HANDS.get(owner[parent], owner[parent])
-    summed = np.zeros((len(weights), len(SMPL24)))
-    np.add.at(summed.T, owner, weights.T)
-    return summed
+        smpl_joint[j] = j if j < _SHARED else _HANDS.get(smpl_joint[parent], smpl_joint[parent])
+    smpl_weights = np.zeros((len(weights), len(SMPL24)))
+    np.add.at(smpl_weights.T, smpl_joint, weights.T)
+    return smpl_weights

@@ -44,10 +44,10 @@ def run(arguments: list[str] | None = None) -> int:
         _drop_output()
     except ModuleNotFoundError as error:
         extra = "export" if options.command == "export" else None
-        missing = missing_extra(error, f"`lidarpose {options.command}`", extra)
-        if not isinstance(missing, LidarPoseError):
+        extra_error = missing_extra(error, f"`lidarpose {options.command}`", extra)
+        if not isinstance(extra_error, LidarPoseError):
             raise
-        return _failed(missing)
+        return _failed(extra_error)
     except LidarPoseError as error:
         return _failed(error)
     except OSError as error:
@@ -59,9 +59,9 @@ def run(arguments: list[str] | None = None) -> int:
     except MemoryError as error:
         reason = f" ({error})" if str(error) else ""
         return _failed(InputError(f"the memory is full{reason}: give less at once, as fewer points or people"))
-    except KeyboardInterrupt as stopped:
+    except KeyboardInterrupt as interrupt:
         # training says how to go on
-        return _ended(str(stopped) or "stopped", getattr(stopped, "status", 130))
+        return _ended(str(interrupt) or "stopped", getattr(interrupt, "status", 130))
     return 0
 
 
@@ -95,13 +95,13 @@ class _Parser(argparse.ArgumentParser):
 
 def _joined(arguments: list[str]) -> list[str]:
     """`--sensor-origin -1,0,2` as `--sensor-origin=-1,0,2`, and `--up -y` as `--up=-y`."""
-    joined: list[str] = []
+    words: list[str] = []
     for argument in arguments:
-        if joined and joined[-1] in _SIGNED and argument.startswith("-") and argument[1:2] in tuple("0123456789.xyz"):
-            joined[-1] += f"={argument}"
+        if words and words[-1] in _SIGNED and argument.startswith("-") and argument[1:2] in tuple("0123456789.xyz"):
+            words[-1] += f"={argument}"
         else:
-            joined.append(argument)
-    return joined
+            words.append(argument)
+    return words
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -99,17 +99,19 @@ def _synth(options: argparse.Namespace) -> None:
         **{name: getattr(options, name) for name in fields},
     )
     with Progress(job.count, unit=job.what) as bar:
-        made = write_dataset(job, options.out, workers=options.workers, progress=lambda done, _: bar.update(done))
-    there = "" if made == job.count else f", {job.count - made:,} were there"
-    tell(f"{counted(made, job.what)} made{there} -> {options.out}")
+        num_written = write_dataset(
+            job, options.out, workers=options.workers, progress=lambda count, _: bar.update(count)
+        )
+    note = "" if num_written == job.count else f", {job.count - num_written:,} were there"
+    tell(f"{counted(num_written, job.what)} made{note} -> {options.out}")
 
 
 def _prepare(options: argparse.Namespace) -> None:
     from lidarpose.data.prepare import prepare, summary_lines
 
-    where = options.dataset, options.root, options.out
+    paths = options.dataset, options.root, options.out
     choices = {name: getattr(options, name) for name in ("split", "split_by", "smpl", "workers")}
-    summary = prepare(*where, level=not options.no_level, **choices)
+    summary = prepare(*paths, level=not options.no_level, **choices)
     for line in summary_lines(summary):
         tell(line)
 

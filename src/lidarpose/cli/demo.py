@@ -59,9 +59,9 @@ def _report(model: Predictor, people: list) -> tuple[list[dict], dict[str, bytes
     clouds = [person.sample.points for person in people]
     # the sensor of a sample is the origin of its frame; the first call warms the network up
     model.predict(clouds[:2], sensor_origin=(0, 0, 0))
-    started = time.perf_counter()
+    start = time.perf_counter()
     poses = model.predict(clouds, sensor_origin=(0, 0, 0))
-    milliseconds = (time.perf_counter() - started) * 1e3 / len(people)
+    milliseconds = (time.perf_counter() - start) * 1e3 / len(people)
 
     rows, panels = [], []
     for person, pose in zip(people, poses, strict=True):

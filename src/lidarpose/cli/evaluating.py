@@ -88,9 +88,9 @@ def _evaluate(options: argparse.Namespace) -> None:
 
     if options.weights == DETECTOR:
         return _evaluate_detector(options)
-    if wrong := [f"--{name}" for name in option_names(_DETECTOR) if getattr(options, name) is not None]:
+    if detector_flags := [f"--{name}" for name in option_names(_DETECTOR) if getattr(options, name) is not None]:
         raise InputError(
-            f"{wrong[0]} is of lidarpose evaluate detector, got the network {options.weights}: leave it out"
+            f"{detector_flags[0]} is of lidarpose evaluate detector, got the network {options.weights}: leave it out"
         )
     folder = evaluation.new_folder(options.weights) if options.out is None else evaluation.check_folder(options.out)
     settings = {name: getattr(options, name) for name in option_names(_OPTIONS)}
@@ -99,12 +99,12 @@ def _evaluate(options: argparse.Namespace) -> None:
         run = evaluation.run(
             options.weights, options.datasets, command=_command(options), progress=progress, **settings
         )
-    written = evaluation.write(run, folder)
+    paths = evaluation.write(run, folder)
     for result in run.scores.results:
         print("\n".join(_lines(result)))
     for study in run.studies:
         print("\n".join(_study(study)))
-    tell(f"{', '.join(path.name for path in written)} -> {folder}")
+    tell(f"{', '.join(path.name for path in paths)} -> {folder}")
 
 
 def _evaluate_detector(options: argparse.Namespace) -> None:
@@ -134,11 +134,11 @@ def _evaluate_detector(options: argparse.Namespace) -> None:
             progress=progress,
             **settings,
         )
-    about = {"command": _command(options), **settings, "detector": options.detector, "network": network}
-    written = write_detector(results, sets, folder, about, pictures)
+    run_info = {"command": _command(options), **settings, "detector": options.detector, "network": network}
+    paths = write_detector(results, sets, folder, run_info, pictures)
     for result in results:
         print("\n".join(_detector_lines(result)))
-    tell(f"{', '.join(path.name for path in written)} -> {folder}{'' if pictures is None else f', {pictures}'}")
+    tell(f"{', '.join(path.name for path in paths)} -> {folder}{'' if pictures is None else f', {pictures}'}")
 
 
 def _detector_lines(result) -> Iterator[str]:
@@ -146,8 +146,8 @@ def _detector_lines(result) -> Iterator[str]:
     import pandas
 
     rows = pandas.DataFrame(result.rows)
-    named = [SimpleNamespace(**row) for row in result.rows]
-    rows["cell"] = [f"{_value(row)} {_ends(row)}".rstrip() for row in named]
+    records = [SimpleNamespace(**row) for row in result.rows]
+    rows["cell"] = [f"{_value(row)} {_ends(row)}".rstrip() for row in records]
     recall = rows[rows.figure == "recall"].set_index(["group", "of", "count", "at"]).cell.unstack(sort=False)
     recall.columns = [f"at {at} (score {score:.2f})" for at, score in result.thresholds.items()]
     yield f"{result.dataset}: {result.scans:,} scans; recall, %, at so many false people a scan:"
@@ -157,8 +157,8 @@ def _detector_lines(result) -> Iterator[str]:
     for row in rows[(rows.figure != "recall") & rows["at"].isin(["", "1", "default"])].itertuples():
         words = (row.figure.replace("_", " "), row.at and f"at {row.at}", row.group, row.of if row.of != "all" else "")
         yield f"  {' '.join(filter(None, words))}: {row.cell} {row.unit}"
-    for thing, count in result.things.items():
-        yield f"  false at 1 a scan: {count:,} {thing}"
+    for kind, count in result.things.items():
+        yield f"  false at 1 a scan: {count:,} {kind}"
 
 
 def _table(options: argparse.Namespace) -> None:
@@ -192,13 +192,13 @@ def _command(options: argparse.Namespace) -> str:
 
 def _progress(stack: ExitStack, unit: str = "people") -> Callable[[str, int, int], None]:
     """progress(dataset, done, total), which shows one dataset after the other; `stack` ends the last."""
-    shown: dict[str, Progress] = {}
+    bars: dict[str, Progress] = {}
 
     def progress(dataset: str, done: int, total: int) -> None:
-        if dataset not in shown:
+        if dataset not in bars:
             stack.close()
-            shown[dataset] = stack.enter_context(Progress(total or None, unit=unit, label=dataset))
-        shown[dataset].update(done)
+            bars[dataset] = stack.enter_context(Progress(total or None, unit=unit, label=dataset))
+        bars[dataset].update(done)
 
     return progress
 
@@ -216,15 +216,15 @@ def _lines(result) -> Iterator[str]:
     for note in result.notes:
         yield f"  note: {note}"
     if counts["without a pose"]:
-        but = " but PEM" if any(row.figure == "pem" for row in result.lines) else ""
-        yield f"  without a pose, and in no metric{but}: {counts['without a pose']:,} people"
+        exception = " but PEM" if any(row.figure == "pem" for row in result.lines) else ""
+        yield f"  without a pose, and in no metric{exception}: {counts['without a pose']:,} people"
     for reason, entry in result.skipped.items():
         yield f"  skipped {entry['count']:,}: {reason} (first: {entry['first']})"
     rows = [(_named(row, setting), row) for row in result.lines if _is_shown(row)]
-    wide = max(len(name) for name, _ in rows)
-    yield f"  {'':<{wide}}{'value':>8}  {'95 % interval':<16}{'people':>8}"
+    name_width = max(len(name) for name, _ in rows)
+    yield f"  {'':<{name_width}}{'value':>8}  {'95 % interval':<16}{'people':>8}"
     for name, row in rows:
-        yield f"  {name:<{wide}}{_value(row):>8}  {_ends(row):<16}{row.people:>8,}"
+        yield f"  {name:<{name_width}}{_value(row):>8}  {_ends(row):<16}{row.people:>8,}"
 
 
 def _is_shown(row) -> bool:

@@ -50,33 +50,35 @@ def add(commands, execute: Callable[[list[str]], int]) -> None:
 def _paper(commands, execute: Callable[[list[str]], int], options: argparse.Namespace) -> None:
     from lidarpose.paper import figures
     from lidarpose.paper.report import plan, run_table, write_table
-    from lidarpose.paper.steps import check_out
+    from lidarpose.paper.steps import begin_out, check_out
     from lidarpose.paper.tables import TABLES, Options, cells
 
     check_name("table or figure", options.name, _NAMES)
-    wanted = {name: getattr(options, name) for name in ("people", "hours", "seeds", "workers", "size")}
-    wanted |= {"subjects": options.subjects or "", "held_out": options.held_out or ""}
-    asked = Options(data=_data(options.data), motion=names(options.motion or ""), **wanted)
+    budget = {name: getattr(options, name) for name in ("people", "hours", "seeds", "workers", "size")}
+    budget |= {"subjects": options.subjects or "", "held_out": options.held_out or ""}
+    paper_options = Options(data=_data(options.data), motion=names(options.motion or ""), **budget)
     out = Path(options.out)
     check_out(out)
     if options.name == "fig6":
         if options.dry_run:
             print("# Figure 6: synthesized bodies\n\nDrawn at once; there is nothing to train.")
             return
-        motion = asked.motion[0] if asked.motion else None
+        begin_out(out)
+        motion = paper_options.motion[0] if paper_options.motion else None
         print(figures.draw_one_body(out, seed=0, motion=motion))
         return
-    table, chosen = TABLES[options.name], names(options.rows or "")
-    selected = cells(table, asked, chosen)
+    table, row_keys = TABLES[options.name], names(options.rows or "")
+    selected_cells = cells(table, paper_options, row_keys)
     if options.dry_run:
-        print(plan(table, selected, out, partial(_problem, commands)), end="")
+        print(plan(table, selected_cells, out, partial(_problem, commands)), end="")
         return
     if options.table_only:
-        write_table(table, selected, asked, out)
+        begin_out(out)
+        write_table(table, selected_cells, paper_options, out)
     else:
-        run_table(table, asked, out, chosen, execute, tell)
+        run_table(table, paper_options, out, row_keys, execute, tell)
     print(out / f"{table.name}.md")
-    for path in figures.draw(table.name, selected, out) if table.name.startswith("fig") else ():
+    for path in figures.draw(table.name, selected_cells, out) if table.name.startswith("fig") else ():
         print(path)
 
 

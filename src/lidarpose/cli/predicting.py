@@ -93,8 +93,8 @@ def _predict(options: argparse.Namespace) -> None:
     poses = predict(options.source[0], **prediction_options(options), progress=True)
     outputs: dict[Path, bytes] = {}
     if result is not None:
-        as_csv = result.suffix.lower() == ".csv"
-        outputs[result] = (poses.to_dataframe().to_csv(index=False) if as_csv else poses.to_json()).encode()
+        is_csv = result.suffix.lower() == ".csv"
+        outputs[result] = (poses.to_dataframe().to_csv(index=False) if is_csv else poses.to_json()).encode()
     if picture is not None:
         outputs[picture] = poses.picture(title=file.name)
     if page is not None:
@@ -104,12 +104,12 @@ def _predict(options: argparse.Namespace) -> None:
         print(poses.to_json(), end="")
     for line in _warnings(poses):
         tell(f"lidarpose: warning: {line}")
-    posed = sum(person.has_pose for person in poses)
-    where = f" -> {' and '.join(map(str, outputs))}" if outputs else ""
+    num_posed = sum(person.has_pose for person in poses)
+    destination = f" -> {' and '.join(map(str, outputs))}" if outputs else ""
     if not poses and poses.scan is not None:
-        tell(f"nobody found{where}; {_NOBODY}")
+        tell(f"nobody found{destination}; {_NOBODY}")
         return
-    tell(f"{posed} of {len(poses)} people, {poses.timing_ms['per_person']:.0f} ms each{where}")
+    tell(f"{num_posed} of {len(poses)} people, {poses.timing_ms['per_person']:.0f} ms each{destination}")
 
 
 def output_paths(
@@ -120,9 +120,9 @@ def output_paths(
     from lidarpose.io.files import check_apart, check_writable
 
     result = _result_path(options.out, name, "poses", *(f".{suffix}" for suffix in formats))
-    beside = result or Path(f"{name}.poses.json")
-    picture = beside.with_suffix(".png") if options.picture else None
-    page = beside.with_suffix(".html") if options.html else None
+    base_path = result or Path(f"{name}.poses.json")
+    picture = base_path.with_suffix(".png") if options.picture else None
+    page = base_path.with_suffix(".html") if options.html else None
     for path in filter(None, (result, picture, page)):
         inputs = (options.boxes, options.calib, options.weights, *(options.background or ()))
         check_apart(path, *options.source, *inputs)
@@ -136,8 +136,8 @@ def prediction_options(options: argparse.Namespace) -> dict[str, Any]:
     from lidarpose.inference.predictor import load
 
     choices = {name: getattr(options, name) for name in ("backend", "device", "decode", "tta")}
-    given = {name: getattr(options, name) for name in ("boxes", "calib", "crop", "find", "skeleton")}
-    return given | _reading(options) | {"model": partial(load, options.weights, **choices)}
+    scan_options = {name: getattr(options, name) for name in ("boxes", "calib", "crop", "find", "skeleton")}
+    return scan_options | _reading(options) | {"model": partial(load, options.weights, **choices)}
 
 
 def _detect(options: argparse.Namespace) -> None:
@@ -191,11 +191,11 @@ def _warnings(poses) -> list[str]:
     """The input's warnings, and each of the people's once with the ids of those it is about."""
     from lidarpose.io.files import shorten
 
-    shared: dict[str, list[str]] = {}
+    ids_by_warning: dict[str, list[str]] = {}
     for person in poses:
         for warning in person.warnings:
-            shared.setdefault(warning, []).append(shorten(str(person.id), _LONGEST_ID))
+            ids_by_warning.setdefault(warning, []).append(shorten(str(person.id), _LONGEST_ID))
     lines = list(poses.warnings)
-    for warning, ids in shared.items():
+    for warning, ids in ids_by_warning.items():
         lines.append(f"{'person' if len(ids) == 1 else 'people'} {first_names(ids)}: {warning}")
     return lines

@@ -66,7 +66,7 @@ def _name_of(paths: Sequence[str]) -> str:
 
 
 def _predict_recording(
-    options: argparse.Namespace, result: Path | None, picture: Path | None, asked: dict[str, Any]
+    options: argparse.Namespace, result: Path | None, picture: Path | None, posing_options: dict[str, Any]
 ) -> None:
     """Poses all frames, and says what came of it. asked: as of `FramePredictor`."""
     from lidarpose.io.files import write_atomic
@@ -81,22 +81,22 @@ def _predict_recording(
         raise InputError(f"expected one folder, or files, got {len(options.source)}: run the command for each folder")
     frames = {name: getattr(options, name) for name in ("columns", "topic", "meta", "rate", "start", "end")}
     source = open_source(options.source, every=1 if options.every is None else options.every, **frames)
-    steps = FramePredictor(name=source.name, track=options.track, live=options.live, **asked)
+    steps = FramePredictor(name=source.name, track=options.track, live=options.live, **posing_options)
     if result is None:
         _print_lines(options, source, steps)
         return
-    ways = None if picture is None else WaysPicture(steps.up)
+    tracks_picture = None if picture is None else WaysPicture(steps.up)
     summary = write_recording(
         source,
         steps,
         result,
         command=_command(options),
         world=options.world,
-        on_line=None if ways is None else ways.add,
+        on_line=None if tracks_picture is None else tracks_picture.add,
         tell=lambda text: tell(f"lidarpose: {text}"),
     )
-    if ways is not None and picture is not None:
-        write_atomic(picture, ways.draw(source, steps.wanted, title=Path(source.name).name))
+    if tracks_picture is not None and picture is not None:
+        write_atomic(picture, tracks_picture.draw(source, steps.wanted, title=Path(source.name).name))
     _report(source, steps, summary, f" -> {' and '.join(str(path) for path in (result, picture) if path)}")
 
 
@@ -117,16 +117,16 @@ def _print_lines(options: argparse.Namespace, source, steps) -> None:
 
 
 def _report(source, steps, summary, outputs: str = "") -> None:
-    about = [f"{source.name}: {line}" for line in source.warnings]
-    for line in [*about, *summary.warning_lines(_MOST_WARNINGS)]:
+    source_warnings = [f"{source.name}: {line}" for line in source.warnings]
+    for line in [*source_warnings, *summary.warning_lines(_MOST_WARNINGS)]:
         tell(f"lidarpose: warning: {line}")
     tell(summary.text(steps.is_tracked) + outputs)
 
 
 def _command(options: argparse.Namespace) -> dict[str, Any]:
     """All that the poses of frames depend on."""
-    ignored = ("run", "command", "quiet", "out", "format", "picture", "world", "source")
-    command = {name: value for name, value in vars(options).items() if name not in ignored}
+    ignored_names = ("run", "command", "quiet", "out", "format", "picture", "world", "source")
+    command = {name: value for name, value in vars(options).items() if name not in ignored_names}
     weights = os.stat(options.weights).st_mtime_ns if os.path.isfile(options.weights) else None
     sources = [os.path.abspath(path) for path in options.source]
     return command | {"source": sources, "weights changed": weights, "version": __version__}

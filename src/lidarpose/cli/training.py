@@ -60,26 +60,27 @@ def add(commands) -> None:
 
 def _add(parser, kind: type[Recipe]) -> None:
     parser.set_defaults(kind=kind)
-    run = "--out:folder RUN" if kind is Finetune else "<folder> RUN?"
-    known = "default, paper, paper-one-stage; prn, lpformer, lidarcap, ne, as with --model; other options override it"
+    folder_option = "--out:folder RUN" if kind is Finetune else "<folder> RUN?"
+    recipe_help = "default, paper (as with --model dapt), paper-one-stage; prn, lpformer, lidarcap, ne, as with --model"
+    recipe_help += "; other options override it"
     options = f"""
-{run}  a new folder for the run (default runs/{kind.kind}-001, -002, ...); with --resume that of the run
+{folder_option}  a new folder for the run (default runs/{kind.kind}-001, -002, ...); with --resume that of the run
 --resume  continue an interrupted run (default: the latest)
---recipe NAME  {"default" if kind is TrainDetector else known}
+--recipe NAME  {"default" if kind is TrainDetector else recipe_help}
 --device NAME  cpu (default: a GPU if there is one)
 --tracker NAME  also log to tensorboard or wandb, if installed
 """
     add_options(parser, options)
     # first the settings of this kind of training, then those that all have
-    own = parser.add_argument_group(f"settings of {kind.kind}")
-    common = parser.add_argument_group("settings of optimizer and run")
+    kind_group = parser.add_argument_group(f"settings of {kind.kind}")
+    common_group = parser.add_argument_group("settings of optimizer and run")
     if kind is Pretrain:
-        add_options(own, KEEP)
-    shared = {field.name for base in (Recipe, PoseRecipe) for field in fields(base)}
+        add_options(kind_group, KEEP)
+    common_names = {field.name for base in (Recipe, PoseRecipe) for field in fields(base)}
     for field in fields(kind):
         if field.name != "data":
             default = "" if field.default in (None, (), "") else f" ({_as_typed(field.default)})"
-            (common if field.name in shared else own).add_argument(
+            (common_group if field.name in common_names else kind_group).add_argument(
                 f"--{field.name.replace('_', '-')}",
                 dest=f"set_{field.name}",
                 metavar=field.metadata.get("metavar") or TYPES[field.type][2],
@@ -103,10 +104,10 @@ def _train(options: argparse.Namespace) -> None:
     if getattr(options, "calibrate", None) is not None:
         from lidarpose.train.detector.calibrate import calibrate
 
-        others = [*changes, *(key for key in ("resume", "recipe", "device", "tracker") if getattr(options, key))]
-        if others:
-            other = f"--{others[0].replace('_', '-')}"
-            raise InputError(f"--calibrate trains nothing: expected only --scans beside it, got {other}: leave it out")
+        other_options = [*changes, *(key for key in ("resume", "recipe", "device", "tracker") if getattr(options, key))]
+        if other_options:
+            flag = f"--{other_options[0].replace('_', '-')}"
+            raise InputError(f"--calibrate trains nothing: expected only --scans beside it, got {flag}: leave it out")
         print(calibrate(options.folder or latest(name), options.calibrate, labeled=options.scans))
         return
     if getattr(options, "scans", None) is not None:
@@ -123,18 +124,18 @@ def _train(options: argparse.Namespace) -> None:
             raise InputError("a run keeps its recipe: leave --recipe away with --resume")
         folder = folder or latest(name)
         # a run keeps its recipe: what is not said again stays
-        wanted = kind(**(read_config(Path(folder), kind)[0].to_dict() | changes))
+        run_recipe = kind(**(read_config(Path(folder), kind)[0].to_dict() | changes))
     else:
-        # a baseline is trained as published
-        model = changes.get("model")
-        wanted = recipe(kind, options.recipe or (model if model in RECIPES[kind] else "default"), **changes)
+        # as published, unless a recipe is named
+        model = {"dapt": "paper"}.get(changes.get("model", ""), changes.get("model"))
+        run_recipe = recipe(kind, options.recipe or (model if model in RECIPES[kind] else "default"), **changes)
     words = [f"--{key.replace('_', '-')} {_as_typed(value)}" for key, value in changes.items() if key != "data"]
     words += [f"--recipe {options.recipe}"] * (options.recipe not in (None, "default"))
     words += ["--resume"] * options.resume
-    sets = [shlex.quote(Path(data).name) for data in changes.get("data", ())]
-    command = " ".join(["lidarpose", name, *sets, *words])
+    dataset_names = [shlex.quote(Path(data).name) for data in changes.get("data", ())]
+    command = " ".join(["lidarpose", name, *dataset_names, *words])
     environment = {"device": options.device, "tracker": options.tracker}
-    path = train(wanted, folder, resume=options.resume, command=command, draw=draw_examples, **environment)
+    path = train(run_recipe, folder, resume=options.resume, command=command, draw=draw_examples, **environment)
     if os.environ.get("RANK", "0") == "0":
         print(path)
 

@@ -115,11 +115,14 @@ def _lines(facts: dict[str, Any], *, verbose: bool) -> Iterator[str]:
             )
             if "note" in run:
                 yield f"           {run['note']}"
-        measured = entry["scores"].get("measured on")
+        measured_on = entry["scores"].get("measured on")
         for label, score in scores if verbose else scores[:1]:
-            yield f"  score    {label}: {score}" + (f" ({measured})" if measured and not verbose else "")
-    least, *scans = (facts["detector"].get(name, 0) for name in _CALIBRATION)
-    yield f"detector   default --min-score {least:.2f}, calibrated on {scans[0]} synthesized and {scans[1]} real scans"
+            yield f"  score    {label}: {score}" + (f" ({measured_on})" if measured_on and not verbose else "")
+    default_score, *counts = (facts["detector"].get(name, 0) for name in _CALIBRATION)
+    yield (
+        f"detector   default --min-score {default_score:.2f}, calibrated on {counts[0]} synthesized and {counts[1]} "
+        "real scans"
+    )
     if not verbose:
         yield "more       lidarpose info --verbose: training and all scores; --json: the same for programs"
 

@@ -32,10 +32,14 @@ def consecutive(tracks: Sequence[Hashable], frames: Sequence[int]) -> list[np.nd
     for row, track in enumerate(tracks):
         rows[track].append(row)
     runs = []
-    for own in rows.values():
-        ordered = np.array(sorted(own, key=lambda row: frames[row]))
-        steps = np.diff([frames[row] for row in ordered])
-        runs += np.split(ordered, np.flatnonzero(steps > _GAP * np.median(steps)) + 1) if len(steps) else [ordered]
+    for track_rows in rows.values():
+        ordered_rows = np.array(sorted(track_rows, key=lambda row: frames[row]))
+        steps = np.diff([frames[row] for row in ordered_rows])
+        runs += (
+            np.split(ordered_rows, np.flatnonzero(steps > _GAP * np.median(steps)) + 1)
+            if len(steps)
+            else [ordered_rows]
+        )
     return runs
 
 
@@ -48,20 +52,22 @@ def window_points(points: np.ndarray, person: np.ndarray) -> np.ndarray:
     if not len(points) or not len(person):
         return np.zeros((0, 3), np.float32)
     x, y, _ = person.mean(0)
-    middle = np.arctan2(y, x)
-    inside = np.ones(len(points), bool)
-    for own, other in zip(_angles(person, middle), _angles(points, middle), strict=True):
-        inside &= (other >= own.min() - MARGIN) & (other <= own.max() + MARGIN)
-    chosen = np.flatnonzero(inside)
-    if len(chosen) > MOST:
-        chosen = chosen[np.arange(MOST) * len(chosen) // MOST]
-    return points[chosen].astype(np.float32)
+    center_azimuth = np.arctan2(y, x)
+    is_inside = np.ones(len(points), bool)
+    for person_angles, point_angles in zip(
+        _angles(person, center_azimuth), _angles(points, center_azimuth), strict=True
+    ):
+        is_inside &= (point_angles >= person_angles.min() - MARGIN) & (point_angles <= person_angles.max() + MARGIN)
+    indices = np.flatnonzero(is_inside)
+    if len(indices) > MOST:
+        indices = indices[np.arange(MOST) * len(indices) // MOST]
+    return points[indices].astype(np.float32)
 
 
-def _angles(points: np.ndarray, middle: float) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuth from the direction `middle`, and elevation of points, (n,) rad."""
+def _angles(points: np.ndarray, center_azimuth: float) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuth from the direction `center_azimuth`, and elevation of points, (n,) rad."""
     _, azimuth, elevation = to_spherical(points)
-    return (azimuth - middle + np.pi) % (2 * np.pi) - np.pi, elevation
+    return (azimuth - center_azimuth + np.pi) % (2 * np.pi) - np.pi, elevation
 
 
 def without_person(points: np.ndarray, person: np.ndarray) -> np.ndarray:
@@ -74,13 +80,13 @@ def static_points(scans: Iterable[np.ndarray]) -> np.ndarray:
     of every cell of 10 cm that is occupied in three scans or more."""
     cells, points = [], []
     for scan in scans:
-        own, first = np.unique(_cells(scan, _CELL), return_index=True)
-        cells.append(own)
-        points.append(scan[first])
+        scan_cells, first_rows = np.unique(_cells(scan, _CELL), return_index=True)
+        cells.append(scan_cells)
+        points.append(scan[first_rows])
     if not cells:
         return np.zeros((0, 3))
-    _, first, count = np.unique(np.concatenate(cells), return_index=True, return_counts=True)
-    return np.concatenate(points)[first[count >= _LEAST]]
+    _, first_rows, count = np.unique(np.concatenate(cells), return_index=True, return_counts=True)
+    return np.concatenate(points)[first_rows[count >= _LEAST]]
 
 
 def _cells(points: np.ndarray, edge: float) -> np.ndarray:

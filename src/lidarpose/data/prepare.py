@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.data.dataset_card import CARD, DatasetCard, write_card
-from lidarpose.data.readers.base import Reader, Skipped
+from lidarpose.data.readers.base import BAD_REST, Reader, Skipped
 from lidarpose.data.rows import labeled_row
 from lidarpose.data.shards import DatasetReader, open_dataset, read_rows, shard_path, shard_writer
 from lidarpose.data.splits import SplitRule, split_rule
@@ -42,8 +42,6 @@ READERS: dict[str, tuple[str, str, bool]] = {
 _LEVELED = ("lidarhuman26m",)
 # tables of such a dataset; the people's last, since a part is whole once they are there
 _TABLES = ("skipped", "labelled")
-# why the people of a part, or those after a fault in it, are left out
-_REST = "the rest of a part cannot be read"
 # how many people are counted at once for the progress bar
 _PROGRESS_STEP = 200
 # what the summary reads of the shards
@@ -103,24 +101,24 @@ def prepare(
         raise file_error(root, f"is no folder; expected the raw files of {name}")
     parts = list(source.parts(root))
     rule = split_rule(name, root, split_by, parts)
-    absent = rule.absent(parts) if rule is not None else {}
+    absent_names = rule.absent(parts) if rule is not None else {}
     # of a split that is asked for alone, nobody misses the others
-    absent = {of: names for of, names in absent.items() if split in (None, of)}
+    absent_names = {split_name: names for split_name, names in absent_names.items() if split in (None, split_name)}
     parts = _parts_of(name, parts, rule, split)
     card = _card(source, parts, rule, split)
-    missing = open_folder(out, card)
+    missing_shards = open_folder(out, card)
     make = PartWriter(reader=source, root=root, out=out, parts=tuple(parts), rule=rule, only=split)
-    finished = len(parts) - len(missing)
+    num_finished = len(parts) - len(missing_shards)
     with lock_dataset(out):
         # the summary of a run that is not over would be wrong
-        if missing or not (out / CARD).is_file():
+        if missing_shards or not (out / CARD).is_file():
             write_card(out, card)
-        with Progress(len(parts), unit="parts", done=finished, shown=progress) as bar:
+        with Progress(len(parts), unit="parts", done=num_finished, shown=progress) as bar:
             people = 0
-            for shards, more in make_shards(make, missing, workers=workers):
-                people, finished = people + more, finished + shards
-                bar.update(finished, f"{people:,} people")
-        summary = _summarize(open_dataset(out), parts=parts, absent=absent, rule=rule)
+            for shards, new_people in make_shards(make, missing_shards, workers=workers):
+                people, num_finished = people + new_people, num_finished + shards
+                bar.update(num_finished, f"{people:,} people")
+        summary = _summarize(open_dataset(out), parts=parts, absent_names=absent_names, rule=rule)
         write_card(out, replace(card, summary=summary))
     return summary
 
@@ -132,10 +130,10 @@ def _parts_of(name: str, parts: list[str], rule: SplitRule | None, split: str | 
     if rule is None:
         raise InputError(f"{name} has no split to choose {split!r} from: put train.txt and test.txt into its folder")
     check_name(f"split of {name} by {rule.name}", split, rule.sets)
-    chosen = [part for part in parts if not rule.by_part or rule.of_part(part) == split]
-    if not chosen:
+    split_parts = [part for part in parts if not rule.by_part or rule.of_part(part) == split]
+    if not split_parts:
         raise InputError(f"none of the {len(parts)} parts of {name} is in {split!r} by {rule.name}: {rule.source}")
-    return chosen
+    return split_parts
 
 
 def _card(source: Reader, parts: list[str], rule: SplitRule | None, split: str | None) -> DatasetCard:
@@ -176,8 +174,8 @@ class PartWriter:
 
     def __call__(self, number: int) -> Counts:
         people = 0
-        skipped, labeled = (shard_writer(shard_path(self.out, table, number), table) for table in _TABLES)
-        with labeled as add_person, skipped as add_skipped:
+        skipped_writer, people_writer = (shard_writer(shard_path(self.out, table, number), table) for table in _TABLES)
+        with people_writer as add_person, skipped_writer as add_skipped:
             for record in self._with_split(self.parts[number]):
                 if isinstance(record, Skipped):
                     add_skipped({"index": number, "reason": record.reason, "where": record.where})
@@ -203,31 +201,31 @@ class PartWriter:
         try:
             yield from self.reader.read(self.root, part)
         except InputError as error:
-            yield Skipped(_REST, f"{part}: {error}")
+            yield Skipped(BAD_REST, f"{part}: {error}")
         except (OSError, ArithmeticError, LookupError, TypeError, ValueError, AttributeError) as error:
             # what no reader foresaw must not cost the other parts; its kind tells a mistake in a reader from a bad file
             kind = type(error).__name__
-            yield Skipped(f"{_REST} ({kind})", one_line(f"{part}: {kind}: {error}"))
+            yield Skipped(f"{BAD_REST} ({kind})", one_line(f"{part}: {kind}: {error}"))
 
 
 # ---- the summary: from the shards alone, so that it is the same however often a run was stopped
 
 
 def _summarize(
-    dataset: DatasetReader, *, parts: list[str], absent: dict[str, list[str]], rule: SplitRule | None
+    dataset: DatasetReader, *, parts: list[str], absent_names: dict[str, list[str]], rule: SplitRule | None
 ) -> dict[str, Any]:
-    """The summary of `prepare`: counts, and warnings of what looks wrong. absent: split -> sequences not there."""
+    """The summary of `prepare`: counts, and warnings of what looks wrong. absent_names: split -> missing sequences."""
     labels, splits, sources, reasons = Counter[int](), Counter[str](), Counter[str](), Counter[str]()
     examples: dict[str, str] = {}
     frames: set[tuple[str, int]] = set()
-    trunks, offsets, table = [], [], []
+    trunks, offsets, part_rows = [], [], []
     names = skeleton(dataset.card.skeleton).joints
-    ends = [[names.index(f"{side}_{joint}") for side in ("left", "right")] for joint in ("hip", "shoulder")]
+    joint_pairs = [[names.index(f"{side}_{joint}") for side in ("left", "right")] for joint in ("hip", "shoulder")]
     for shard, part in enumerate(parts):
-        people, skipped = 0, list(read_rows(dataset.path(shard, "skipped"), "skipped"))
+        people, skipped_rows = 0, list(read_rows(dataset.path(shard, "skipped"), "skipped"))
         for row in read_rows(dataset.path(shard), "labelled", _SUMMARIZED):
-            missing = any(row[name] is None for name in _SUMMARIZED if name != "split")
-            if missing or len(row["joints"]) != 3 * len(names):
+            is_incomplete = any(row[name] is None for name in _SUMMARIZED if name != "split")
+            if is_incomplete or len(row["joints"]) != 3 * len(names):
                 problem = "has a row that is no sample; delete it and run the same command again"
                 raise file_error(dataset.path(shard), problem)
             people += 1
@@ -239,13 +237,13 @@ def _summarize(
             is_labeled = ~np.isnan(joints[:, 0])
             if is_labeled.any():
                 offsets.append(float(np.linalg.norm(joints[is_labeled].mean(0) - row["center"])))
-            hips, shoulders = (joints[pair].mean(0) for pair in ends)
+            hips, shoulders = (joints[pair].mean(0) for pair in joint_pairs)
             if not np.isnan(shoulders - hips).any():
                 trunks.append((shoulders - hips) / max(float(np.linalg.norm(shoulders - hips)), 1e-6))
-        for row in skipped:
+        for row in skipped_rows:
             reasons[row["reason"]] += 1
             examples.setdefault(row["reason"], row["where"])
-        table.append({"part": part, "people": people, "skipped": len(skipped)})
+        part_rows.append({"part": part, "people": people, "skipped": len(skipped_rows)})
     summary = {
         "people": sum(splits.values()),
         "frames": len(frames),
@@ -256,12 +254,12 @@ def _summarize(
         "skipped_first": examples,
         "trunk": [round(float(v), 3) for v in np.mean(trunks, 0)] if trunks else None,
         "joints_from_center_m": round(float(np.median(offsets)), 3) if offsets else None,
-        "parts": table,
+        "parts": part_rows,
     }
-    return summary | {"warnings": _warnings(summary, absent, rule)}
+    return summary | {"warnings": _warnings(summary, absent_names, rule)}
 
 
-def _warnings(summary: dict[str, Any], absent: dict[str, list[str]], rule: SplitRule | None) -> list[str]:
+def _warnings(summary: dict[str, Any], absent_names: dict[str, list[str]], rule: SplitRule | None) -> list[str]:
     lines, trunk, offset = [], summary["trunk"], summary["joints_from_center_m"]
     if not summary["people"]:
         lines.append("there is nobody in it; see what was skipped")
@@ -270,11 +268,13 @@ def _warnings(summary: dict[str, Any], absent: dict[str, list[str]], rule: Split
     if offset is not None and offset > _FAR:
         problem = f"joints are {offset:.2f} m from the points in the median"
         lines.append(f"{problem}: labels and clouds of different releases?")
-    empty = [part["part"] for part in summary["parts"] if not part["people"]]
-    if empty and summary["people"]:
-        lines.append(f"nobody in {first_names(empty, 5)}")
+    empty_parts = [part["part"] for part in summary["parts"] if not part["people"]]
+    if empty_parts and summary["people"]:
+        lines.append(f"nobody in {first_names(empty_parts, 5)}")
     if rule is not None:
-        lines += [f"of {split} by {rule.name} {first_names(names, 5)} are not there" for split, names in absent.items()]
+        lines += [
+            f"of {split} by {rule.name} {first_names(names, 5)} are not there" for split, names in absent_names.items()
+        ]
         if rule.leaks:
             lines.append(f"the split {rule.name} leaks: {rule.leaks}")
     return lines

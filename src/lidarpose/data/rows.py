@@ -56,11 +56,11 @@ class Column(NamedTuple):
 
 
 def _columns(text: str) -> dict[str, Column]:
-    words = (re.fullmatch(r"(\w+):((\w+)(?:\[(.+)\])?(\?)?)", word) for word in text.split())
+    matches = (re.fullmatch(r"(\w+):((\w+)(?:\[(.+)\])?(\?)?)", word) for word in text.split())
     return {
-        word[1]: Column(word[2], word[3], tuple(word[4].split(",")) if word[4] else None, bool(word[5]))
-        for word in words
-        if word
+        match[1]: Column(match[2], match[3], tuple(match[4].split(",")) if match[4] else None, bool(match[5]))
+        for match in matches
+        if match
     }
 
 
@@ -100,9 +100,9 @@ def person_row(
 def labeled_row(sample: LabeledSample, *, index: int) -> dict[str, Any]:
     """A row of the table of real people. index: number of the part that the person is from. Raises InputError for a
     center without a column."""
-    unknown = sorted(sample.centers.keys() - set(CENTERS))
-    if unknown:
-        raise InputError(f"centers have the names {', '.join(CENTERS)}, got {', '.join(unknown)}")
+    unknown_names = sorted(sample.centers.keys() - set(CENTERS))
+    if unknown_names:
+        raise InputError(f"centers have the names {', '.join(CENTERS)}, got {', '.join(unknown_names)}")
     centers = {f"center_{name}": center for name, center in sample.centers.items()}
     distance = sample.distance if sample.sensor_known else None
     return _sample_columns(sample, "labelled") | centers | {"index": index, "distance": distance}
@@ -121,15 +121,15 @@ def sample_of(row: dict[str, Any], skeleton_name: str = BODY26.name, what: str =
     The id of the box is the track, of real people and in streets. All joints of synthetic people count as seen.
     Raises InputError that names the column for a row that is none.
     """
-    joints = skeleton(skeleton_name)
+    dataset_skeleton = skeleton(skeleton_name)
     is_real = "joint_labels" in row
-    _check_row(row, "labelled" if is_real else "people", len(joints))
+    _check_row(row, "labelled" if is_real else "people", len(dataset_skeleton))
     values = {name: row[name] for name in row.keys() & _FIELDS} | {"track": str(row["track"])}
     if is_real:
         values["centers"] = {name: row[f"center_{name}"] for name in CENTERS if row[f"center_{name}"] is not None}
         values["sensor_known"] = row["distance"] is not None
     else:
-        values["joint_labels"] = np.full(len(joints), SEEN, np.uint8)
+        values["joint_labels"] = np.full(len(dataset_skeleton), SEEN, np.uint8)
         values["sequence"] = str(row["index"])
         values["time"] = np.nan if what == "people" else row["frame"] / _CLIP_HZ
         values["info"] = PersonInfo(**{name: row[name] for name in _INFO if row[name] is not None})
@@ -138,7 +138,9 @@ def sample_of(row: dict[str, Any], skeleton_name: str = BODY26.name, what: str =
         values["box"] = Box(center=row["box_center"], size=row["box_size"], yaw=row["box_yaw"], id=track)
     for name in ("points", "rotations", "background", "neighbors"):
         values[name] = None if row[name] is None else row[name].reshape(-1, 3)
-    return LabeledSample(**values, pose=Pose(joints=row["joints"].reshape(-1, 3), skeleton=joints, frame="sensor"))
+    return LabeledSample(
+        **values, pose=Pose(joints=row["joints"].reshape(-1, 3), skeleton=dataset_skeleton, frame="sensor")
+    )
 
 
 def _check_row(row: dict[str, Any], table: str, joints: int) -> None:
@@ -149,12 +151,12 @@ def _check_row(row: dict[str, Any], table: str, joints: int) -> None:
     if len({row[name] is None for name in ("box_center", "box_size", "box_yaw")}) > 1:
         raise InputError("columns box_center, box_size, box_yaw: some are null, expected all or none")
     check_lengths(row, table, joints)
-    clip = [name for name in _CLIP_COLUMNS if row[name] is not None]
-    for name in ("points", "center", *clip):
+    clip_columns = [name for name in _CLIP_COLUMNS if row[name] is not None]
+    for name in ("points", "center", *clip_columns):
         if not np.isfinite(row[name]).all():
             raise InputError(f"column {name} has values that are no finite numbers")
     # a joint may be NaN
-    for name in ("points", "center", "joints", *clip):
+    for name in ("points", "center", "joints", *clip_columns):
         if (np.abs(row[name]) > FARTHEST).any():
             raise InputError(f"column {name} has values beyond {FARTHEST:g} m")
     if row["part"] is not None and row["part"].max(initial=0) > len(SMPL24):
@@ -168,9 +170,9 @@ def check_lengths(row: dict[str, Any], table: str, joints: int = 0) -> None:
     for name, column in TABLES[table].items():
         if column.shape is None or row[name] is None:
             continue
-        first, *rest = column.shape
-        each = math.prod(map(int, rest))
-        count = int(first) if first.isdecimal() else sizes.setdefault(first, len(row[name]) // each)
-        if len(row[name]) != count * each:
-            expected = f"{count * each}: {column.text} with {first} = {count}"
+        dimension, *item_shape = column.shape
+        item_size = math.prod(map(int, item_shape))
+        count = int(dimension) if dimension.isdecimal() else sizes.setdefault(dimension, len(row[name]) // item_size)
+        if len(row[name]) != count * item_size:
+            expected = f"{count * item_size}: {column.text} with {dimension} = {count}"
             raise InputError(f"column {name} has {len(row[name])} values, expected {expected}")

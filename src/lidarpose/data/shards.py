@@ -93,15 +93,15 @@ def shard_writer(path: str | Path, table: str) -> Iterator[Callable[[dict[str, A
     written, MissingExtra without pyarrow.
     """
     pa, parquet = pyarrow()
-    waiting: list[dict[str, Any]] = []
+    buffer: list[dict[str, Any]] = []
 
     def flush() -> None:
-        writer.write_table(to_arrow(pa, table, waiting), row_group_size=_ROW_GROUP[table])
-        waiting.clear()
+        writer.write_table(to_arrow(pa, table, buffer), row_group_size=_ROW_GROUP[table])
+        buffer.clear()
 
     def add(row: dict[str, Any]) -> None:
-        waiting.append(row)
-        if len(waiting) == _ROW_GROUP[table]:
+        buffer.append(row)
+        if len(buffer) == _ROW_GROUP[table]:
             flush()
 
     # a flipped bit in points would pass unnoticed
@@ -109,7 +109,7 @@ def shard_writer(path: str | Path, table: str) -> Iterator[Callable[[dict[str, A
     schema = to_arrow(pa, table, []).schema
     with atomic_path(path) as temporary, parquet.ParquetWriter(temporary, schema, **options) as writer:
         yield add
-        if waiting:
+        if buffer:
             flush()
 
 
@@ -143,11 +143,11 @@ def read_rows(path: str | Path, table: str, columns: tuple[str, ...] | None = No
     pa, _ = pyarrow()
     with open_parquet(path, "delete it and make it again", page_checksum_verification=True) as file:
         names = file.schema_arrow.names
-        missing = [name for name, column in TABLES[table].items() if name not in names and not column.optional]
-        if missing:
-            raise InputError(f"is no shard of {table}: the columns {', '.join(missing)} are missing")
-        wanted = [name for name in TABLES[table] if name in names and (columns is None or name in columns)]
-        for batch in file.iter_batches(batch_size=_ROW_GROUP[table], columns=wanted):
+        missing_columns = [name for name, column in TABLES[table].items() if name not in names and not column.optional]
+        if missing_columns:
+            raise InputError(f"is no shard of {table}: the columns {', '.join(missing_columns)} are missing")
+        column_names = [name for name in TABLES[table] if name in names and (columns is None or name in columns)]
+        for batch in file.iter_batches(batch_size=_ROW_GROUP[table], columns=column_names):
             yield from _rows_of(pa, batch, table)
 
 
@@ -216,8 +216,8 @@ class DatasetReader:
             return sample_of(row, self.card.skeleton, self.card.settings.get("what", "people"))
         except (ValueError, TypeError, AttributeError, KeyError) as error:
             number = row.get("index")
-            place = self.folder if number is None else self.path(number // self.card.per_shard)
-            raise file_error(place, f"row of index {number} is no sample: {error}; write it again") from None
+            path = self.folder if number is None else self.path(number // self.card.per_shard)
+            raise file_error(path, f"row of index {number} is no sample: {error}; write it again") from None
 
 
 def open_dataset(folder: str | Path) -> DatasetReader:

@@ -60,16 +60,18 @@ class SplitRule:
     def of_chunks(self, part: str, people: int) -> list[str]:
         """The split of each of a part's people, in their order."""
         chunks = -(-people // self.length)
-        drawn_by = zlib.crc32(part.encode("utf-8", "backslashreplace"))
-        order = np.random.default_rng([self.seed, drawn_by]).permutation(chunks)
-        train = set(order[: int(self.share * chunks)].tolist())
-        return ["train" if k // self.length in train else "test" for k in range(people)]
+        part_seed = zlib.crc32(part.encode("utf-8", "backslashreplace"))
+        order = np.random.default_rng([self.seed, part_seed]).permutation(chunks)
+        train_chunks = set(order[: int(self.share * chunks)].tolist())
+        return ["train" if k // self.length in train_chunks else "test" for k in range(people)]
 
     def absent(self, parts: list[str]) -> dict[str, list[str]]:
         """Split -> names in the list that no part has."""
-        present = set(map(self._name, parts))
-        missing = {split: [name for name in names if name not in present] for split, names in self.sets.items()}
-        return {split: names for split, names in missing.items() if names}
+        present_names = set(map(self._name, parts))
+        missing_names = {
+            split: [name for name in names if name not in present_names] for split, names in self.sets.items()
+        }
+        return {split: names for split, names in missing_names.items() if names}
 
 
 def split_rule(dataset: str, root: Path, name: str | None = None, parts: Sequence[str] = ()) -> SplitRule | None:
@@ -80,27 +82,29 @@ def split_rule(dataset: str, root: Path, name: str | None = None, parts: Sequenc
     the name. Raises InputError for an unknown name, half of the lists, one that is empty or no text, lists of which no
     name is a part's, and a part in two of them.
     """
-    published = {rule.name: rule for rule in _published(dataset)}
+    rules = {rule.name: rule for rule in _published(dataset)}
     if name is not None:
-        if not published:
-            own = "put train.txt and test.txt into its folder"
-            raise InputError(f"{dataset} has no published splits, got {name!r}: {own}")
-        check_name(f"split of {dataset}", name, published)
-        return published[name]
-    return _own(root, parts) or next((rule for rule in published.values() if rule.usual), None)
+        if not rules:
+            remedy = "put train.txt and test.txt into its folder"
+            raise InputError(f"{dataset} has no published splits, got {name!r}: {remedy}")
+        check_name(f"split of {dataset}", name, rules)
+        return rules[name]
+    return _own(root, parts) or next((rule for rule in rules.values() if rule.usual), None)
 
 
 def _own(root: Path, parts: Sequence[str]) -> SplitRule | None:
     paths = {split: root / file for split, file in _LISTS.items() if (root / file).is_file()}
     if not paths:
         return None
-    missing = [_LISTS[split] for split in _NEEDED if split not in paths]
-    if missing:
-        present = next(iter(paths.values())).name
-        raise file_error(root, f"has {present} and no {missing[0]}: add it, or take the other away")
+    missing_files = [_LISTS[split] for split in _NEEDED if split not in paths]
+    if missing_files:
+        present_file = next(iter(paths.values())).name
+        raise file_error(root, f"has {present_file} and no {missing_files[0]}: add it, or take the other away")
     # a name without its first folder, where only one part has it
-    short = Counter(part.partition("/")[2] for part in parts)
-    full = {name: part for part in parts if short[name := part.partition("/")[2]] == 1} | {part: part for part in parts}
+    short_name_counts = Counter(part.partition("/")[2] for part in parts)
+    full_names = {name: part for part in parts if short_name_counts[name := part.partition("/")[2]] == 1} | {
+        part: part for part in parts
+    }
     sets: dict[str, tuple[str, ...]] = {}
     split_of: dict[str, str] = {}
     for split, path in paths.items():
@@ -112,14 +116,14 @@ def _own(root: Path, parts: Sequence[str]) -> SplitRule | None:
         names = [line.strip() for line in lines if line.strip()]
         if not names:
             raise file_error(path, "names no sequence; expected one a line")
-        sets[split] = tuple(full.get(name, name) for name in names)
+        sets[split] = tuple(full_names.get(name, name) for name in names)
         for name in sorted(sets[split]):
             if split_of.setdefault(name, split) != split:
                 raise file_error(path, f"names {name}, which is in {_LISTS[split_of[name]]} too: leave it out of one")
     source = ", ".join(path.name for path in paths.values())
-    if parts and not full.keys() & split_of.keys():
-        got = sets[next(iter(sets))][0]
-        raise file_error(root, f"has nothing that {source} name: expected names such as {parts[0]!r}, got {got!r}")
+    if parts and not full_names.keys() & split_of.keys():
+        example = sets[next(iter(sets))][0]
+        raise file_error(root, f"has nothing that {source} name: expected names such as {parts[0]!r}, got {example!r}")
     return SplitRule(name="own", source=f"{source} beside the data", rule="sequences", sets=sets)
 
 

@@ -56,13 +56,20 @@ def open_folder(folder: Path, card: DatasetCard, rows: Mapping[str, int] | None 
 
 def check_settings(folder: str | Path, present: DatasetCard, wanted: DatasetCard) -> None:
     """Raises InputError that names the settings in which a dataset differs from what is wanted."""
-    old, new = (
+    old_settings, new_settings = (
         {"count": c.count, "per_shard": c.per_shard, "version": c.version, **c.settings} for c in (present, wanted)
     )
-    pairs = {name: (json.dumps(old.get(name)), json.dumps(new.get(name))) for name in sorted(old | new)}
-    differ = [f"{name} {there} there, {asked} asked for" for name, (there, asked) in pairs.items() if there != asked]
-    if differ:
-        problem = f"{folder} holds a dataset of other settings: {'; '.join(differ)}"
+    pairs = {
+        name: (json.dumps(old_settings.get(name)), json.dumps(new_settings.get(name)))
+        for name in sorted(old_settings | new_settings)
+    }
+    differences = [
+        f"{name} {present_value} there, {wanted_value} asked for"
+        for name, (present_value, wanted_value) in pairs.items()
+        if present_value != wanted_value
+    ]
+    if differences:
+        problem = f"{folder} holds a dataset of other settings: {'; '.join(differences)}"
         raise InputError(f"{problem}; give another folder or the same settings")
 
 
@@ -95,17 +102,17 @@ def make_shards(make: Make, shards: list[int], *, workers: int = 1) -> Iterator[
 def _by_processes(make: Make, shards: list[int], workers: int) -> Iterator[tuple[int, int]]:
     # a fresh interpreter: threads and open files of this one are none of theirs
     context = multiprocessing.get_context("spawn")
-    done, stop = context.Value("q", 0), context.Event()
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(make, done, stop)) as pool:
+    counter, stop = context.Value("q", 0), context.Event()
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(make, counter, stop)) as pool:
         try:
-            reported, waiting = 0, {pool.submit(_shard, shard) for shard in shards}
-            while waiting:
-                ready, waiting = wait(waiting, timeout=_TICK, return_when=FIRST_COMPLETED)
-                for future in ready:
+            reported_count, pending_futures = 0, {pool.submit(_shard, shard) for shard in shards}
+            while pending_futures:
+                done_futures, pending_futures = wait(pending_futures, timeout=_TICK, return_when=FIRST_COMPLETED)
+                for future in done_futures:
                     future.result()
-                now = done.value
-                yield len(ready), now - reported
-                reported = now
+                current_count = counter.value
+                yield len(done_futures), current_count - reported_count
+                reported_count = current_count
         except BrokenProcessPool:
             raise InputError(
                 f"a worker process died, of {workers}: give fewer --workers if memory ran out; "
@@ -120,12 +127,12 @@ def _by_processes(make: Make, shards: list[int], workers: int) -> Iterator[tuple
 _mine: tuple = ()
 
 
-def _start(make: Make, done, stop) -> None:
+def _start(make: Make, counter, stop) -> None:
     global _mine
     # the parent says when to stop
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_leave_with_parent, daemon=True).start()
-    _mine = (make, done, stop)
+    _mine = (make, counter, stop)
 
 
 def _leave_with_parent() -> None:
@@ -136,11 +143,11 @@ def _leave_with_parent() -> None:
 
 
 def _shard(shard: int) -> None:
-    make, done, stop = _mine
+    make, counter, stop = _mine
     with closing(_counts(make, shard)) as counts:
         for count in counts:
-            with done.get_lock():
-                done.value += count
+            with counter.get_lock():
+                counter.value += count
             if stop.is_set():
                 return
 

@@ -40,17 +40,17 @@ def draw_errors(result: Result) -> bytes:
     setting = result.setting
     figure = _figure(9.6, 6.6, f"{setting.dataset}: MPJPE of {setting.method}, mm", setting.summary)
     rows = [row for row in result.lines if row.figure == "mpjpe" and row.arithmetic == OURS and row.value is not None]
-    overall = {row.method: row.value for row in rows if row.group == "all" and row.value is not None}
-    for axes, (group, (title, missing)) in zip(figure.subplots(2, 2).ravel(), panels.items(), strict=True):
+    overall_values = {row.method: row.value for row in rows if row.group == "all" and row.value is not None}
+    for axes, (group, (title, empty_text)) in zip(figure.subplots(2, 2).ravel(), panels.items(), strict=True):
         axes.set_title(title, fontsize=10, loc="left", color=_INK)
-        shown = [row for row in rows if row.group == group and row.method == setting.method]
-        if not shown:
-            _empty(axes, missing)
+        group_rows = [row for row in rows if row.group == group and row.method == setting.method]
+        if not group_rows:
+            _empty(axes, empty_text)
             continue
-        values, low, high = _intervals(shown, "value")
-        names = [f"{row.of}\n{row.people:,}" for row in shown]
+        values, low, high = _intervals(group_rows, "value")
+        names = [f"{row.of}\n{row.people:,}" for row in group_rows]
         _bars(axes, values, low, high, names, [f"{value:.0f}" for value in values])
-        for method, value in overall.items():
+        for method, value in overall_values.items():
             if method == setting.method:
                 _level(axes, value, f"all {value:.1f}", _INK)
             elif value < axes.get_ylim()[1] * 1.6:
@@ -62,17 +62,21 @@ def draw_errors(result: Result) -> bytes:
 def draw_reliability(predictions: Predictions, result: Result) -> bytes | None:
     """Stated confidence against the share of joints within 10 cm, and stated spread against the true error; None where
     the network states neither."""
-    some = predictions.select(~predictions.moving)
-    error = some.errors()
-    known = ~np.isnan(error) & ~np.isnan(some.confidence) & ~np.isnan(some.spread)
-    if not known.any():
+    people = predictions.select(~predictions.moving)
+    error = people.errors()
+    is_stated = ~np.isnan(error) & ~np.isnan(people.confidence) & ~np.isnan(people.spread)
+    if not is_stated.any():
         return None
-    error, confidence, spread = error[known], some.confidence[known].astype(float), some.spread[known].astype(float)
+    error, confidence, spread = (
+        error[is_stated],
+        people.confidence[is_stated].astype(float),
+        people.spread[is_stated].astype(float),
+    )
     setting = result.setting
     title = f"{setting.dataset}: confidence and spread that {setting.method} predicts"
-    left, right = (figure := _figure(9.0, 4.3, title, setting.summary)).subplots(1, 2)
-    _confidence(left, confidence, error < 1e3 * CONFIDENCE_RADIUS, result)
-    _spread(right, spread * 1e3, error)
+    left_axes, right_axes = (figure := _figure(9.0, 4.3, title, setting.summary)).subplots(1, 2)
+    _confidence(left_axes, confidence, error < 1e3 * CONFIDENCE_RADIUS, result)
+    _spread(right_axes, spread * 1e3, error)
     return png_of(figure, None)
 
 
@@ -94,16 +98,16 @@ def draw_stability(study: Stability) -> bytes:
             _curve(next(axes), curve, 1.08 * max(values))
     if study.ends:
         _end_joints(next(axes), study.ends)
-    for unused in axes:
-        unused.set_axis_off()
+    for unused_axes in axes:
+        unused_axes.set_axis_off()
     return png_of(figure, None)
 
 
 def compare_stability(studies: dict[str, dict[str, Any]], names: Sequence[str] = ("jitter", "clusters")) -> bytes:
     """Curves of several networks in one chart. Paper: Figure 7. studies: name of a network -> a study of
     stability.json; names: of its curves."""
-    first = next(iter(studies.values()))
-    figure = _figure(5.2 * len(names), 4.2, "points perturbed: MPJPE in mm", _scored(first["who"], first))
+    first_study = next(iter(studies.values()))
+    figure = _figure(5.2 * len(names), 4.2, "points perturbed: MPJPE in mm", _scored(first_study["who"], first_study))
     for axes, name in zip(np.ravel(figure.subplots(1, len(names))), names, strict=True):
         for (network, study), color in zip(studies.items(), cycle(_PALETTE), strict=False):
             curve = next(curve for curve in study["curves"] if curve["name"] == name)
@@ -122,25 +126,25 @@ def compare_stability(studies: dict[str, dict[str, Any]], names: Sequence[str] =
 def compare_ends(studies: dict[str, dict[str, Any]]) -> bytes:
     """Errors of end joints over the worst people, of several networks: means, and quartiles as lines. Paper: Figure 8.
     studies: as of `compare_stability`."""
-    first = next(iter(studies.values()))
-    of_whom = _scored(first["setting"]["dataset"], first)
-    figure = _figure(9.6, 4.4, "end joints of each network's worst people: error in mm", of_whom)
+    first_study = next(iter(studies.values()))
+    subtitle = _scored(first_study["setting"]["dataset"], first_study)
+    figure = _figure(9.6, 4.4, "end joints of each network's worst people: error in mm", subtitle)
     axes, width = figure.subplots(), 0.8 / max(len(studies), 1)
     for k, ((network, study), color) in enumerate(zip(studies.items(), cycle(_PALETTE), strict=False)):
         ends = study["ends"]
-        at = np.arange(len(ends)) + (k - (len(studies) - 1) / 2) * width
-        axes.bar(at, [end["mean"] for end in ends], 0.9 * width, color=color, label=network, zorder=2)
+        positions = np.arange(len(ends)) + (k - (len(studies) - 1) / 2) * width
+        axes.bar(positions, [end["mean"] for end in ends], 0.9 * width, color=color, label=network, zorder=2)
         low, _, high = np.array([end["quartiles"] for end in ends]).T
-        axes.vlines(at, low, high, color=_INK, lw=1, zorder=3)
+        axes.vlines(positions, low, high, color=_INK, lw=1, zorder=3)
         axes.set_xticks(np.arange(len(ends)), [f"{end['group']}\nworst {end['worst']:,}" for end in ends])
     _styled(axes, "means; lines from the lower to the upper quartile")
     axes.legend(fontsize=8, frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, -0.32))
     return png_of(figure, None)
 
 
-def _scored(who: str, study: dict[str, Any]) -> str:
+def _scored(people: str, study: dict[str, Any]) -> str:
     """Who was scored, and how: the protocol is that of all studies in a chart."""
-    return f"{who} · protocol {study['setting']['protocol']}"
+    return f"{people} · protocol {study['setting']['protocol']}"
 
 
 def draw_worst(p: Predictions, setting: Setting, worst: Sequence[tuple[EvalSample, int]]) -> bytes:
@@ -163,31 +167,31 @@ def draw_worst(p: Predictions, setting: Setting, worst: Sequence[tuple[EvalSampl
 # ---- panels
 
 
-def _bars(axes, values: np.ndarray, low, high, names: list[str], texts: list[str], *, level: bool = False) -> None:
-    """A bar a value with its interval and a text at its end, upright or `level`."""
-    at = np.arange(len(values))
-    (axes.barh if level else axes.bar)(at, values, 0.7, color=_BAR, zorder=1)
-    (axes.hlines if level else axes.vlines)(at, low, high, color=_BLUE, lw=1.6, zorder=4)
-    axes.plot(*((values, at) if level else (at, values)), "o", ms=4, color=_BLUE, zorder=5)
+def _bars(axes, values: np.ndarray, low, high, names: list[str], texts: list[str], *, horizontal: bool = False) -> None:
+    """A bar a value with its interval and a text at its end, upright or `horizontal`."""
+    positions = np.arange(len(values))
+    (axes.barh if horizontal else axes.bar)(positions, values, 0.7, color=_BAR, zorder=1)
+    (axes.hlines if horizontal else axes.vlines)(positions, low, high, color=_BLUE, lw=1.6, zorder=4)
+    axes.plot(*((values, positions) if horizontal else (positions, values)), "o", ms=4, color=_BLUE, zorder=5)
     ends = np.maximum(values, high)
-    for k, end, text in zip(at, ends, texts, strict=True):
-        place, offset = ((end, k), (4, -3)) if level else ((k, end), (0, 4))
-        shown = _text(axes, text, place, offset, ha="left" if level else "center", zorder=6)
-        shown.set_bbox({"fc": "white", "ec": "none", "alpha": 0.75, "pad": 0.6})
-    (axes.set_yticks if level else axes.set_xticks)(at, names, fontsize=7.5)
-    (axes.set_xlim if level else axes.set_ylim)(0, 1.18 * ends.max())
+    for k, end, text in zip(positions, ends, texts, strict=True):
+        anchor, offset = ((end, k), (4, -3)) if horizontal else ((k, end), (0, 4))
+        annotation = _text(axes, text, anchor, offset, ha="left" if horizontal else "center", zorder=6)
+        annotation.set_bbox({"fc": "white", "ec": "none", "alpha": 0.75, "pad": 0.6})
+    (axes.set_yticks if horizontal else axes.set_xticks)(positions, names, fontsize=7.5)
+    (axes.set_xlim if horizontal else axes.set_ylim)(0, 1.18 * ends.max())
     # a single bar is no wider than one of four
-    spare = max(4 - len(at), 0) / 2
-    (axes.set_ylim if level else axes.set_xlim)(-0.6 - spare, len(at) - 0.4 + spare)
-    _styled(axes, grid="x" if level else "y")
+    margin = max(4 - len(positions), 0) / 2
+    (axes.set_ylim if horizontal else axes.set_xlim)(-0.6 - margin, len(positions) - 0.4 + margin)
+    _styled(axes, grid="x" if horizontal else "y")
 
 
-def _confidence(axes, stated: np.ndarray, hit: np.ndarray, result: Result) -> None:
-    index = np.minimum((stated * _BINS).astype(int), _BINS - 1)
+def _confidence(axes, confidence: np.ndarray, is_hit: np.ndarray, result: Result) -> None:
+    index = np.minimum((confidence * _BINS).astype(int), _BINS - 1)
     count = np.bincount(index, minlength=_BINS)
-    some = count >= _FEWEST
-    mean = np.bincount(index, stated, _BINS)[some] / count[some]
-    share = np.bincount(index, hit.astype(float), _BINS)[some] / count[some]
+    is_populated = count >= _FEWEST
+    mean = np.bincount(index, confidence, _BINS)[is_populated] / count[is_populated]
+    share = np.bincount(index, is_hit.astype(float), _BINS)[is_populated] / count[is_populated]
     centers = (np.arange(_BINS) + 0.5) / _BINS
     axes.bar(centers, count / count.sum(), 0.092, color=_BAR, label="share of joints", zorder=1)
     axes.plot([0, 1], [0, 1], color=_GRAY, lw=0.9, zorder=2)
@@ -200,30 +204,30 @@ def _confidence(axes, stated: np.ndarray, hit: np.ndarray, result: Result) -> No
     _styled(axes, title, xlabel="predicted confidence", legend=True)
 
 
-def _spread(axes, stated: np.ndarray, error: np.ndarray) -> None:
+def _spread(axes, spread: np.ndarray, error: np.ndarray) -> None:
     edges = 1e3 * np.array(_SPREADS)
-    index = np.digitize(stated, edges) - 1
+    index = np.digitize(spread, edges) - 1
     bins = [index == k for k in range(len(edges) - 1) if (index == k).sum() >= _FEWEST]
-    stated_means, means = (np.array([values[rows].mean() for rows in bins]) for values in (stated, error))
+    spread_means, error_means = (np.array([values[rows].mean() for rows in bins]) for values in (spread, error))
     quartiles = np.array([np.quantile(error[rows], [0.25, 0.75]) for rows in bins]).reshape(-1, 2)
-    top = 1.1 * max([*stated_means, *means, *quartiles[:, 1], 1.0])
+    top = 1.1 * max([*spread_means, *error_means, *quartiles[:, 1], 1.0])
     axes.plot([0, top], [0, top], color=_GRAY, lw=0.9, zorder=2)
-    axes.fill_between(stated_means, *quartiles.T, color=_BAR, lw=0, label="middle half", zorder=1)
-    axes.plot(stated_means, means, "o-", color=_BLUE, ms=4.5, lw=1.4, label="mean", zorder=3)
+    axes.fill_between(spread_means, *quartiles.T, color=_BAR, lw=0, label="middle half", zorder=1)
+    axes.plot(spread_means, error_means, "o-", color=_BLUE, ms=4.5, lw=1.4, label="mean", zorder=3)
     axes.set(xlim=(0, top), ylim=(0, top))
-    title = f"spread {stated.mean():.0f} mm predicted, {error.mean():.0f} mm true"
+    title = f"spread {spread.mean():.0f} mm predicted, {error.mean():.0f} mm true"
     _styled(axes, title, xlabel="predicted spread, mm", ylabel="true error, mm", legend=True)
 
 
 def _curve(axes, curve: Curve, top: float) -> None:
     # amounts are not evenly apart, but each is one step of the study
-    at = np.array([k for k, point in enumerate(curve.points) if point.mpjpe is not None])
-    points = [curve.points[k] for k in at]
+    positions = np.array([k for k, point in enumerate(curve.points) if point.mpjpe is not None])
+    points = [curve.points[k] for k in positions]
     values, low, high = _intervals(points, "mpjpe")
-    axes.fill_between(at, low, high, color=_BAR, lw=0, zorder=1)
-    axes.plot(at, values, "o-", color=_BLUE, ms=4.5, lw=1.4, zorder=3)
+    axes.fill_between(positions, low, high, color=_BAR, lw=0, zorder=1)
+    axes.plot(positions, values, "o-", color=_BLUE, ms=4.5, lw=1.4, zorder=3)
     axes.axhline(values[0], color=_GRAY, lw=0.8, ls=(0, (4, 3)), zorder=2)
-    for x, value in zip(at, values, strict=True):
+    for x, value in zip(positions, values, strict=True):
         _text(axes, f"{value:.0f}", (x, value), (0, 6))
     names = [point.label + (f"\n({point.no_pose})" if point.no_pose else "") for point in curve.points]
     axes.set_xticks(np.arange(len(names)), names, fontsize=8)
@@ -235,15 +239,15 @@ def _sensors(axes, curve: Curve) -> None:
     points = sorted((p for p in curve.points if p.mpjpe is not None), key=lambda point: -point.points)
     values, low, high = _intervals(points, "mpjpe")
     names = [f"{point.label} · {point.points:.0f}" for point in points]
-    _bars(axes, values, low, high, names, [f"{value:.0f}" for value in values], level=True)
+    _bars(axes, values, low, high, names, [f"{value:.0f}" for value in values], horizontal=True)
     _styled(axes, "other sensors · median number of points", grid="x")
 
 
 def _end_joints(axes, ends: Sequence[End]) -> None:
-    low, middle, high = np.array([end.quartiles for end in ends]).T
+    low, medians, high = np.array([end.quartiles for end in ends]).T
     texts = [f"{end.mean:.0f} ± {end.deviation:.0f}" for end in ends]
     _bars(axes, np.array([end.mean for end in ends]), low, high, [end.group for end in ends], texts)
-    axes.plot(np.arange(len(ends)), middle, "o", ms=5, color=_GRAY, mec="white", zorder=4)
+    axes.plot(np.arange(len(ends)), medians, "o", ms=5, color=_GRAY, mec="white", zorder=4)
     _styled(axes, f"end joints of the worst {ends[0].worst:,}: mean, quartiles")
 
 
@@ -283,20 +287,20 @@ def _styled(
         axes.legend(fontsize=8, loc="upper left", frameon=False)
 
 
-def _text(axes, words: str, at: tuple[Any, Any], offset: tuple[float, float], *, ha: str = "center", **more):
-    return axes.annotate(words, at, offset, textcoords="offset points", ha=ha, fontsize=8, color=_INK, **more)
+def _text(axes, text: str, position: tuple[Any, Any], offset: tuple[float, float], *, ha: str = "center", **options):
+    return axes.annotate(text, position, offset, textcoords="offset points", ha=ha, fontsize=8, color=_INK, **options)
 
 
-def _level(axes, y: float, words: str, color: str) -> None:
+def _level(axes, y: float, text: str, color: str) -> None:
     """A level line with words above its right end."""
     dashes = (4, 3) if color == _INK else (1, 2)
     axes.axhline(y, color=color, lw=0.8, ls=(0, dashes), zorder=3)
-    place = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "ha": "right"}
-    axes.annotate(words, (1.0, y), (-2, 2), fontsize=7.5, color=color, zorder=7, **place)
+    options = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "ha": "right"}
+    axes.annotate(text, (1.0, y), (-2, 2), fontsize=7.5, color=color, zorder=7, **options)
 
 
-def _empty(axes, words: str, title: str = "") -> None:
+def _empty(axes, text: str, title: str = "") -> None:
     if title:
         axes.set_title(title, fontsize=9.5, loc="left", color=_INK)
     axes.set_axis_off()
-    axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", va="center", fontsize=9, color=_FAINT)
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=9, color=_FAINT)

@@ -91,8 +91,8 @@ class EvalSample:
     def plain(self) -> bool:
         """Upright, whole and uncluttered, of 100 points and more."""
         info = self.info
-        enough = len(self.sample.points) >= PLAIN_POINTS
-        return enough and bool(is_plain(bool(info.upright), info.visible, info.clutter))
+        has_enough_points = len(self.sample.points) >= PLAIN_POINTS
+        return has_enough_points and bool(is_plain(bool(info.upright), info.visible, info.clutter))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,43 +160,43 @@ def spread(total: int, limit: int | None) -> np.ndarray:
 
 
 def _open_folder(folder: Path, split: str | None, limit: int | None) -> EvalDataset:
-    dataset, damaged = open_dataset(folder), Skipped()
+    dataset, damaged_shards = open_dataset(folder), Skipped()
     card = dataset.card
-    synthetic = card.people != "labelled"
-    if synthetic and split not in (None, EVERYBODY):
+    is_synthetic = card.people != "labelled"
+    if is_synthetic and split not in (None, EVERYBODY):
         raise file_error(folder, f"holds synthetic people, which have no splits, got {split!r}: leave split out")
-    rows = _stored_rows(dataset, damaged)
+    rows = _stored_rows(dataset, damaged_shards)
     splits = sorted(rows["split"].dropna().unique())
     if split is None:
         split = next((name for name in _DEFAULT_SPLITS if name in splits), EVERYBODY)
         if split == EVERYBODY and splits:
             raise file_error(folder, f"has nobody in test or val, only in {', '.join(splits)}: say split NAME")
-    chosen = rows if split == EVERYBODY else rows[rows["split"] == split]
-    total = len(chosen)
+    people = rows if split == EVERYBODY else rows[rows["split"] == split]
+    total = len(people)
     if not total:
-        known = ", ".join(splits) or "no splits"
-        raise file_error(folder, f"has nobody in the split {split!r}; there are {known}: say one as split")
-    chosen = chosen.iloc[spread(total, limit)]
+        split_names = ", ".join(splits) or "no splits"
+        raise file_error(folder, f"has nobody in the split {split!r}; there are {split_names}: say one as split")
+    people = people.iloc[spread(total, limit)]
     source, _, leaks = str(card.about.get("split", "")).partition("; LEAKS: ")
-    own = skeleton(card.skeleton)
+    dataset_skeleton = skeleton(card.skeleton)
     return EvalDataset(
         name=folder.resolve().name,
-        kind="synth" if synthetic else str(card.settings.get("dataset", "labelled")),
-        skeleton=own,
-        scored=_SYNTHETIC if synthetic else own,
-        read=lambda skipped: _read_folder(dataset, chosen, damaged, skipped),
-        split="none" if synthetic or not splits else split,
+        kind="synth" if is_synthetic else str(card.settings.get("dataset", "labelled")),
+        skeleton=dataset_skeleton,
+        scored=_SYNTHETIC if is_synthetic else dataset_skeleton,
+        read=lambda skipped: _read_folder(dataset, people, damaged_shards, skipped),
+        split="none" if is_synthetic or not splits else split,
         split_source=source.removeprefix(f"{card.settings.get('split_by') or ''}: "),
         leaks=leaks,
         settings=card.settings,
-        count=len(chosen),
+        count=len(people),
         total=total,
-        limit=limit if len(chosen) < total else None,
-        clusters=not synthetic or card.settings.get("what") != "people",
+        limit=limit if len(people) < total else None,
+        clusters=not is_synthetic or card.settings.get("what") != "people",
     )
 
 
-def _stored_rows(dataset: DatasetReader, damaged: Skipped) -> pd.DataFrame:
+def _stored_rows(dataset: DatasetReader, damaged_shards: Skipped) -> pd.DataFrame:
     """(shard, row, split) of everybody stored. Damaged shards are left out and counted; raises InputError for a missing
     one, and where all are damaged."""
     card, rows = dataset.card, []
@@ -210,10 +210,10 @@ def _stored_rows(dataset: DatasetReader, damaged: Skipped) -> pd.DataFrame:
             else:
                 splits = [None] * dataset.rows_of(card.people, shard)
         except InputError as error:
-            count_skipped(damaged, "damaged shards", error)
+            count_skipped(damaged_shards, "damaged shards", error)
         else:
             rows += [(shard, row, split) for row, split in enumerate(splits)]
-    for entry in damaged.values():
+    for entry in damaged_shards.values():
         if entry["count"] == card.shards:
             raise InputError(
                 f"none of the {card.shards} shards of {dataset.folder} can be read; the first: {entry['first']}"
@@ -222,23 +222,23 @@ def _stored_rows(dataset: DatasetReader, damaged: Skipped) -> pd.DataFrame:
 
 
 def _read_folder(
-    dataset: DatasetReader, chosen: pd.DataFrame, damaged: Skipped, skipped: Skipped
+    dataset: DatasetReader, people: pd.DataFrame, damaged_shards: Skipped, skipped: Skipped
 ) -> Iterator[EvalSample]:
-    skipped.update({reason: dict(entry) for reason, entry in damaged.items()})
-    for shard, rows in chosen.groupby("shard")["row"]:
+    skipped.update({reason: dict(entry) for reason, entry in damaged_shards.items()})
+    for shard, rows in people.groupby("shard")["row"]:
         path = dataset.path(shard)
         try:
             # a shard that turns out to be damaged half way is left out as a whole
-            stored = list(read_rows(path, dataset.card.people))
+            stored_rows = list(read_rows(path, dataset.card.people))
         except InputError as error:
             count_skipped(skipped, "damaged shards", error)
             count_skipped(skipped, "people of damaged shards", path.name, len(rows))
             continue
         for row in rows:
             try:
-                sample = dataset.sample(stored[row])
+                sample = dataset.sample(stored_rows[row])
             except InputError as error:
-                count_skipped(skipped, "rows that are no sample", f"{path.name}, row {row}: {error}")
+                count_skipped(skipped, "people whose rows are no sample", f"{path.name}, row {row}: {error}")
             else:
                 yield EvalSample(sample=sample, points=sample.points, shard=int(shard), row=int(row))
 
@@ -288,26 +288,26 @@ def load_bench(which: str = BENCH) -> Bench:
     table = parquet.read_table(pa.BufferReader(data)).to_pandas()
     columns: dict[str, Any] = {name: values.to_numpy() for name, values in table.items()}
     columns |= {name: np.stack(columns[name]) for name in ("origin", "joints", "box")}
-    shifts = zip(columns["origin"], columns.pop("points_mm"), strict=True)
-    points = tuple(origin + millimeters.reshape(-1, 3) / 1e3 for origin, millimeters in shifts)
+    pairs = zip(columns["origin"], columns.pop("points_mm"), strict=True)
+    points = tuple(origin + millimeters.reshape(-1, 3) / 1e3 for origin, millimeters in pairs)
     columns["num_points"] = np.array([len(cloud) for cloud in points])
     # of bench 1 all are people, of no family
-    own = {
+    defaults = {
         "person": np.ones(len(points), bool),
         "others": np.zeros(len(points), int),
         "family": np.full(len(points), ""),
     }
-    columns = own | columns
+    columns = defaults | columns
     joints = columns.pop("joints").reshape(-1, len(BODY26), 3)
     return Bench(points=points, joints=joints, columns=columns)
 
 
-def _open_bench(which: str, split: str | None, limit: int | None) -> EvalDataset:
+def _open_bench(key: str, split: str | None, limit: int | None) -> EvalDataset:
     """lidarpose-bench: its people alone, and without a limit the frames of its clips for motion."""
-    name = BENCHES[which].name
+    name = BENCHES[key].name
     if split not in (None, EVERYBODY):
         raise InputError(f"{name} is one test set without splits, got {split!r}: leave split out")
-    bench = load_bench(which)
+    bench = load_bench(key)
     total = len(bench.people)
     limit = limit if limit is not None and limit < total else None
     rows = bench.people[spread(total, limit)]
@@ -330,7 +330,7 @@ def _open_bench(which: str, split: str | None, limit: int | None) -> EvalDataset
 def _bench_sample(bench: Bench, row: int) -> EvalSample:
     columns = {name: values[row] for name, values in bench.columns.items() if name != "part"}
     clip, frame, box = int(columns["clip"]), int(columns["frame"]), columns["box"]
-    known = ("sensor", "kind", "distance", "visible", "clutter", "upright")
+    info_names = ("sensor", "kind", "distance", "visible", "clutter", "upright")
     sample = LabeledSample(
         points=bench.points[row].astype(np.float32),
         center=columns["origin"],
@@ -340,17 +340,17 @@ def _bench_sample(bench: Bench, row: int) -> EvalSample:
         sequence=f"clip {clip}" if clip >= 0 else str(row),
         frame=frame,
         time=frame / 10 if clip >= 0 else np.nan,
-        info=PersonInfo(**{name: columns[name] for name in known}),
+        info=PersonInfo(**{name: columns[name] for name in info_names}),
     )
-    words = {name: str(columns[name]) for name in ("condition", "poses", "family")}
-    return EvalSample(sample=sample, points=bench.points[row], shard=0, row=row, moving=clip >= 0, **words)
+    categories = {name: str(columns[name]) for name in ("condition", "poses", "family")}
+    return EvalSample(sample=sample, points=bench.points[row], shard=0, row=row, moving=clip >= 0, **categories)
 
 
 def facing(joints: np.ndarray) -> np.ndarray:
     """joints (N, 26, 3) m of body26 -> (N,) rad: the direction that hips and shoulders face, from above."""
-    at = BODY26.index
-    left = joints[:, at("left_hip")] - joints[:, at("right_hip")]
-    left = left + joints[:, at("left_shoulder")] - joints[:, at("right_shoulder")]
+    joint_index = BODY26.index
+    left = joints[:, joint_index("left_hip")] - joints[:, joint_index("right_hip")]
+    left = left + joints[:, joint_index("left_shoulder")] - joints[:, joint_index("right_shoulder")]
     return np.arctan2(-left[:, 0], left[:, 1])
 
 
@@ -362,8 +362,8 @@ def mean_poses(bench: Bench) -> dict[str, np.ndarray]:
     offset = bench.joints - center[:, None]
     R_level_person = rotation_about("z", facing(bench.joints))
     # row vectors: x_person = x_level @ R_level_person
-    turned = (offset @ R_level_person)[bench.people].mean(0)
+    mean_offset_person = (offset @ R_level_person)[bench.people].mean(0)
     return {
-        "mean pose, true facing": center[:, None] + turned @ np.swapaxes(R_level_person, -1, -2),
+        "mean pose, true facing": center[:, None] + mean_offset_person @ np.swapaxes(R_level_person, -1, -2),
         "mean pose": center[:, None] + offset[bench.people].mean(0),
     }

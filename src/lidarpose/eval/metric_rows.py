@@ -38,18 +38,20 @@ ITOP_HALVES = {
 def facing_flipped(predictions: Predictions) -> np.ndarray:
     """(N,) percent: 100 where the predicted person faces over 90 degrees away from the true one, by hips and shoulders
     seen from above, else 0; NaN where these are not labeled or there is no pose."""
-    of = predictions.skeleton
+    skeleton = predictions.skeleton
     names = [(f"left_{joint}", f"right_{joint}") for joint in ("hip", "shoulder")]
-    pairs = np.array([(of.index(a), of.index(b)) for a, b in names if a in of.joints and b in of.joints], int)
+    pairs = np.array(
+        [(skeleton.index(a), skeleton.index(b)) for a, b in names if a in skeleton.joints and b in skeleton.joints], int
+    )
     if not len(pairs):
         return np.full(len(predictions), np.nan)
-    labeled = np.all(predictions.labeled[:, pairs.ravel()], axis=1)
+    is_labeled = np.all(predictions.labeled[:, pairs.ravel()], axis=1)
     # (N, 2): from right to left as seen from above, summed over hips and shoulders
-    predicted, true = (
-        np.where(labeled[:, None, None], joints[:, pairs[:, 0]] - joints[:, pairs[:, 1]], 0).sum(1)[:, :2]
+    predicted_left, true_left = (
+        np.where(is_labeled[:, None, None], joints[:, pairs[:, 0]] - joints[:, pairs[:, 1]], 0).sum(1)[:, :2]
         for joints in (predictions.filled, predictions.true)
     )
-    return np.where(labeled, 100.0 * ((predicted * true).sum(1) < 0), np.nan)
+    return np.where(is_labeled, 100.0 * ((predicted_left * true_left).sum(1) < 0), np.nan)
 
 
 def _pck(p: Predictions, threshold: float, torso: float = TORSO) -> np.ndarray:
@@ -105,10 +107,10 @@ def _pem(p: Predictions, setting: Setting) -> Score | None:
     frames: dict[tuple, list[int]] = {}
     for k in np.flatnonzero(p.boxed).tolist():
         frames.setdefault((p.sequence[k], p.frame[k]), []).append(k)
-    rows = [np.array(own) for own in frames.values()]
+    frame_rows = [np.array(rows) for rows in frames.values()]
     columns = (p.true, p.box, p.labels == SEEN)
-    pred = [p.pred[own][p.posed[own]] for own in rows]
-    result = keypoints.pem(pred, *([column[own] for own in rows] for column in columns))
+    pred = [p.pred[rows][p.posed[rows]] for rows in frame_rows]
+    result = keypoints.pem(pred, *([column[rows] for rows in frame_rows] for column in columns))
     joints = result.matched + result.missed + result.extra
     return Score(result.pem, people=result.people, joints=joints, skipped=result.people_excused)
 
@@ -116,24 +118,24 @@ def _pem(p: Predictions, setting: Setting) -> Score | None:
 def _of_confidence(p: Predictions, setting: Setting, metric: Callable) -> Score | None:
     """Confidence against hits, over all labeled joints at once; None where it cannot be ranked or is not stated."""
     error = p.errors()
-    known = ~np.isnan(error) & ~np.isnan(p.confidence)
-    hit = error[known] < 1e3 * CONFIDENCE_RADIUS
-    if not known.any() or (metric is aggregate.auroc and hit.all() == hit.any()):
+    is_stated = ~np.isnan(error) & ~np.isnan(p.confidence)
+    is_hit = error[is_stated] < 1e3 * CONFIDENCE_RADIUS
+    if not is_stated.any() or (metric is aggregate.auroc and is_hit.all() == is_hit.any()):
         return None
-    people = known.any(1)
-    value = 100 * metric(p.confidence[known].astype(float), hit)
-    return Score(value, people=people.sum(), joints=known.sum(), skipped=(p.posed & ~people).sum())
+    is_counted = is_stated.any(1)
+    value = 100 * metric(p.confidence[is_stated].astype(float), is_hit)
+    return Score(value, people=is_counted.sum(), joints=is_stated.sum(), skipped=(p.posed & ~is_counted).sum())
 
 
 def _p95(p: Predictions, setting: Setting) -> Score | None:
     """The 95th percentile of people's mean errors."""
     error = p.errors()
-    known = ~np.isnan(error)
-    people = known.any(1)
-    if not people.any():
+    is_labeled = ~np.isnan(error)
+    has_label = is_labeled.any(1)
+    if not has_label.any():
         return None
-    value = np.percentile(np.nanmean(error[people], axis=1), 95)
-    return Score(value, people=people.sum(), joints=known.sum(), skipped=(p.posed & ~people).sum())
+    value = np.percentile(np.nanmean(error[has_label], axis=1), 95)
+    return Score(value, people=has_label.sum(), joints=is_labeled.sum(), skipped=(p.posed & ~has_label).sum())
 
 
 # metrics of everybody at once, without an interval: (Predictions, Setting) -> Score or None, unit
@@ -150,19 +152,19 @@ SUMMARIES: dict[str, tuple[Callable[[Predictions, Setting], Score | None], str]]
 
 def _groups(section: str, p: Predictions, setting: Setting) -> Iterator[tuple[str, str, np.ndarray, np.ndarray | None]]:
     """(group, of, rows (N,) bool, joint indices or None for all) of a section of the report."""
-    everybody = np.ones(len(p), bool)
+    all_rows = np.ones(len(p), bool)
     if section == "all":
-        yield "all", "all", everybody, None
+        yield "all", "all", all_rows, None
     elif section == "dense":
-        known = ~np.isnan(facing_flipped(p))
-        dense, sparse = p.points >= PLENTY, (p.points >= FEW) & (p.points < PLENTY)
-        for of, rows in ((f"{PLENTY} and more", dense), (f"{FEW} to {PLENTY}", sparse)):
-            if known[rows].any():
+        has_facing = ~np.isnan(facing_flipped(p))
+        is_dense, is_sparse = p.points >= PLENTY, (p.points >= FEW) & (p.points < PLENTY)
+        for of, rows in ((f"{PLENTY} and more", is_dense), (f"{FEW} to {PLENTY}", is_sparse)):
+            if has_facing[rows].any():
                 yield "points", of, rows, None
     elif section == "joints":
         for name, joints in joint_groups(p.skeleton).items():
             if name != "all":
-                yield "joints", name, everybody, joints
+                yield "joints", name, all_rows, joints
     elif section == "conditions":
         for title in ("condition", "poses", "family", "sensor"):
             values = getattr(p, title)
@@ -170,19 +172,19 @@ def _groups(section: str, p: Predictions, setting: Setting) -> Iterator[tuple[st
                 yield title, of, values == of, None
         yield "plain", "upright, whole, uncluttered, 100 points", p.plain, None
     elif section == "spans":
-        hidden = p.hidden if not np.isnan(p.hidden).all() else hidden_share(p.labels)
+        hidden_shares = p.hidden if not np.isnan(p.hidden).all() else hidden_share(p.labels)
         spans = {"distance, m": (p.distance, aggregate.DISTANCE_EDGES), "points": (p.points, aggregate.POINT_EDGES)}
-        for title, (values, edges) in (spans | {"hidden share": (hidden, aggregate.OCCLUSION_EDGES)}).items():
+        for title, (values, edges) in (spans | {"hidden share": (hidden_shares, aggregate.OCCLUSION_EDGES)}).items():
             for of, rows in aggregate.span_rows(values, edges).items():
                 yield title, of, rows, None
     elif section == "itop" and setting.kind == "itop":
-        yield "all", "all", everybody, None
-        for half, words in ITOP_HALVES.items():
-            names = [name for name in p.skeleton.joints if name.removeprefix("left_").removeprefix("right_") in words]
+        yield "all", "all", all_rows, None
+        for half, stems in ITOP_HALVES.items():
+            names = [name for name in p.skeleton.joints if name.removeprefix("left_").removeprefix("right_") in stems]
             if names:
-                yield "body", half, everybody, np.array([p.skeleton.index(name) for name in names])
+                yield "body", half, all_rows, np.array([p.skeleton.index(name) for name in names])
         for j, name in enumerate(p.skeleton.joints):
-            yield "joint", name, everybody, np.array([j])
+            yield "joint", name, all_rows, np.array([j])
     elif section == "boxes" and _has_waymo_boxes(p, setting) and (p.boxed & p.posed).any():
         yield "all", "all", p.boxed, None
 
@@ -210,20 +212,20 @@ def hidden_share(labels: np.ndarray) -> np.ndarray:
 
 def metric_rows(predictions: Predictions, setting: Setting, *, dapt_compat: bool = False) -> tuple[MetricRow, ...]:
     """The rows of a dataset's people; dapt_compat: also with the released code's arithmetic."""
-    alone = predictions.select(~predictions.moving)
-    rows = [*_mean_rows(alone, setting, ("all", "dense", "joints", "conditions", "spans", "boxes", "itop"))]
+    people = predictions.select(~predictions.moving)
+    rows = [*_mean_rows(people, setting, ("all", "dense", "joints", "conditions", "spans", "boxes", "itop"))]
     for name, (summary, unit) in SUMMARIES.items():
-        if (score := summary(alone, setting)) is not None:
-            rows.append(_row(score, setting, name, unit=unit, no_pose=int((~alone.posed).sum())))
+        if (score := summary(people, setting)) is not None:
+            rows.append(_row(score, setting, name, unit=unit, no_pose=int((~people.posed).sum())))
     rows += _acceleration(predictions, setting)
-    return tuple([*rows, *_dapt_compat_rows(alone, setting)] if dapt_compat else rows)
+    return tuple([*rows, *_dapt_compat_rows(people, setting)] if dapt_compat else rows)
 
 
 def baseline_rows(predictions: Predictions, setting: Setting) -> tuple[MetricRow, ...]:
     """What is reported of a baseline: over everybody, and MPJPE by condition."""
-    alone = predictions.select(~predictions.moving)
-    by_condition = _mean_rows(alone, setting, ("conditions",), metrics=("mpjpe",))
-    return (*_mean_rows(alone, setting, ("all", "dense")), *by_condition)
+    people = predictions.select(~predictions.moving)
+    by_condition = _mean_rows(people, setting, ("conditions",), metrics=("mpjpe",))
+    return (*_mean_rows(people, setting, ("all", "dense")), *by_condition)
 
 
 def _mean_rows(
@@ -254,22 +256,24 @@ def _mean_row(
     return _row(score, setting, figure, unit=metric.unit, group=group, of=of, low=low, high=high, no_pose=no_pose)
 
 
-def _row(score: Score, setting: Setting, figure: str, *, group: str = "all", of: str = "all", **more: Any) -> MetricRow:
-    """A row of a score; more: the other fields of `MetricRow`."""
+def _row(
+    score: Score, setting: Setting, figure: str, *, group: str = "all", of: str = "all", **other_fields: Any
+) -> MetricRow:
+    """A row of a score; other_fields: of `MetricRow`."""
     counts: dict[str, Any] = {name: int(getattr(score, name)) for name in ("people", "joints", "skipped")}
-    shared = {name: getattr(setting, name) for name in ("method", "protocol", "centring", "split", "limit")}
-    return MetricRow(figure=figure, group=group, of=of, value=number(score), **counts | shared | more)
+    setting_values = {name: getattr(setting, name) for name in ("method", "protocol", "centring", "split", "limit")}
+    return MetricRow(figure=figure, group=group, of=of, value=number(score), **counts | setting_values | other_fields)
 
 
 def _dapt_compat_rows(p: Predictions, setting: Setting) -> Iterator[MetricRow]:
     """The released code's arithmetic on people with a pose; see docs/evaluate.md for what differs."""
-    posed = p.select(p.posed)
-    if not len(posed):
+    posed_people = p.select(p.posed)
+    if not len(posed_people):
         return
-    tables = {name: METRICS[name].values(posed) for name in ("mpjpe", "pck3", "pck5")}
+    tables = {name: METRICS[name].values(posed_people) for name in ("mpjpe", "pck3", "pck5")}
     # its alignment takes every joint, so it has none where a joint is not labeled
-    if not np.isnan(posed.true).any():
-        tables["pa_mpjpe"] = aligned_errors(posed.pred, posed.true, dapt_compat=True)
+    if not np.isnan(posed_people.true).any():
+        tables["pa_mpjpe"] = aligned_errors(posed_people.pred, posed_people.true, dapt_compat=True)
     for metric, table in tables.items():
         is_pck, unit = metric.startswith("pck"), METRICS[metric].unit
         for name, joints in joint_groups(p.skeleton).items():
@@ -277,7 +281,7 @@ def _dapt_compat_rows(p: Predictions, setting: Setting) -> Iterator[MetricRow]:
                 score = mean(table[:, joints], empty=np.nan if is_pck else 0.0)
                 score.skipped = 0
                 group = "all" if name == "all" else "joints"
-                options: dict[str, Any] = {"unit": unit, "no_pose": len(p) - len(posed), "arithmetic": RELEASED}
+                options: dict[str, Any] = {"unit": unit, "no_pose": len(p) - len(posed_people), "arithmetic": RELEASED}
                 yield _row(score, setting, metric, group=group, of=name, **options)
 
 
@@ -292,20 +296,20 @@ def person_rows(p: Predictions, objects: np.ndarray, others: np.ndarray, setting
         objects: (K,) what it says of the objects, the probability of a person.
         others: (N,) how many points are a second person's; with a few it is neither there nor not.
     """
-    clear = (others == 0) | (others >= FEWEST_OF_SECOND)
-    ranked = {
+    is_clear = (others == 0) | (others >= FEWEST_OF_SECOND)
+    rankings = {
         # who has no pose is not taken for a person
         "person_auroc": (
             np.append(np.where(p.posed, p.person, 0), objects).astype(np.float32),
             np.arange(len(p) + len(objects)) < len(p),
         ),
-        "second_person_auroc": (p.second_person[clear], others[clear] > 0),
+        "second_person_auroc": (p.second_person[is_clear], others[is_clear] > 0),
     }
-    for figure, (probability, is_true) in ranked.items():
-        stated = ~np.isnan(probability)
-        if len(np.unique(is_true[stated])) == 2:
-            value = 100 * aggregate.auroc(probability[stated].astype(float), is_true[stated])
-            yield _row(Score(value, people=int(stated.sum())), setting, figure, unit="%")
+    for figure, (probability, is_true) in rankings.items():
+        is_stated = ~np.isnan(probability)
+        if len(np.unique(is_true[is_stated])) == 2:
+            value = 100 * aggregate.auroc(probability[is_stated].astype(float), is_true[is_stated])
+            yield _row(Score(value, people=int(is_stated.sum())), setting, figure, unit="%")
 
 
 # ---- motion
@@ -319,15 +323,19 @@ def triples(p: Predictions) -> np.ndarray:
     if len(order) < 3:
         return np.empty((0, 3), int)
     rows = np.stack([order[:-2], order[1:-1], order[2:]], 1)
-    first, second = np.diff(p.time[rows], axis=1).T
+    first_step, second_step = np.diff(p.time[rows], axis=1).T
     with np.errstate(invalid="ignore"):
         # of one person: a step from one track's end to the next one's beginning is nobody's
-        even = (owner[rows] == owner[rows[:, :1]]).all(1) & (first > 0) & (np.abs(second - first) < _EVEN * first)
+        is_even = (
+            (owner[rows] == owner[rows[:, :1]]).all(1)
+            & (first_step > 0)
+            & (np.abs(second_step - first_step) < _EVEN * first_step)
+        )
         # the sequence's own step: not one that skips frames
         step = np.full(int(owner.max()) + 1, np.inf)
-        np.minimum.at(step, owner[rows[even, 0]], first[even])
-        even &= first < (1 + _EVEN) * step[owner[rows[:, 0]]]
-    return rows[even & p.posed[rows].all(1)]
+        np.minimum.at(step, owner[rows[is_even, 0]], first_step[is_even])
+        is_even &= first_step < (1 + _EVEN) * step[owner[rows[:, 0]]]
+    return rows[is_even & p.posed[rows].all(1)]
 
 
 def _acceleration(p: Predictions, setting: Setting) -> Iterator[MetricRow]:

@@ -151,21 +151,27 @@ def write_poses(path: str | Path, predictions: dict[str, Predictions]) -> None:
         kind, shape = column.metadata["kind"], column.metadata["shape"]
         value = pa.string() if kind is str else pa.from_numpy_dtype(kind)
         types.append((column.name, pa.list_(value) if shape else value))
-    skeletons = {name: own.skeleton for name, own in predictions.items()}
-    about = {k: {"skeleton": of.name, "joints": of.joints, "parents": of.parents} for k, of in skeletons.items()}
+    skeletons = {name: people.skeleton for name, people in predictions.items()}
+    dataset_entries = {
+        k: {"skeleton": skeleton.name, "joints": skeleton.joints, "parents": skeleton.parents}
+        for k, skeleton in skeletons.items()
+    }
     schema = pa.schema(
         [*types, ("error_mm", pa.list_(pa.float32()))],
-        metadata={METADATA: json.dumps({"unit": "m", "datasets": about})},
+        metadata={METADATA: json.dumps({"unit": "m", "datasets": dataset_entries})},
     )
     with parquet.ParquetWriter(path, schema, compression="zstd", write_page_checksum=True) as writer:
-        for name, own in predictions.items():
-            values: dict[str, Any] = {"dataset": [name] * len(own), "error_mm": list(own.errors().astype(np.float32))}
+        for name, people in predictions.items():
+            values: dict[str, Any] = {
+                "dataset": [name] * len(people),
+                "error_mm": list(people.errors().astype(np.float32)),
+            }
             for column in _COLUMNS:
-                array = getattr(own, column.name)
+                array = getattr(people, column.name)
                 if column.metadata["shape"]:
-                    flat = array.reshape(len(own), -1)
-                    null = np.isnan(flat).all(1) & column.metadata["null"]
-                    array = [None if is_null else row for is_null, row in zip(null, flat, strict=True)]
+                    flat = array.reshape(len(people), -1)
+                    null_mask = np.isnan(flat).all(1) & column.metadata["null"]
+                    array = [None if is_null else row for is_null, row in zip(null_mask, flat, strict=True)]
                 values[column.name] = array
             writer.write_table(pa.Table.from_pydict(values, schema=schema))
 
@@ -176,12 +182,12 @@ def read_poses(path: str | Path) -> dict[str, Predictions]:
     data = read_bytes(path, expected="poses.parquet of an evaluation")
     try:
         table = parquet.read_table(pa.BufferReader(data), page_checksum_verification=True)
-        about = json.loads(table.schema.metadata[METADATA.encode()])["datasets"]
+        dataset_entries = json.loads(table.schema.metadata[METADATA.encode()])["datasets"]
         predictions = {}
-        for name, entry in about.items():
+        for name, entry in dataset_entries.items():
             joints, parents = tuple(entry["joints"]), tuple(entry["parents"])
-            own = table.filter(pa.compute.equal(table["dataset"], name)).to_pylist()
-            rows = [{key: value for key, value in row.items() if value is not None} for row in own]
+            records = table.filter(pa.compute.equal(table["dataset"], name)).to_pylist()
+            rows = [{key: value for key, value in row.items() if value is not None} for row in records]
             predictions[name] = stack(Skeleton(name=entry["skeleton"], joints=joints, parents=parents), rows)
         return predictions
     except (pa.ArrowException, KeyError, TypeError, ValueError, AttributeError) as error:

@@ -91,10 +91,10 @@ def check_protocol(protocol: str, dataset: EvalDataset) -> None:
         )
     if kind not in DAPT:
         raise InputError(f"the released code evaluates {', '.join(DAPT)}, not {kind}: use protocol clean for {name}")
-    if split_by != (wanted := DAPT[kind].split):
+    if split_by != (expected_split := DAPT[kind].split):
         raise InputError(
-            f"{name} was split by {split_by or 'nothing'}, the protocol dapt is by {wanted}: run lidarpose prepare "
-            f"{kind} RAW OUT --split-by {wanted} into another folder"
+            f"{name} was split by {split_by or 'nothing'}, the protocol dapt is by {expected_split}: run lidarpose "
+            f"prepare {kind} RAW OUT --split-by {expected_split} into another folder"
         )
 
 
@@ -161,8 +161,8 @@ class EvalSetup:
         cut, the dataset's own, if any."""
         sample, setting = person.sample, self.setting
         if setting.protocol == "dapt":
-            inside, _ = released_view(person.points, sample.joints, sample.centers, sample.box)
-            return person.points[inside], released_box(sample.joints, sample.centers, sample.box)
+            is_inside, _ = released_view(person.points, sample.joints, sample.centers, sample.box)
+            return person.points[is_inside], released_box(sample.joints, sample.centers, sample.box)
         if setting.kind in _OWN_CROP or setting.kind not in _CLEAN_CROPS or sample.box is None:
             return person.points, sample.box
         box = jittered(sample.box, np.random.default_rng([setting.seed, person.shard, person.row]))
@@ -170,25 +170,25 @@ class EvalSetup:
 
     def shown(self, person: EvalSample) -> tuple[EvalSample | None, str]:
         """The person as the protocol shows them; or None, and why it leaves them out."""
-        kind, least = self.setting.kind, 0
+        kind, min_points = self.setting.kind, 0
         if self.setting.protocol == "dapt":
-            center, least = DAPT[kind].center, DAPT[kind].least
+            center, min_points = DAPT[kind].center, DAPT[kind].least
             if center not in person.sample.centers:
                 return None, f"people without the center {center!r}"
             if kind == "humanm3" and (person.sample.joint_labels == UNLABELED).all():
                 return None, "people without a labelled joint, whom their box is made of"
         points, _ = self.crop(person)
-        if len(points) < least:
-            return None, f"people of under {least} points, as the released code skips them"
+        if len(points) < min_points:
+            return None, f"people of under {min_points} points, as the released code skips them"
         return replace(person, points=points), ""
 
     def predict(self, samples: Sequence[EvalSample]) -> Predictions:
         """What is known of people as the protocol shows them, and what the network answers."""
         answers: list[dict] = [{} for _ in samples]
         answer = self._predict_clean if self.setting.protocol == "clean" else self._predict_dapt
-        known = [person.sample.sensor_known and self.setting.sensor == "known" for person in samples]
+        sensors_known = [person.sample.sensor_known and self.setting.sensor == "known" for person in samples]
         for origin in (np.zeros(3), None):
-            rows = [k for k, is_known in enumerate(known) if is_known == (origin is not None)]
+            rows = [k for k, is_known in enumerate(sensors_known) if is_known == (origin is not None)]
             for k, values in zip(rows, answer([samples[k] for k in rows], origin) if rows else (), strict=True):
                 answers[k] = self._known(samples[k]) | values
         return stack(self.joints, answers)
@@ -217,9 +217,11 @@ class EvalSetup:
         if clips := self._clips(samples):
             batches = ((rows, {"clip": clip}) for rows, clip in clips["clips"].batches(batch))
         for rows, clip in batches:
-            some = [samples[row] for row in rows]
-            centers = np.stack([person.sample.centers[DAPT[self.setting.kind].center] for person in some])
-            estimates = model.outputs([person.points.astype(float) for person in some], centers, origin, **clip)
+            batch_samples = [samples[row] for row in rows]
+            centers = np.stack([person.sample.centers[DAPT[self.setting.kind].center] for person in batch_samples])
+            estimates = model.outputs(
+                [person.points.astype(float) for person in batch_samples], centers, origin, **clip
+            )
             for k, (row, center) in enumerate(zip(rows, centers, strict=True)):
                 values = self._picked(estimates, k)
                 values["pred"] = values["pred"] + center
@@ -236,33 +238,40 @@ class EvalSetup:
         sequence = person.sample.sequence
         if self._frames == 1 or self.dataset.limit is not None or samples[-1].sample.sequence != sequence:
             return True
-        own = [other.sample for other in samples if other.sample.sequence == sequence]
+        sequence_samples = [eval_sample.sample for eval_sample in samples if eval_sample.sample.sequence == sequence]
         # a track's last run may go on
-        last = {own[run[0]].track: len(run) for run in _runs(own)}
-        return all(length % self._frames == 0 for length in last.values())
+        last_lengths = {sequence_samples[run[0]].track: len(run) for run in _runs(sequence_samples)}
+        return all(length % self._frames == 0 for length in last_lengths.values())
 
     def _clips(self, samples: Sequence[EvalSample]) -> dict[str, Clips]:
         """What a network of clips reads besides clouds: which people are frames that follow each other; of people who
         are drawn from a dataset none, however few frames lie between them."""
         if self._frames == 1:
             return {}
-        own = [person.sample for person in samples]
-        runs = _runs(own) if self.dataset.limit is None else np.arange(len(own))[:, None]
-        around = {name: [getattr(sample, name) for sample in own] for name in ("background", "neighbors")}
-        around = {name: [np.zeros((0, 3)) if own is None else own for own in clouds] for name, clouds in around.items()}
-        return {"clips": Clips(windows=np.concatenate([clip_windows(run) for run in runs]), **around)}
+        labeled_samples = [person.sample for person in samples]
+        runs = _runs(labeled_samples) if self.dataset.limit is None else np.arange(len(labeled_samples))[:, None]
+        surroundings = {
+            name: [getattr(sample, name) for sample in labeled_samples] for name in ("background", "neighbors")
+        }
+        surroundings = {
+            name: [np.zeros((0, 3)) if cloud is None else cloud for cloud in clouds]
+            for name, clouds in surroundings.items()
+        }
+        return {"clips": Clips(windows=np.concatenate([clip_windows(run) for run in runs]), **surroundings)}
 
     def _picked(self, estimates, index) -> dict:
         """Of a pose, or of person `index` of many: the scored joints."""
-        pick = self.model.skeleton.map_to(self.joints)
-        stated = {name: getattr(estimates, name) for name in ("confidence", "spread", "visible")}
-        stated = {name: value[index][..., pick] for name, value in stated.items() if value is not None}
-        whole = {name: value[index] for name in PER_PERSON if (value := getattr(estimates, name)) is not None}
-        return stated | whole | {"pred": estimates.joints[index][..., pick, :]}
+        joint_indices = self.model.skeleton.map_to(self.joints)
+        joint_values = {name: getattr(estimates, name) for name in ("confidence", "spread", "visible")}
+        joint_values = {
+            name: value[index][..., joint_indices] for name, value in joint_values.items() if value is not None
+        }
+        person_values = {name: value[index] for name in PER_PERSON if (value := getattr(estimates, name)) is not None}
+        return joint_values | person_values | {"pred": estimates.joints[index][..., joint_indices, :]}
 
     def _known(self, person: EvalSample) -> dict[str, Any]:
         sample, box = person.sample, person.sample.box
-        pick = self.dataset.skeleton.map_to(self.joints)
+        joint_indices = self.dataset.skeleton.map_to(self.joints)
         return {
             **{
                 name: getattr(person, name)
@@ -273,8 +282,8 @@ class EvalSetup:
             "hidden": 1 - person.info.visible,
             "points": len(person.points),
             "box": None if box is None else [*box.center, *box.size, box.yaw],
-            "true": sample.joints[pick],
-            "labels": sample.joint_labels[pick],
+            "true": sample.joints[joint_indices],
+            "labels": sample.joint_labels[joint_indices],
         }
 
 
@@ -293,30 +302,35 @@ def eval_setup(
     check_protocol(protocol, dataset)
     if protocol == "dapt" and model.model.get("tta", 1) > 1:
         raise InputError("the protocol dapt predicts each person once, as the released code does: leave tta out")
-    wanted = dataset.scored
+    target_skeleton = dataset.scored
     if skeleton is not None:
-        wanted = skeleton_of(skeleton)
-        if missing := [name for name in wanted.joints if name not in dataset.skeleton.joints]:
+        target_skeleton = skeleton_of(skeleton)
+        if missing_joints := [name for name in target_skeleton.joints if name not in dataset.skeleton.joints]:
             raise InputError(
-                f"{dataset.name} has no {', '.join(missing)}, which {wanted.name} asks for: its joints are "
-                f"{dataset.skeleton.name}"
+                f"{dataset.name} has no {', '.join(missing_joints)}, which {target_skeleton.name} asks for: its joints "
+                f"are {dataset.skeleton.name}"
             )
-    own, without = model.skeleton.joints, DAPT[dataset.kind].without if protocol == "dapt" else ()
-    shared = tuple(name for name in wanted.joints if name in own and name not in without)
-    if not shared:
+    network_joints, excluded_joints = model.skeleton.joints, DAPT[dataset.kind].without if protocol == "dapt" else ()
+    scored_joints = tuple(
+        name for name in target_skeleton.joints if name in network_joints and name not in excluded_joints
+    )
+    if not scored_joints:
         raise InputError(
-            f"{dataset.name} has the joints {', '.join(wanted.joints)}, the network {', '.join(own)}: none in common"
+            f"{dataset.name} has the joints {', '.join(target_skeleton.joints)}, the network "
+            f"{', '.join(network_joints)}: none in common"
         )
     reasons = {
-        "the network has no": [name for name in wanted.joints if name not in own],
-        "the released means leave out": [name for name in wanted.joints if name in own and name in without],
+        "the network has no": [name for name in target_skeleton.joints if name not in network_joints],
+        "the released means leave out": [
+            name for name in target_skeleton.joints if name in network_joints and name in excluded_joints
+        ],
     }
     fields = ("split", "split_source", "leaks", "total", "limit", "clusters", "kind")
     setting = Setting(
         dataset=dataset.name,
         method=str(model.model["name"]),
         protocol=protocol,
-        joints=shared,
+        joints=scored_joints,
         not_judged="; ".join(f"{reason} {', '.join(names)}" for reason, names in reasons.items() if names),
         sensor="unknown" if sensor_unknown else "known",
         seed=seed,
@@ -324,21 +338,21 @@ def eval_setup(
         crop=DAPT[dataset.kind].crop if protocol == "dapt" else _CLEAN_CROPS.get(dataset.kind, _UNBOXED),
         **{name: getattr(dataset, name) for name in fields},
     )
-    return EvalSetup(model=model, dataset=dataset, setting=setting, joints=_subset(wanted, shared))
+    return EvalSetup(model=model, dataset=dataset, setting=setting, joints=_subset(target_skeleton, scored_joints))
 
 
-def _subset(of: Skeleton, joints: Sequence[str]) -> Skeleton:
+def _subset(skeleton: Skeleton, joints: Sequence[str]) -> Skeleton:
     """A skeleton of some joints of another, in its order; each hangs on the nearest of its ancestors that is left, or
     on the first."""
-    if tuple(joints) == of.joints:
-        return of
+    if tuple(joints) == skeleton.joints:
+        return skeleton
     parents: list[int] = []
     for name in joints:
-        parent = of.parents[of.index(name)]
-        while parent >= 0 and of.joints[parent] not in joints:
-            parent = of.parents[parent]
-        parents.append(joints.index(of.joints[parent]) if parent >= 0 else min(len(parents), 1) - 1)
-    return Skeleton(name=f"{len(joints)} joints of {of.name}", joints=tuple(joints), parents=tuple(parents))
+        parent = skeleton.parents[skeleton.index(name)]
+        while parent >= 0 and skeleton.joints[parent] not in joints:
+            parent = skeleton.parents[parent]
+        parents.append(joints.index(skeleton.joints[parent]) if parent >= 0 else min(len(parents), 1) - 1)
+    return Skeleton(name=f"{len(joints)} joints of {skeleton.name}", joints=tuple(joints), parents=tuple(parents))
 
 
 def _runs(samples: Sequence[LabeledSample]) -> list[np.ndarray]:

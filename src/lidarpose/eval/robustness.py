@@ -71,15 +71,15 @@ def behind_an_edge(points: np.ndarray, box: Box | None, amount: float, rng: np.r
     """All but what lies behind one straight edge of something opaque, which hides a share `amount` of the points: the
     end of a wall, a parapet, a car. The edge is straight as seen from the origin and has any direction."""
     angle = rng.uniform(0, 2 * np.pi)
-    middle = points.mean(0)
+    center = points.mean(0)
     # seen from the sensor: to the left and up, as tangents of angles from the middle of the points
-    forward = np.array([middle[0], middle[1], 0]) / max(np.hypot(middle[0], middle[1]), 1e-6)
+    forward = np.array([center[0], center[1], 0]) / max(np.hypot(center[0], center[1]), 1e-6)
     depth = np.maximum(points @ forward, 1e-3)
     left = points @ np.array([-forward[1], forward[0], 0]) / depth
-    along = np.cos(angle) * left + np.sin(angle) * points[:, 2] / depth
-    visible = np.ones(len(points), bool)
-    visible[np.argsort(along, kind="stable")[: int(round(amount * len(points)))]] = False
-    return points[visible]
+    coordinate = np.cos(angle) * left + np.sin(angle) * points[:, 2] / depth
+    is_visible = np.ones(len(points), bool)
+    is_visible[np.argsort(coordinate, kind="stable")[: int(round(amount * len(points)))]] = False
+    return points[is_visible]
 
 
 def box_moved(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
@@ -89,8 +89,8 @@ def box_moved(points: np.ndarray, box: Box | None, amount: float, rng: np.random
         low, high = points.min(0) - _MARGIN, points.max(0) + _MARGIN
         box = Box(center=(low + high) / 2, size=high - low)
     angle = rng.uniform(0, 2 * np.pi)
-    moved = replace(box, center=box.center + amount * np.array([np.cos(angle), np.sin(angle), 0]))
-    return points[moved.contains(points)]
+    moved_box = replace(box, center=box.center + amount * np.array([np.cos(angle), np.sin(angle), 0]))
+    return points[moved_box.contains(points)]
 
 
 def out_of_level(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
@@ -231,16 +231,16 @@ def people_to_perturb(setup: EvalSetup) -> list[CroppedPerson]:
     """Of lidarpose-bench its clean people, of other datasets at most `PEOPLE`, evenly spread. Raises InputError where
     nobody has a point."""
     if setup.setting.kind == BENCH:
-        chosen = [person for person in setup.dataset if person.condition == _CLEAN and not person.moving]
+        samples = [person for person in setup.dataset if person.condition == _CLEAN and not person.moving]
     else:
         rows = set(spread(setup.dataset.count, PEOPLE).tolist())
-        chosen = [person for k, person in enumerate(setup.dataset) if k in rows]
+        samples = [person for k, person in enumerate(setup.dataset) if k in rows]
     # who is not scored is not perturbed either
-    shown = [(setup.shown(person)[0], person) for person in chosen]
+    pairs = [(setup.shown(person)[0], person) for person in samples]
     people = [
-        CroppedPerson(shown=cropped, whole=person, box=setup.crop(person)[1])
-        for cropped, person in shown
-        if cropped is not None and len(cropped.points)
+        CroppedPerson(shown=crop, whole=person, box=setup.crop(person)[1])
+        for crop, person in pairs
+        if crop is not None and len(crop.points)
     ]
     if not people:
         raise InputError(f"none of the {_who(setup)} has a point to perturb: score more people, or leave stability out")
@@ -264,23 +264,23 @@ def study(
     if setup.dataset.count > PEOPLE:
         # a draw of it, as by a limit
         setup = replace(setup, dataset=replace(setup.dataset, limit=PEOPLE))
-    done = 0
+    num_predicted = 0
 
     def advance(count: int) -> None:
-        nonlocal done
-        progress(done := done + count, 0)
+        nonlocal num_predicted
+        progress(num_predicted := num_predicted + count, 0)
 
     advance(0)
-    unperturbed = setup.predict([person.shown for person in people])
-    base = unperturbed.errors()
-    first = _point(unperturbed, base, 0.0, "0", setup.setting)
+    base_predictions = setup.predict([person.shown for person in people])
+    base_errors = base_predictions.errors()
+    base_point = _point(base_predictions, base_errors, 0.0, "0", setup.setting)
     curves = []
     for name, perturbation in PERTURBATIONS.items():
-        points = [first]
+        points = [base_point]
         for amount in perturbation.amounts:
-            perturbed = setup.predict([_perturbed(setup, person, name, amount) for person in people])
+            perturbed_predictions = setup.predict([_perturbed(setup, person, name, amount) for person in people])
             label = f"{amount * perturbation.scale:.4g}"
-            points.append(_point(perturbed, base, amount, label, setup.setting))
+            points.append(_point(perturbed_predictions, base_errors, amount, label, setup.setting))
             advance(len(people))
         curves.append(Curve(name=name, title=perturbation.title, says=perturbation.says, points=tuple(points)))
     notes = []
@@ -300,19 +300,19 @@ def end_errors(predictions: Predictions) -> tuple[End, ...]:
     worst 30 %."""
     table = predictions.select(~predictions.moving & predictions.posed).errors()
     table = table[~np.isnan(table).all(1)]
-    worst = min(WORST, int(np.ceil(WORST_SHARE * len(table))))
-    table = table[np.argsort(-np.nanmean(table, 1), kind="stable")[:worst]]
+    num_worst = min(WORST, int(np.ceil(WORST_SHARE * len(table))))
+    table = table[np.argsort(-np.nanmean(table, 1), kind="stable")[:num_worst]]
     groups = joint_groups(predictions.skeleton)
     ends = []
     for name in ENDS:
         errors = table[:, groups.get(name, [])]
-        labeled = ~np.isnan(errors)
-        if labeled.any():
-            own = errors[labeled]
-            values = {"mean": float(own.mean()), "deviation": float(own.std())}
-            quartiles = tuple(np.quantile(own, [0.25, 0.5, 0.75]).tolist())
-            people = int(labeled.any(1).sum())
-            ends.append(End(group=name, **values, quartiles=quartiles, people=people, worst=worst))
+        is_labeled = ~np.isnan(errors)
+        if is_labeled.any():
+            group_errors = errors[is_labeled]
+            values = {"mean": float(group_errors.mean()), "deviation": float(group_errors.std())}
+            quartiles = tuple(np.quantile(group_errors, [0.25, 0.5, 0.75]).tolist())
+            people = int(is_labeled.any(1).sum())
+            ends.append(End(group=name, **values, quartiles=quartiles, people=people, worst=num_worst))
     return tuple(ends)
 
 
@@ -321,13 +321,13 @@ def _who(setup: EvalSetup) -> str:
 
 
 def _perturbed(setup: EvalSetup, person: CroppedPerson, name: str, amount: float) -> EvalSample:
-    shown, sample = person.shown, person.shown.sample
-    seed = [setup.setting.seed, zlib.crc32(name.encode()), shown.shard, shown.row]
+    eval_sample, sample = person.shown, person.shown.sample
+    seed = [setup.setting.seed, zlib.crc32(name.encode()), eval_sample.shard, eval_sample.row]
     # a displaced box may let in what the dataset holds around the person
-    points = (person.whole if name == "crop" else shown).points.astype(float)
+    points = (person.whole if name == "crop" else eval_sample).points.astype(float)
 
-    def apply(places: np.ndarray) -> np.ndarray:
-        return PERTURBATIONS[name].apply(places, person.box, amount, np.random.default_rng(seed))
+    def apply(positions: np.ndarray) -> np.ndarray:
+        return PERTURBATIONS[name].apply(positions, person.box, amount, np.random.default_rng(seed))
 
     if PERTURBATIONS[name].rigid:
         sample = replace(
@@ -336,26 +336,28 @@ def _perturbed(setup: EvalSetup, person: CroppedPerson, name: str, amount: float
             box=sample.box and replace(sample.box, center=apply(sample.box.center)),
             centers={name: apply(center) for name, center in sample.centers.items()},
         )
-    return replace(shown, points=apply(points), sample=sample)
+    return replace(eval_sample, points=apply(points), sample=sample)
 
 
-def _point(predictions: Predictions, base: np.ndarray, amount: float, label: str, setting: Setting) -> Point:
-    """One amount's point; base (n, J) mm: the errors of the same people unperturbed."""
+def _point(predictions: Predictions, base_errors: np.ndarray, amount: float, label: str, setting: Setting) -> Point:
+    """One amount's point; base_errors (n, J) mm: the errors of the same people unperturbed."""
     rng = np.random.default_rng([zlib.crc32(label.encode()), setting.seed])
     clusters = predictions.sequence if setting.clusters else None
     # NaN without a label, a row of NaN without a pose
     errors = predictions.errors()
-    both = ~np.isnan(errors) & ~np.isnan(base)
-    first, second = np.where(both, errors, np.nan), np.where(both, base, np.nan)
+    has_both = ~np.isnan(errors) & ~np.isnan(base_errors)
+    paired_errors, paired_base = np.where(has_both, errors, np.nan), np.where(has_both, base_errors, np.nan)
     low, high = interval(errors, rng, clusters=clusters, repeats=_REPEATS).stated
-    increase_low, increase_high = paired_interval(first, second, rng, clusters=clusters, repeats=_REPEATS).stated
+    increase_low, increase_high = paired_interval(
+        paired_errors, paired_base, rng, clusters=clusters, repeats=_REPEATS
+    ).stated
     return Point(
         amount=amount,
         label=label,
         mpjpe=number(mean(errors)),
         low=low,
         high=high,
-        increase=number(mean(first - second)),
+        increase=number(mean(paired_errors - paired_base)),
         increase_low=increase_low,
         increase_high=increase_high,
         people=len(errors),
@@ -392,7 +394,7 @@ def _sensor_curve(setup: EvalSetup, advance: Callable[[int], None]) -> Curve:
 def _simulated(sample, setup: EvalSetup, shard: int, row: int) -> EvalSample:
     """A simulated sample with the joints of the evaluated dataset, all of them seen."""
     skeleton = setup.dataset.skeleton
-    labeled = LabeledSample(
+    labeled_sample = LabeledSample(
         points=sample.points,
         center=sample.center,
         pose=Pose(joints=sample.pose.joints[BODY26.map_to(skeleton)], skeleton=skeleton),
@@ -400,4 +402,4 @@ def _simulated(sample, setup: EvalSetup, shard: int, row: int) -> EvalSample:
         joint_labels=np.full(len(skeleton), SEEN, np.uint8),
         sequence=str(row),
     )
-    return EvalSample(sample=labeled, points=sample.points, shard=shard, row=row)
+    return EvalSample(sample=labeled_sample, points=sample.points, shard=shard, row=row)

@@ -58,32 +58,32 @@ def evaluate_dataset(
     dataset, setting = setup.dataset, setup.setting
     parts: list[Predictions] = []
     worst: list[tuple[float, int, EvalSample]] = []
-    people = unknown = 0
+    num_people = num_unknown = 0
     progress(0, dataset.count)
     for chunk in _chunks(setup):
-        predicted = setup.predict(chunk)
-        errors = predicted.errors()
-        for k in np.flatnonzero(~np.isnan(errors).all(1) & ~predicted.moving).tolist():
-            worst.append((float(np.nanmean(errors[k])), people + k, chunk[k]))
+        chunk_predictions = setup.predict(chunk)
+        errors = chunk_predictions.errors()
+        for k in np.flatnonzero(~np.isnan(errors).all(1) & ~chunk_predictions.moving).tolist():
+            worst.append((float(np.nanmean(errors[k])), num_people + k, chunk[k]))
         # the points of the worst people alone are kept
         worst = sorted(worst, key=lambda entry: (-entry[0], entry[1]))[:WORST]
-        parts.append(predicted)
-        people += len(chunk)
-        unknown += sum(not person.sample.sensor_known for person in chunk)
-        progress(people, dataset.count)
+        parts.append(chunk_predictions)
+        num_people += len(chunk)
+        num_unknown += sum(not person.sample.sensor_known for person in chunk)
+        progress(num_people, dataset.count)
     if not parts:
-        left = "; ".join(f"{reason}: {entry['first']}" for reason, entry in dataset.skipped.items())
-        raise InputError(f"nobody of {dataset.name} could be scored ({left})")
+        reasons = "; ".join(f"{reason}: {entry['first']}" for reason, entry in dataset.skipped.items())
+        raise InputError(f"nobody of {dataset.name} could be scored ({reasons})")
     predictions = concatenate(parts)
-    if setting.sensor == "known" and unknown:
-        setting = replace(setting, sensor="unknown" if unknown == people else "of some people")
+    if setting.sensor == "known" and num_unknown:
+        setting = replace(setting, sensor="unknown" if num_unknown == num_people else "of some people")
     lines = metric_rows(predictions, setting, dapt_compat=dapt_compat)
     if dataset.bench is not None:
         lines += _baselines(dataset.bench, predictions, setting)
         lines += _person_rows(setup, dataset.bench, predictions, setting)
-    alone = ~predictions.moving
-    counts = {"people": int(alone.sum()), "frames of clips": int((~alone).sum())}
-    counts["without a pose"] = int((~predictions.posed & alone).sum())
+    is_alone = ~predictions.moving
+    counts = {"people": int(is_alone.sum()), "frames of clips": int((~is_alone).sum())}
+    counts["without a pose"] = int((~predictions.posed & is_alone).sum())
     skipped = {reason: dict(entry) for reason, entry in dataset.skipped.items()}
     notes = tuple(_notes(setup, setting, predictions))
     result = Result(setting=setting, counts=counts, skipped=skipped, notes=notes, lines=lines)
@@ -105,37 +105,37 @@ def _chunks(setup: EvalSetup) -> Iterator[list[EvalSample]]:
 def _shown(setup: EvalSetup) -> Iterator[EvalSample]:
     """The people as the protocol shows them; who has nothing to show is counted."""
     for person in setup.dataset:
-        shown, reason = setup.shown(person)
-        if shown is None:
+        cropped_person, reason = setup.shown(person)
+        if cropped_person is None:
             where = f"{person.sample.sequence}, frame {person.sample.frame}, track {person.sample.track}"
             count_skipped(setup.dataset.skipped, reason, where)
         else:
-            yield shown
+            yield cropped_person
 
 
 def _baselines(bench: Bench, predictions: Predictions, setting: Setting) -> tuple[MetricRow, ...]:
     """What knows no points, scored on the same people."""
-    pick = BODY26.map_to(predictions.skeleton)
-    unstated = np.full_like(predictions.confidence, np.nan)
+    joint_indices = BODY26.map_to(predictions.skeleton)
+    nan_values = np.full_like(predictions.confidence, np.nan)
     rows: tuple[MetricRow, ...] = ()
     for name, joints in mean_poses(bench).items():
-        pred = joints[predictions.row][:, pick].astype(np.float32)
-        baseline = replace(predictions, pred=pred, confidence=unstated, spread=unstated, visible=unstated)
+        pred = joints[predictions.row][:, joint_indices].astype(np.float32)
+        baseline = replace(predictions, pred=pred, confidence=nan_values, spread=nan_values, visible=nan_values)
         rows += baseline_rows(baseline, replace(setting, method=f"{BASELINE}{name}"))
     return rows
 
 
 def _person_rows(setup: EvalSetup, bench: Bench, predictions: Predictions, setting: Setting) -> tuple[MetricRow, ...]:
     """Of a network that says whether a crop shows a person, where the set has objects too."""
-    alone = predictions.select(~predictions.moving)
-    if not len(bench.objects) or np.isnan(alone.person).all():
+    people = predictions.select(~predictions.moving)
+    if not len(bench.objects) or np.isnan(people.person).all():
         return ()
     model, origin = setup.model, np.zeros(3) if setting.sensor == "known" else None
     clouds = [bench.points[row] for row in bench.objects]
     answers = model.predict(clouds, sensor_origin=origin, skeleton=model.skeleton.name)
     # what no pose is found in is no person
     objects = np.array([0.0 if answer.person is None else answer.person for answer in answers])
-    return tuple(person_rows(alone, objects, bench.columns["others"][alone.row], setting))
+    return tuple(person_rows(people, objects, bench.columns["others"][people.row], setting))
 
 
 def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iterator[str]:
@@ -154,8 +154,11 @@ def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iter
         yield "joints that are labeled as hidden count, but in PEM; people are predicted in their labeled boxes"
     sequences = len(np.unique(predictions.sequence[~predictions.moving]))
     if setting.clusters and sequences < aggregate.LEAST_UNITS:
-        few = "one sequence alone" if sequences == 1 else f"{sequences} sequences alone"
-        yield f"{few}: no intervals, which take {aggregate.LEAST_UNITS}, since frames of a sequence are not independent"
+        sequence_count = "one sequence alone" if sequences == 1 else f"{sequences} sequences alone"
+        yield (
+            f"{sequence_count}: no intervals, which take {aggregate.LEAST_UNITS}, since frames of a sequence are not "
+            "independent"
+        )
     if setting.kind == BENCH:
         yield "baselines use no points: the mean skeleton about the points' center, with the true facing or one for all"
 
@@ -172,12 +175,14 @@ def _notes_of_run(run: dict, dataset: EvalDataset) -> Iterator[str]:
             yield f"the network was trained on split {split} of {dataset.name}: it knows who it is scored on"
         elif dataset.split == "val" and "validation_mm" in run:
             yield "the network's run was validated on this split: its best.safetensors was selected on these people"
-    made = dataset.settings if dataset.kind == "synth" else {}
-    synthesized = recipe["mix"] if "mix" in recipe else not recipe.get("shards")
-    alike = made.get("what") == "people" and all(made.get(name) == recipe.get(name) for name in ("seed", "scene"))
-    if synthesized and alike:
-        who = f"synthesized people of seed {made['seed']}, as these are: they may be the very same"
-        yield f"the network was trained on {who}; make others by lidarpose synth --seed"
+    settings = dataset.settings if dataset.kind == "synth" else {}
+    is_synthetic = recipe["mix"] if "mix" in recipe else not recipe.get("shards")
+    has_same_settings = settings.get("what") == "people" and all(
+        settings.get(name) == recipe.get(name) for name in ("seed", "scene")
+    )
+    if is_synthetic and has_same_settings:
+        people = f"synthesized people of seed {settings['seed']}, as these are: they may be the very same"
+        yield f"the network was trained on {people}; make others by lidarpose synth --seed"
 
 
 # ---- all of one call
@@ -240,19 +245,19 @@ def run(
     Raises:
         InputError: one line, for what does not fit. MissingExtra: without pyarrow.
     """
-    opened = _opened(datasets, split, limit)
+    eval_datasets = _opened(datasets, split, limit)
     predictor, weights = _loaded(model, device=device, backend=backend, decode=decode, tta=tta)
     options: dict[str, Any] = {"protocol": protocol, "seed": seed, "skeleton": skeleton}
-    setups = [eval_setup(predictor, dataset, sensor_unknown=sensor_unknown, **options) for dataset in opened]
-    perturbed = [people_to_perturb(setup) if stability else None for setup in setups]
+    setups = [eval_setup(predictor, dataset, sensor_unknown=sensor_unknown, **options) for dataset in eval_datasets]
+    perturbed_people = [people_to_perturb(setup) if stability else None for setup in setups]
     progress = progress or (lambda dataset, done, total: None)
     evaluations, studies = [], []
-    for setup, people in zip(setups, perturbed, strict=True):
+    for setup, people in zip(setups, perturbed_people, strict=True):
         name, legacy = setup.dataset.name, dapt_compat or legacy
         evaluations.append(evaluate_dataset(setup, dapt_compat=legacy, progress=partial(progress, name)))
         if people is not None:
-            shown = partial(progress, f"{name}, perturbed")
-            studies.append(study(setup, evaluations[-1].predictions, people=people, progress=shown))
+            study_progress = partial(progress, f"{name}, perturbed")
+            studies.append(study(setup, evaluations[-1].predictions, people=people, progress=study_progress))
     results = tuple(evaluation.result for evaluation in evaluations)
     scores = Scores(weights=weights, command=command, seed=setups[0].setting.seed, results=results)
     return Run(scores=scores, evaluations=tuple(evaluations), studies=tuple(studies))
@@ -263,11 +268,11 @@ def _opened(datasets: str | os.PathLike | Sequence[str | os.PathLike], split, li
     if not datasets:
         raise InputError("expected a dataset to evaluate on: a folder that lidarpose prepare or synth wrote, or bench")
     pyarrow()
-    opened = [open_eval_dataset(dataset, split=split, limit=limit) for dataset in datasets]
-    names = [dataset.name for dataset in opened]
-    if twice := next((name for name in names if names.count(name) > 1), None):
-        raise InputError(f"two datasets are called {twice}: evaluate them one by one, or rename a folder")
-    return opened
+    eval_datasets = [open_eval_dataset(dataset, split=split, limit=limit) for dataset in datasets]
+    names = [dataset.name for dataset in eval_datasets]
+    if duplicate := next((name for name in names if names.count(name) > 1), None):
+        raise InputError(f"two datasets are called {duplicate}: evaluate them one by one, or rename a folder")
+    return eval_datasets
 
 
 def _loaded(model: Model | str | os.PathLike, **options: Any) -> tuple[Model, dict[str, Any]]:
@@ -329,8 +334,8 @@ def write(run: Run, folder: str | os.PathLike) -> list[Path]:
         name = evaluation.result.setting.dataset
         files[f"{name}-errors.png"] = charts.draw_errors(evaluation.result)
         files[f"{name}-reliability.png"] = charts.draw_reliability(evaluation.predictions, evaluation.result)
-        shown = (evaluation.predictions, evaluation.result.setting, evaluation.worst)
-        files[f"{name}-worst.png"] = evaluation.worst and charts.draw_worst(*shown)
+        arguments = (evaluation.predictions, evaluation.result.setting, evaluation.worst)
+        files[f"{name}-worst.png"] = evaluation.worst and charts.draw_worst(*arguments)
     for stability in run.studies:
         files[f"{stability.setting.dataset}-stability.png"] = charts.draw_stability(stability)
     if run.studies:

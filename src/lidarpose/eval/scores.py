@@ -57,10 +57,10 @@ class Setting:
     def summary(self) -> str:
         """Protocol, centering, split and limit in a few words: "clean · points alone · split test"."""
         split = "no split" if self.split == "none" else f"split {self.split}{', leaks' if self.leaks else ''}"
-        words = [self.protocol, self.centring, split]
+        parts = [self.protocol, self.centring, split]
         if self.limit is not None:
-            words.append(f"{self.limit:,} of {self.total:,} people")
-        return " · ".join(words)
+            parts.append(f"{self.limit:,} of {self.total:,} people")
+        return " · ".join(parts)
 
     # the name until 0.2
     told = summary
@@ -110,12 +110,12 @@ class Result:
     def line(self, figure: str, group: str = "all", of: str = "all", **more: str) -> MetricRow:
         """The row of a metric, of the network itself unless `method` or `arithmetic` say otherwise. Raises InputError
         where there is none."""
-        wanted = {"method": self.setting.method, "arithmetic": OURS} | more
-        wanted |= {"figure": figure, "group": group, "of": of}
+        keys = {"method": self.setting.method, "arithmetic": OURS} | more
+        keys |= {"figure": figure, "group": group, "of": of}
         for row in self.lines:
-            if all(getattr(row, name) == value for name, value in wanted.items()):
+            if all(getattr(row, name) == value for name, value in keys.items()):
                 return row
-        raise InputError(f"{self.setting.dataset} has no line {', '.join(map(str, wanted.values()))}")
+        raise InputError(f"{self.setting.dataset} has no line {', '.join(map(str, keys.values()))}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -239,23 +239,25 @@ def _entries(path: str, scores: Scores) -> Iterator[dict[str, Any]]:
     digest = scores.weights.get("digest") or None
     for result in scores.results:
         setting = result.setting
-        overall = [row for row in result.lines if (row.group, row.of) == ("all", "all")]
+        overall_rows = [row for row in result.lines if (row.group, row.of) == ("all", "all")]
         for method, arithmetic in dict.fromkeys((row.method, row.arithmetic) for row in result.lines):
-            values = {row.figure: row.value for row in overall if (row.method, row.arithmetic) == (method, arithmetic)}
-            own = method == setting.method
-            words = [
+            values = {
+                row.figure: row.value for row in overall_rows if (row.method, row.arithmetic) == (method, arithmetic)
+            }
+            is_network = method == setting.method
+            note_parts = [
                 *_setting_words(result),
                 "arithmetic of the released code, faults included" if arithmetic == RELEASED else "",
-                "uses no points" if not own else f"weights {digest[:12]}" if digest else "",
+                "uses no points" if not is_network else f"weights {digest[:12]}" if digest else "",
                 path,
             ]
             yield {
                 "row": method if arithmetic == OURS else f"{method}, released arithmetic",
                 **{name: getattr(setting, name) for name in ("kind", "dataset", "protocol")},
                 "figures": {name: values.get(name) for name in COLUMNS},
-                "note": "; ".join(filter(None, words)),
+                "note": "; ".join(filter(None, note_parts)),
                 "path": path,
-                "weights": digest if own else None,
+                "weights": digest if is_network else None,
             }
 
 
@@ -264,17 +266,17 @@ def _setting_words(result: Result) -> Iterator[str]:
     split = setting.split
     if split != "none" and setting.split_source:
         split += f" ({setting.split_source})"
-    limited = "" if setting.limit is None else f", evenly picked from {setting.total:,}"
-    left_out = sum(entry["count"] for reason, entry in result.skipped.items() if reason.startswith("people"))
+    limit_text = "" if setting.limit is None else f", evenly picked from {setting.total:,}"
+    num_left_out = sum(entry["count"] for reason, entry in result.skipped.items() if reason.startswith("people"))
     yield f"{setting.dataset}: protocol {setting.protocol}"
     yield f"center: {setting.centring}"
     yield f"crop: {setting.crop}"
     yield f"split: {split}{', which leaks: ' + setting.leaks if setting.leaks else ''}"
-    yield f"{result.counts['people']:,} people{limited}"
+    yield f"{result.counts['people']:,} people{limit_text}"
     yield f"{len(setting.joints)} joints{' (' + setting.not_judged + ')' if setting.not_judged else ''}"
     yield "" if setting.sensor == "known" else f"sensor position {setting.sensor}"
     yield f"{no_pose:,} without a pose, not counted" if no_pose else ""
-    yield f"{left_out:,} left out" if left_out else ""
+    yield f"{num_left_out:,} left out" if num_left_out else ""
 
 
 def _markdown(entries: list[dict[str, Any]]) -> str:
@@ -286,20 +288,24 @@ def _markdown(entries: list[dict[str, Any]]) -> str:
             notes.append(note)
         return f"[{notes.index(note) + 1}]"
 
-    titles = {kind: about["title"] for kind, about in paper["datasets"].items()}
-    marked = {k: f"{titles[k]} {mark(f'{titles[k]}: ' + about['protocol'])}" for k, about in paper["datasets"].items()}
+    titles = {kind: info["title"] for kind, info in paper["datasets"].items()}
+    marked_titles = {
+        k: f"{titles[k]} {mark(f'{titles[k]}: ' + info['protocol'])}" for k, info in paper["datasets"].items()
+    }
     rows = []
     for method in paper["methods"]:
         name = method["method"]
-        cells = {(kind, m): f"{value:.2f}" for kind, own in method["figures"].items() for m, value in own.items()}
+        cells = {
+            (kind, m): f"{value:.2f}" for kind, figures in method["figures"].items() for m, value in figures.items()
+        }
         rows.append((f"{name} {mark(name + ': ' + method['protocol'])}" if method["protocol"] else name, cells))
-    lines = [f"**Published**: {paper['source']}; {paper['note']}", "", *_grid(marked, rows)]
+    lines = [f"**Published**: {paper['source']}; {paper['note']}", "", *_grid(marked_titles, rows)]
     for protocol, title in _BLOCKS.items():
-        if own := [entry for entry in entries if entry["protocol"] == protocol and entry["kind"] in titles]:
-            lines += ["", f"**{title}.**", "", *_grid(titles, _rows(own, "kind", mark))]
-    if others := [entry for entry in entries if entry["kind"] not in titles]:
-        columns = {entry["dataset"]: entry["dataset"] for entry in others}
-        lines += ["", f"**{_OTHERS}.**", "", *_grid(columns, _rows(others, "dataset", mark))]
+        if block_entries := [entry for entry in entries if entry["protocol"] == protocol and entry["kind"] in titles]:
+            lines += ["", f"**{title}.**", "", *_grid(titles, _rows(block_entries, "kind", mark))]
+    if other_entries := [entry for entry in entries if entry["kind"] not in titles]:
+        columns = {entry["dataset"]: entry["dataset"] for entry in other_entries}
+        lines += ["", f"**{_OTHERS}.**", "", *_grid(columns, _rows(other_entries, "dataset", mark))]
     lines += ["", "mm and percent; lower MPJPE and higher PCK are better.", ""]
     return "\n".join([*lines, *(f"[{k}] {note}  " for k, note in enumerate(notes, 1))]) + "\n"
 
@@ -310,7 +316,7 @@ def _rows(entries: list[dict[str, Any]], by: str, mark: Callable[[str], str]) ->
     rows: list[tuple[tuple[str, str | None], dict]] = []
     for entry in entries:
         key, column = (entry["row"].replace(BASELINE, "baseline: "), entry["weights"]), entry[by]
-        cells = next((cells for own, cells in rows if own == key and (column, "mpjpe") not in cells), None)
+        cells = next((cells for row_key, cells in rows if row_key == key and (column, "mpjpe") not in cells), None)
         if cells is None:
             rows.append((key, cells := {}))
         for name, value in entry["figures"].items():

@@ -115,13 +115,13 @@ def exported_beside(path: str | os.PathLike, *, threads: int | None = None) -> O
     header = read_header(path)
     if header.network != "pose":
         raise file_error(path, "a network of the paper does not run as ONNX: leave backend away, or say torch")
-    beside = path.with_suffix(".onnx")
-    make = f"make it with `lidarpose export {path} --out {beside}`, or use backend torch"
-    if not beside.is_file():
-        raise file_error(path, f"ONNX Runtime needs {beside.name} beside it, which does not exist: {make}")
-    backend = OnnxBackend(beside, threads=threads)
+    onnx_path = path.with_suffix(".onnx")
+    hint = f"make it with `lidarpose export {path} --out {onnx_path}`, or use backend torch"
+    if not onnx_path.is_file():
+        raise file_error(path, f"ONNX Runtime needs {onnx_path.name} beside it, which does not exist: {hint}")
+    backend = OnnxBackend(onnx_path, threads=threads)
     if backend.source != content_digest(path, expected="a checkpoint"):
-        raise file_error(beside, f"made from other weights than {path.name} beside it: {make}")
+        raise file_error(onnx_path, f"made from other weights than {path.name} beside it: {hint}")
     return backend
 
 
@@ -142,7 +142,7 @@ def estimates(raw: Raw, decoder: Decoder, skeleton: Skeleton) -> Pose:
     spread = None if raw.log_spread is None else np.exp(np.minimum(raw.log_spread.astype(float), _LARGEST_LOG_SPREAD))
     if confidence is None and raw.heatmaps is not None:
         confidence, spread = _from_heatmaps(raw, raw.heatmaps, joints - raw.vote)
-    of_person = {} if raw.person is None else dict(zip(PER_PERSON, sigmoid(raw.person).T, strict=True))
+    per_person = {} if raw.person is None else dict(zip(PER_PERSON, sigmoid(raw.person).T, strict=True))
     return Pose(
         joints=joints,
         skeleton=skeleton,
@@ -150,7 +150,7 @@ def estimates(raw: Raw, decoder: Decoder, skeleton: Skeleton) -> Pose:
         spread=spread,
         visible=None if raw.visible is None else sigmoid(raw.visible),
         in_range=in_range,
-        **of_person,
+        **per_person,
     )
 
 
@@ -160,11 +160,11 @@ def _from_heatmaps(raw: Raw, heatmaps: tuple[np.ndarray, ...], offset: np.ndarra
     Confidence is the share of the heatmaps within `CONFIDENCE_RADIUS` of the joint, axes taken as independent; spread
     the root of their mean square distance. Neither is calibrated.
     """
-    share, square = np.ones(offset.shape[:2]), np.zeros(offset.shape[:2])
+    share, mean_square = np.ones(offset.shape[:2]), np.zeros(offset.shape[:2])
     for axis, heatmap in enumerate(heatmaps):
         weight = np.exp(heatmap.astype(float) - heatmap.max(-1, keepdims=True))
         weight /= weight.sum(-1, keepdims=True)
         distance = raw.low[axis] + np.arange(heatmap.shape[-1]) * raw.step[axis] - offset[..., axis, None]
         share = share * np.clip((weight * (np.abs(distance) < CONFIDENCE_RADIUS)).sum(-1), 0, 1)
-        square = square + (weight * distance**2).sum(-1)
-    return share, np.sqrt(square)
+        mean_square = mean_square + (weight * distance**2).sum(-1)
+    return share, np.sqrt(mean_square)

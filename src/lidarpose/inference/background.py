@@ -45,19 +45,23 @@ def learn_background(
     """
     sources = _sources(scans, columns)
     grid: _Grid | None = None
-    static, eighths = None, np.zeros(0, np.int64)
+    static_voxels, eighths = None, np.zeros(0, np.int64)
     for rows in np.array_split(np.arange(len(sources)), min(_PARTS, len(sources))):
         voxels, counts = np.zeros(0, np.int64), np.zeros(0, np.int64)
         for row in rows:
             points = _points(sources[row], columns)
             grid = grid or _Grid(points)
-            filled = grid.eighths(points)
-            eighths = _ascending(np.concatenate([eighths, filled]))
-            voxels, counts = _counted(voxels, counts, grid.voxels(filled))
-        often = voxels[counts >= _SHARE * len(rows)]
-        static = often if static is None else np.intersect1d(static, often, assume_unique=True)
-    assert grid is not None and static is not None
-    return grid.middles(eighths[np.isin(_packed(_unpacked(eighths) // 2), static)])
+            scan_eighths = grid.eighths(points)
+            eighths = _ascending(np.concatenate([eighths, scan_eighths]))
+            voxels, counts = _counted(voxels, counts, grid.voxels(scan_eighths))
+        frequent_voxels = voxels[counts >= _SHARE * len(rows)]
+        static_voxels = (
+            frequent_voxels
+            if static_voxels is None
+            else np.intersect1d(static_voxels, frequent_voxels, assume_unique=True)
+        )
+    assert grid is not None and static_voxels is not None
+    return grid.middles(eighths[np.isin(_packed(_unpacked(eighths) // 2), static_voxels)])
 
 
 def read_background(source: Any, *, columns: int | None = None) -> np.ndarray:
@@ -70,10 +74,10 @@ def read_background(source: Any, *, columns: int | None = None) -> np.ndarray:
 def is_static(points: np.ndarray, background: np.ndarray) -> np.ndarray:
     """points (n, 3) m, static points (k, 3) m of one frame -> (n,) bool: which lie where something static does."""
     grid = _Grid(background)
-    voxels, own = grid.voxels(grid.eighths(background)), _packed(grid.index(points) // 2)
+    voxels, point_voxels = grid.voxels(grid.eighths(background)), _packed(grid.index(points) // 2)
     if not len(voxels):
         return np.zeros(len(points), bool)
-    return voxels[np.searchsorted(voxels, own).clip(0, len(voxels) - 1)] == own
+    return voxels[np.searchsorted(voxels, point_voxels).clip(0, len(voxels) - 1)] == point_voxels
 
 
 class _Grid:
@@ -95,21 +99,21 @@ class _Grid:
     def voxels(self, eighths: np.ndarray) -> np.ndarray:
         """Those of which a corner touches an eighth, ascending: 2 x 2 x 2 for each."""
         low = (_unpacked(eighths) - 1) // 2
-        near = [_packed((low + np.array(offset)).clip(0, _SPAN - 1)) for offset in np.ndindex(2, 2, 2)]
-        return _ascending(np.concatenate(near))
+        neighbors = [_packed((low + np.array(offset)).clip(0, _SPAN - 1)) for offset in np.ndindex(2, 2, 2)]
+        return _ascending(np.concatenate(neighbors))
 
     def middles(self, eighths: np.ndarray) -> np.ndarray:
         """(n, 3) m."""
         return (_unpacked(eighths) + 0.5) * (_VOXEL / 2) + self.corner
 
 
-def _counted(numbers: np.ndarray, counts: np.ndarray, more: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ascending numbers with their counts, each of `more` counted once more."""
-    together = _ascending(np.concatenate([numbers, more]))
-    total = np.zeros(len(together), np.int64)
-    total[np.searchsorted(together, numbers)] = counts
-    total[np.searchsorted(together, more)] += 1
-    return together, total
+def _counted(numbers: np.ndarray, counts: np.ndarray, new_numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ascending numbers with their counts, each of `new_numbers` counted once more."""
+    all_numbers = _ascending(np.concatenate([numbers, new_numbers]))
+    totals = np.zeros(len(all_numbers), np.int64)
+    totals[np.searchsorted(all_numbers, numbers)] = counts
+    totals[np.searchsorted(all_numbers, new_numbers)] += 1
+    return all_numbers, totals
 
 
 def _ascending(numbers: np.ndarray) -> np.ndarray:

@@ -67,14 +67,14 @@ _FAR_OUT, _BELOW_SENSOR, _LOWEST, _LEAST_HEIGHT = 25.0, 15.0, 5, 0.2
 
 def unit_warning(size: np.ndarray, *, what: str) -> str | None:
     """What is likely wrong where a person's extent `size` (3,), z up, is no person's in meters."""
-    tall, largest = float(size[2]), float(size.max())
+    height, largest = float(size[2]), float(size.max())
     if 0 < largest < _LARGEST_IN_KILOMETERS:
         return f"{what} is {largest:.2g} m in size: are the units kilometers? multiply all coordinates by 1000"
     # a few returns may all lie at one height, and a whole street is large, but far wider than tall
-    if tall < _SMALLEST_IN_OTHER_UNITS or tall < largest / _WIDEST:
+    if height < _SMALLEST_IN_OTHER_UNITS or height < largest / _WIDEST:
         return None
-    unit, factor = ("millimeters", 1000) if tall > _LARGEST_IN_CENTIMETERS else ("centimeters", 100)
-    return f"{what} is {tall:,.0f} m tall: are the units {unit}? divide all coordinates by {factor}"
+    unit, factor = ("millimeters", 1000) if height > _LARGEST_IN_CENTIMETERS else ("centimeters", 100)
+    return f"{what} is {height:,.0f} m tall: are the units {unit}? divide all coordinates by {factor}"
 
 
 def oversize_warning(points: np.ndarray, pose: Pose) -> str | None:
@@ -84,10 +84,10 @@ def oversize_warning(points: np.ndarray, pose: Pose) -> str | None:
         points: (n, 3) m, z up, of the whole crop.
         pose: the person's.
     """
-    across = float(np.ptp(points[:, :2], axis=0).max())
-    if across > _WIDEST_CROP:
+    width = float(np.ptp(points[:, :2], axis=0).max())
+    if width > _WIDEST_CROP:
         return (
-            f"the points reach over {across:,.0f} m, and one person was looked for near their middle: expected a crop "
+            f"the points reach over {width:,.0f} m, and one person was looked for near their middle: expected a crop "
             "of one person: give the people's boxes, or crop closer"
         )
     low, high = np.percentile(points[:, 2], _TRIMMED)
@@ -134,8 +134,8 @@ def lies(pose: Pose, points: np.ndarray) -> bool:
         spread = points.std(0)
         if spread[:2].max() > max(_LONG, _LONG_TO_TALL * spread[2]):
             return True
-    at = {name: pose.joints[pose.skeleton.index(name)] for name in _TRUNK}
-    trunk = at["left_shoulder"] + at["right_shoulder"] - at["left_hip"] - at["right_hip"]
+    joints = {name: pose.joints[pose.skeleton.index(name)] for name in _TRUNK}
+    trunk = joints["left_shoulder"] + joints["right_shoulder"] - joints["left_hip"] - joints["right_hip"]
     return bool(abs(trunk[2]) < np.sin(np.radians(35)) * np.linalg.norm(trunk))
 
 
@@ -170,10 +170,10 @@ def empty_boxes(scan: Scan, people: Poses) -> str | None:
 def wide_boxes(scan: Scan, people: Poses) -> str | None:
     """Boxes are wider than tall: their sizes are in another order."""
     sizes = np.array([box.size for box in scan.boxes or []])
-    wide, tall = np.median(sizes[:, :2].max(1)), np.median(sizes[:, 2])
-    if tall >= _TALL_TO_WIDE * wide:
+    width, height = np.median(sizes[:, :2].max(1)), np.median(sizes[:, 2])
+    if height >= _TALL_TO_WIDE * width:
         return None
-    return f"boxes are wider ({wide:.1f} m) than tall ({tall:.1f} m): size is length, width, height"
+    return f"boxes are wider ({width:.1f} m) than tall ({height:.1f} m): size is length, width, height"
 
 
 def boxes_at_feet(scan: Scan, people: Poses) -> str | None:
@@ -182,11 +182,11 @@ def boxes_at_feet(scan: Scan, people: Poses) -> str | None:
     heights = _heights(boxes, points, scan.rows)
     if (heights < _GROUND).sum() > _ELSEWHERE * len(heights):
         return None
-    raised = [replace(box, center=box.center + [0, 0, box.size[2]]) for box in boxes]
-    above = 1 + _heights(raised, points, rows_inside(raised, points))
+    raised_boxes = [replace(box, center=box.center + [0, 0, box.size[2]]) for box in boxes]
+    raised_heights = 1 + _heights(raised_boxes, points, rows_inside(raised_boxes, points))
     # a ceiling leaves room above the box, a tree goes on above the head
-    trunk, sky = (above < _CHEST).sum(), (above > _TOP).sum()
-    if trunk < max(_FEWEST, len(heights) / 4) or sky > _ELSEWHERE * len(above):
+    trunk_count, sky_count = (raised_heights < _CHEST).sum(), (raised_heights > _TOP).sum()
+    if trunk_count < max(_FEWEST, len(heights) / 4) or sky_count > _ELSEWHERE * len(raised_heights):
         return None
     return "people stand in the upper half of their boxes and above: is center at the feet? add half the height"
 
@@ -200,10 +200,10 @@ SCAN_CHECKS: tuple[Callable[[Scan, Poses], str | None], ...] = (box_units, empty
 def check_scan(scan: Scan, people: Poses) -> list[str]:
     """The warnings of all checks. people: in the level frame, in the order of the scan's clouds."""
     # boxes that were found are nobody's fault, and the axes were looked at before
-    given = scan.detected_rows is None
-    warnings = {check: check(scan, people) for check in SCAN_CHECKS if scan.boxes and given}
+    is_given = scan.detected_rows is None
+    warnings = {check: check(scan, people) for check in SCAN_CHECKS if scan.boxes and is_given}
     # one wrong axis is one warning, and people who are cut short by their boxes only seem to lie
-    axis = flat_along_another_axis(scan) if given else None
+    axis = flat_along_another_axis(scan) if is_given else None
     if not (axis or warnings.get(wide_boxes) or warnings.get(boxes_at_feet)):
         axis = everybody_lies(scan, people)
     return [warning for warning in (*warnings.values(), axis) if warning]
@@ -216,9 +216,9 @@ def origin_warning(scan: Scan) -> str | None:
     distance = float(np.median([np.linalg.norm(box.center - scan.origin) for box in scan.boxes]))
     if distance < FARTHEST_PERSON:
         return None
-    at = ",".join(f"{value:g}" for value in scan.origin)
+    position = ",".join(f"{value:g}" for value in scan.origin)
     return (
-        f"the sensor at {at} is {distance:,.0f} m from the people, so its place is taken as unknown: "
+        f"the sensor at {position} is {distance:,.0f} m from the people, so its place is taken as unknown: "
         "give it in the points' own frame and in meters (sensor_origin)"
     )
 
@@ -226,22 +226,22 @@ def origin_warning(scan: Scan) -> str | None:
 def scan_unit_warning(points: np.ndarray, count: int) -> str | None:
     """What is likely wrong where the points (n, 3) of a whole scan of `count` points, z up, are not in meters."""
     extent = _extent(points)
-    across, largest = float(extent[:2].max()), float(extent.max())
+    width, largest = float(extent[:2].max()), float(extent.max())
     if largest < _SMALLEST_SCAN:
         return f"the points reach over {largest:.2g} m: are the units kilometers? multiply all coordinates by 1000"
-    if across > _LONGEST_SCAN and count < _SPARSEST * across**2:
-        unit, factor = ("millimeters", 1000) if across > _LONG_IN_MILLIMETERS else ("centimeters", 100)
-        return f"the points reach over {across:,.0f} m: are the units {unit}? divide all coordinates by {factor}"
+    if width > _LONGEST_SCAN and count < _SPARSEST * width**2:
+        unit, factor = ("millimeters", 1000) if width > _LONG_IN_MILLIMETERS else ("centimeters", 100)
+        return f"the points reach over {width:,.0f} m: are the units {unit}? divide all coordinates by {factor}"
     return unit_warning(extent, what="the scan")
 
 
 def unlikely_origin(points: np.ndarray, origin: np.ndarray) -> str | None:
     """A sensor at origin (3,) m cannot have seen the points (n, 3) m of a whole scan, z up."""
     distance = np.hypot(*(points[:, :2] - origin[:2]).T)
-    near = points[distance < _BELOW_SENSOR, 2]
+    near_heights = points[distance < _BELOW_SENSOR, 2]
     if distance.min() > _FAR_OUT:
         problem = f"is {distance.min():,.0f} m from the nearest point"
-    elif len(near) and np.percentile(near, _LOWEST) > origin[2] - _LEAST_HEIGHT:
+    elif len(near_heights) and np.percentile(near_heights, _LOWEST) > origin[2] - _LEAST_HEIGHT:
         problem = "has no ground below it"
     else:
         return None
@@ -255,26 +255,26 @@ def flat_axis(points: np.ndarray) -> str | None:
     """
     extent = _extent(points)
     axis = int(np.argmin(extent))
-    others = np.delete(extent, axis)
-    return "xyz"[axis] if others.min() > max(_STREET, _FLATTER * extent[axis]) else None
+    other_extents = np.delete(extent, axis)
+    return "xyz"[axis] if other_extents.min() > max(_STREET, _FLATTER * extent[axis]) else None
 
 
 def flat_along_another_axis(scan: Scan) -> str | None:
     """The points of the whole scan hardly extend along another axis than the one said to be up."""
-    flat = flat_axis(scan.points)
-    if flat is None or flat == scan.upright_axis:
+    axis = flat_axis(scan.points)
+    if axis is None or axis == scan.upright_axis:
         return None
-    return f"the points extend least along {flat}, so {scan.up} is hardly the input's up axis: try {_option(flat)}"
+    return f"the points extend least along {axis}, so {scan.up} is hardly the input's up axis: try {_option(axis)}"
 
 
 def everybody_lies(scan: Scan, people: Poses) -> str | None:
     """Everybody lies down, as where another axis is up. people: in the level frame."""
-    posed = [(person.pose, person.points) for person in people if person.pose is not None]
-    if not posed or not all(lies(pose, points) for pose, points in posed):
+    posed_people = [(person.pose, person.points) for person in people if person.pose is not None]
+    if not posed_people or not all(lies(pose, points) for pose, points in posed_people):
         return None
-    others = ", or ".join(_option(other) for other in "zyx" if other != scan.upright_axis)
-    who = "the person lies" if len(posed) == 1 else f"all {len(posed)} people lie"
-    return f"{who} down: if that is wrong, {scan.up} is not the input's up axis: try {others}"
+    other_options = ", or ".join(_option(axis) for axis in "zyx" if axis != scan.upright_axis)
+    subject = "the person lies" if len(posed_people) == 1 else f"all {len(posed_people)} people lie"
+    return f"{subject} down: if that is wrong, {scan.up} is not the input's up axis: try {other_options}"
 
 
 def rows_inside(boxes: list[Box], points: np.ndarray) -> list[np.ndarray]:
@@ -283,16 +283,16 @@ def rows_inside(boxes: list[Box], points: np.ndarray) -> list[np.ndarray]:
     for box in boxes:
         # twice what a corner reaches, whatever the yaw
         reach = np.hypot(*box.size[:2])
-        near = strips.rows(box.center[0] - reach, box.center[0] + reach)
-        near = np.sort(near[np.abs(points[near, 1] - box.center[1]) < reach])
-        rows.append(near[box.contains(points[near])])
+        near_rows = strips.rows(box.center[0] - reach, box.center[0] + reach)
+        near_rows = np.sort(near_rows[np.abs(points[near_rows, 1] - box.center[1]) < reach])
+        rows.append(near_rows[box.contains(points[near_rows])])
     return rows
 
 
 def _heights(boxes: list[Box], points: np.ndarray, rows: list[np.ndarray]) -> np.ndarray:
     """(k,): how high above the centers of their boxes, in those boxes' heights, points lie."""
     return np.concatenate(
-        [(points[own, 2] - box.center[2]) / box.size[2] for box, own in zip(boxes, rows, strict=True)]
+        [(points[box_rows, 2] - box.center[2]) / box.size[2] for box, box_rows in zip(boxes, rows, strict=True)]
     )
 
 

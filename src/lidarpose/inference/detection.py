@@ -104,13 +104,13 @@ def detect(
     else:
         cloud, notes = only_returns(as_points(points))
         scan = replace(scan, points=cloud, warnings=tuple(notes))
-    searched = search_alone(scan, search)
+    result = search_alone(scan, search)
     return Boxes(
-        searched.boxes or [],
-        source=searched.source,
-        warnings=searched.warnings,
+        result.boxes or [],
+        source=result.source,
+        warnings=result.warnings,
         detector=detector_version(),
-        up=searched.up,
+        up=result.up,
     )
 
 
@@ -135,26 +135,26 @@ def find_people(scan: Scan, search: Search, known: KnownPlaces | None = None) ->
 def search_alone(scan: Scan, search: Search) -> Scan:
     """`find_people` of a scan that is no frame of a recording, with `other_up_axis` where nobody is found."""
     places = detect_places(scan, search)
-    searched = verify_people(places, search)
-    if searched.boxes or not (hint := other_up_axis(places, search)):
-        return searched
+    result = verify_people(places, search)
+    if result.boxes or not (hint := other_up_axis(places, search)):
+        return result
     # what else looks odd follows from the axis
-    return replace(searched, warnings=(*scan.warnings, hint))
+    return replace(result, warnings=(*scan.warnings, hint))
 
 
 def other_up_axis(places: "Places", search: Search) -> str | None:
     """A scan in which nobody was found -> a line for the user where people are found with another axis up."""
-    given, detections = places.given, places.detections
-    if detections is None or detections.has_ground and flat_axis(places.scan.points) == given.upright_axis:
+    input_scan, detections = places.given, places.detections
+    if detections is None or detections.has_ground and flat_axis(places.scan.points) == input_scan.upright_axis:
         # outdoors: the axis is right
         return None
-    others = [up for up in UP_AXES if up != given.up]
-    boxes = {up: find_people(replace(given, up=up), search).boxes or [] for up in others}
-    best = max(others, key=lambda up: sum(box.score or 0.0 for box in boxes[up]))
-    if not (number := len(boxes[best])):
+    other_axes = [up for up in UP_AXES if up != input_scan.up]
+    boxes = {up: find_people(replace(input_scan, up=up), search).boxes or [] for up in other_axes}
+    best_axis = max(other_axes, key=lambda up: sum(box.score or 0.0 for box in boxes[up]))
+    if not (count := len(boxes[best_axis])):
         return None
-    people = "a person" if number == 1 else f"{number} people"
-    return f"nobody is found with up {given.up}, but {people} with up {best}: try up {best}"
+    people = "a person" if count == 1 else f"{count} people"
+    return f"nobody is found with up {input_scan.up}, but {people} with up {best_axis}: try up {best_axis}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -170,17 +170,16 @@ class Places:
 
 def detect_places(scan: Scan, search: Search) -> Places:
     """The first half of `find_people`, which depends on no other frame."""
-    whole, count = scan, len(scan.points)
-    given, notes = _thinned(scan, search)
-    scan, warnings = given, [*scan.warnings, *notes]
+    full_scan, count = scan, len(scan.points)
+    input_scan, notes = _thinned(scan, search)
+    scan, warnings = input_scan, [*scan.warnings, *notes]
     if len(scan.points) < MIN_POINTS:
         scan = replace(scan, warnings=(*warnings, f"under {MIN_POINTS} points"))
-        return Places(given=given, scan=scan, level=scan.points, detections=None)
+        return Places(given=input_scan, scan=scan, level=scan.points, detections=None)
     level = _leveled(scan)
     # what else looks odd follows from wrong axes or units
-    # what else looks odd follows from wrong axes or units
-    if wrong := flat_along_another_axis(scan):
-        warnings.append(wrong)
+    if frame_warning := flat_along_another_axis(scan):
+        warnings.append(frame_warning)
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     up = estimate_up(_near(level, origin, search), origin)
     if up is not None:
@@ -194,49 +193,51 @@ def detect_places(scan: Scan, search: Search) -> Places:
         level = _leveled(scan)
         origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     # level: a scan that leans is as tall as one in other units
-    if not wrong and (wrong := scan_unit_warning(level, count)):
-        warnings.append(wrong)
+    if not frame_warning and (frame_warning := scan_unit_warning(level, count)):
+        warnings.append(frame_warning)
     if origin is not None and (warning := unlikely_origin(level, origin)):
         # from the beginning: of an unknown sensor other points are kept, and what is up is told by others
-        own = whole.warnings if wrong else (*whole.warnings, warning)
-        return replace(detect_places(replace(whole, origin=None, warnings=own), search), given=given)
-    moving = None
+        scan_warnings = full_scan.warnings if frame_warning else (*full_scan.warnings, warning)
+        return replace(detect_places(replace(full_scan, origin=None, warnings=scan_warnings), search), given=input_scan)
+    is_moving = None
     if search.background is not None:
-        moving = ~is_static(scan.points, search.background)
-        if (share := 1 - moving.mean()) < _LEAST_STATIC:
+        is_moving = ~is_static(scan.points, search.background)
+        if (static_share := 1 - is_moving.mean()) < _LEAST_STATIC:
             warnings.append(
-                f"only {share:.0%} of the points lie on the background: is it of this sensor, in this frame?"
+                f"only {static_share:.0%} of the points lie on the background: is it of this sensor, in this frame?"
             )
-        elif not moving.any():
+        elif not is_moving.any():
             warnings.append(
                 "all points lie on the background, so nobody is looked for: was it learned from this scan alone? "
                 "record for ten seconds or more"
             )
     detector = search.detector or _detector()
-    detections = detector.detect(level, origin, max_range=search.max_range, limit=MOST_POSED, moving=moving)
-    if not (detections.has_ground or wrong):
+    detections = detector.detect(level, origin, max_range=search.max_range, limit=MOST_POSED, moving=is_moving)
+    if not (detections.has_ground or frame_warning):
         warnings.append("no ground was found, and people are searched without it: is the up axis right?")
     scan = replace(scan, warnings=tuple(warnings))
-    return Places(given=given, scan=scan, level=level, detections=detections)
+    return Places(given=input_scan, scan=scan, level=level, detections=detections)
 
 
 def verify_people(places: Places, search: Search, known: KnownPlaces | None = None) -> Scan:
     """The second half of `find_people`."""
-    scan, given = places.scan, places.given
+    scan, input_scan = places.scan, places.given
     if places.detections is None:
         return replace(scan, boxes=[], detected_rows=[])
     # the boxes of a frame that leans are larger than their people: these are looked for anew
-    leans = not np.allclose(given.R_boxes_input, scan.R_level_input)
+    is_tilted = not np.allclose(input_scan.R_boxes_input, scan.R_level_input)
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
-    here = None if known is None or leans else known.level(scan.R_level_input)
+    known_level = None if known is None or is_tilted else known.level(scan.R_level_input)
     header = (search.detector or _detector()).header
-    people = verified(places.detections, places.level, origin, header, least_score(search), search.max_people, here)
-    boxes = [_in_input(box, scan, given) for box in people.boxes]
-    searched = replace(scan, boxes=boxes, detected_rows=people.rows)
+    people = verified(
+        places.detections, places.level, origin, header, least_score(search), search.max_people, known_level
+    )
+    boxes = [_in_input(box, scan, input_scan) for box in people.boxes]
+    result = replace(scan, boxes=boxes, detected_rows=people.rows)
     if known is None:
-        return searched
+        return result
     return replace(
-        searched,
+        result,
         pelvises=people.pelvises @ scan.R_level_input,
         verified=people.verified,
         rejected=people.rejected @ scan.R_level_input,
@@ -274,40 +275,44 @@ def _thinned(scan: Scan, search: Search) -> tuple[Scan, list[str]]:
         return scan, []
     # in pieces: of 10^8 points a row of numbers more would take a gigabyte
     pieces = [slice(start, start + _CHUNK) for start in range(0, count, _CHUNK)]
-    reach, number, dense = (search.max_range + _BEYOND) ** 2, count, None
+    squared_reach, num_searched, squared_dense_range = (search.max_range + _BEYOND) ** 2, count, None
     if origin is not None:
-        by_distance = sum(np.histogram(_squared(points[piece], origin), _DISTANCES, (0, reach))[0] for piece in pieces)
-        if (around := int(np.sum(by_distance))) >= MIN_POINTS:
-            number, dense = around, _dense_below(np.asarray(by_distance), reach)
-    rng, parts = np.random.default_rng(0), []
+        histogram = sum(
+            np.histogram(_squared(points[piece], origin), _DISTANCES, (0, squared_reach))[0] for piece in pieces
+        )
+        if (num_in_range := int(np.sum(histogram))) >= MIN_POINTS:
+            num_searched, squared_dense_range = num_in_range, _dense_below(np.asarray(histogram), squared_reach)
+    rng, kept_rows = np.random.default_rng(0), []
     for piece in pieces:
         share: np.ndarray | float = _MOST_POINTS / count
-        if origin is not None and dense is not None:
+        if origin is not None and squared_dense_range is not None:
             squared = _squared(points[piece], origin)
-            share = np.where(squared < reach, squared / dense, 0.0)
-        parts.append(piece.start + np.flatnonzero(rng.random(len(points[piece])) < share))
-    rows, notes = np.concatenate(parts), []
-    if len(rows) < number and (dense is None or dense > search.max_range**2):
-        notes = [f"thinned from {number:,} to {len(rows):,} points to search them: give one scan at a time, or a part"]
+            share = np.where(squared < squared_reach, squared / squared_dense_range, 0.0)
+        kept_rows.append(piece.start + np.flatnonzero(rng.random(len(points[piece])) < share))
+    rows, notes = np.concatenate(kept_rows), []
+    if len(rows) < num_searched and (squared_dense_range is None or squared_dense_range > search.max_range**2):
+        notes = [
+            f"thinned from {num_searched:,} to {len(rows):,} points to search them: give one scan at a time, or a part"
+        ]
     return replace(scan, points=points[rows]), notes
 
 
 def _squared(points: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """(n,) m2: squared distances of points (n, 3) from origin (3,)."""
-    away = points - origin
-    return np.einsum("ni,ni->n", away, away)
+    offset = points - origin
+    return np.einsum("ni,ni->n", offset, offset)
 
 
-def _dense_below(by_distance: np.ndarray, reach: float) -> float:
+def _dense_below(histogram: np.ndarray, squared_reach: float) -> float:
     """The squared distance, m2, up to which points stay in proportion to their own, so that `_MOST_AROUND` stay.
 
-    by_distance: histogram of all squared distances up to reach, m2.
+    histogram: of all squared distances up to `squared_reach`, m2.
     """
-    edges = np.linspace(0, reach, len(by_distance) + 1)
-    inside = np.cumsum(by_distance * (edges[1:] + edges[:-1]) / 2)
-    number = inside / edges[1:] + by_distance.sum() - np.cumsum(by_distance)
-    enough = np.flatnonzero(number <= _MOST_AROUND)
-    return float(edges[1 + enough[0]] if len(enough) else inside[-1] / _MOST_AROUND)
+    edges = np.linspace(0, squared_reach, len(histogram) + 1)
+    weighted_counts = np.cumsum(histogram * (edges[1:] + edges[:-1]) / 2)
+    kept_counts = weighted_counts / edges[1:] + histogram.sum() - np.cumsum(histogram)
+    valid_bins = np.flatnonzero(kept_counts <= _MOST_AROUND)
+    return float(edges[1 + valid_bins[0]] if len(valid_bins) else weighted_counts[-1] / _MOST_AROUND)
 
 
 def _leveled(scan: Scan) -> np.ndarray:
@@ -322,23 +327,23 @@ def _near(points: np.ndarray, origin: np.ndarray | None, search: Search) -> np.n
     rows = np.arange(len(points))
     if origin is not None:
         squared = (points[:, 0] - origin[0]) ** 2 + (points[:, 1] - origin[1]) ** 2
-        near = np.flatnonzero(squared < (search.max_range + _BEYOND) ** 2)
-        rows = near if len(near) else rows
+        near_rows = np.flatnonzero(squared < (search.max_range + _BEYOND) ** 2)
+        rows = near_rows if len(near_rows) else rows
     rows = rows[:: -(-len(rows) // _ENOUGH_FOR_UP)]
     return np.stack([values[rows] for values in points.T]).T
 
 
-def _in_input(box: Box, scan: Scan, given: Scan) -> Box:
-    """A level box as a box of the input, along the axis that `given` says is up. In a frame that leans it is larger, so
-    that it still holds the person."""
-    R_boxes_level = given.R_boxes_input @ scan.R_level_input.T
+def _in_input(box: Box, scan: Scan, input_scan: Scan) -> Box:
+    """A level box as a box of the input, along the axis that `input_scan` says is up. In a frame that leans it is
+    larger, so that it still holds the person."""
+    R_boxes_level = input_scan.R_boxes_input @ scan.R_level_input.T
     center, size, yaw = R_boxes_level @ box.center, box.size, box.yaw
     if not np.allclose(R_boxes_level, np.eye(3)):
         # the level frame of a tilted sensor is turned about its up axis, too, where the input's is not z
         forward = R_boxes_level @ [np.cos(box.yaw), np.sin(box.yaw), 0]
         yaw = float(np.arctan2(forward[1], forward[0]))
         size = np.abs(rotation_about("z", yaw).T @ R_boxes_level @ rotation_about("z", box.yaw)) @ box.size
-    center = given.R_boxes_input.T @ center
+    center = input_scan.R_boxes_input.T @ center
     return rounded(replace(box, center=center, size=size, yaw=yaw))
 
 

@@ -54,11 +54,13 @@ class PoseEstimator:
         return self._transformed(IDENTITY, clouds, centers, origin, clip)
 
     def _transformed(self, transform: TTATransform, clouds, centers, origin, clip) -> Pose:
-        about, view = apply(transform, clouds, centers, origin)
-        seen: dict[str, Any] = {}
+        local_clouds, view = apply(transform, clouds, centers, origin)
+        options: dict[str, Any] = {}
         if clip is not None:
-            seen["clip"] = clip.mapped(lambda around: apply(transform, around, centers, origin)[0])
-        return invert(estimates(self.backend.run(about, view, **seen), self._decoder, self.skeleton), transform)
+            options["clip"] = clip.mapped(lambda surroundings: apply(transform, surroundings, centers, origin)[0])
+        return invert(
+            estimates(self.backend.run(local_clouds, view, **options), self._decoder, self.skeleton), transform
+        )
 
     def poses(
         self,
@@ -75,16 +77,16 @@ class PoseEstimator:
         who is meant where a cloud shows two people."""
         poses: list[Pose | None] = [None] * len(clouds)
         centers = None if centers is None else np.round(centers, _CENTER_DECIMALS)
-        done = 0
-        with Progress(len(clouds), unit="clouds", shown=progress) as shown:
+        count = 0
+        with Progress(len(clouds), unit="clouds", shown=progress) as bar:
             for rows, clip in self._batches(clouds, clips):
-                about = None if centers is None else centers[rows]
-                boxes = None if box_centers is None else box_centers[rows]
-                answers = self._batch([clouds[row] for row in rows], origin, clip, about, boxes)
-                for row, pose in zip(rows, answers, strict=True):
+                batch_centers = None if centers is None else centers[rows]
+                batch_box_centers = None if box_centers is None else box_centers[rows]
+                batch_poses = self._batch([clouds[row] for row in rows], origin, clip, batch_centers, batch_box_centers)
+                for row, pose in zip(rows, batch_poses, strict=True):
                     poses[row] = pose
-                done += len(rows)
-                shown.update(done)
+                count += len(rows)
+                bar.update(count)
         return poses
 
     def _batches(
@@ -107,27 +109,27 @@ class PoseEstimator:
         centers: np.ndarray | None,
         box_centers: np.ndarray | None,
     ) -> list[Pose | None]:
-        first = None
+        first_pass = None
         if centers is None:
             centers = np.stack([center_of(points) for points in clouds])
-            first = self._transformed(self._first, clouds, centers, origin, clip)
-            if box_centers is not None and first.second_person is not None:
-                centers, first = self._of_two(clouds, centers, box_centers, origin, first)
-            root = first.joints[:, self._middle].mean(1)
+            first_pass = self._transformed(self._first, clouds, centers, origin, clip)
+            if box_centers is not None and first_pass.second_person is not None:
+                centers, first_pass = self._of_two(clouds, centers, box_centers, origin, first_pass)
+            root = first_pass.joints[:, self._middle].mean(1)
             # an answer that is no number stays one
             shift = np.round(np.clip(root, -WINDOW / 2, WINDOW / 2) / _CENTER_STEP) * _CENTER_STEP
-            centers, first = centers + shift, replace(first, joints=first.joints - shift[:, None])
-        answers = [self._transformed(transform, clouds, centers, origin, clip) for transform in self._tta]
-        estimated = average([*answers, first] if first is not None and self._averaged else answers)
+            centers, first_pass = centers + shift, replace(first_pass, joints=first_pass.joints - shift[:, None])
+        tta_poses = [self._transformed(transform, clouds, centers, origin, clip) for transform in self._tta]
+        mean_pose = average([*tta_poses, first_pass] if first_pass is not None and self._averaged else tta_poses)
         poses: list[Pose | None] = []
         for k, points in enumerate(clouds):
-            near = (np.abs(points - centers[k]) < WINDOW).all(1).sum()
-            if near < MIN_POINTS or not np.isfinite(estimated.joints[k]).all():
+            near_count = (np.abs(points - centers[k]) < WINDOW).all(1).sum()
+            if near_count < MIN_POINTS or not np.isfinite(mean_pose.joints[k]).all():
                 poses.append(None)
                 continue
-            values = {name: getattr(estimated, name) for name in (*PER_JOINT, *PER_PERSON)}
-            of_person: dict[str, Any] = {name: value[k] for name, value in values.items() if value is not None}
-            poses.append(replace(estimated, joints=estimated.joints[k] + centers[k], **of_person))
+            values = {name: getattr(mean_pose, name) for name in (*PER_JOINT, *PER_PERSON)}
+            per_person: dict[str, Any] = {name: value[k] for name, value in values.items() if value is not None}
+            poses.append(replace(mean_pose, joints=mean_pose.joints[k] + centers[k], **per_person))
         return poses
 
     def _of_two(
@@ -136,20 +138,20 @@ class PoseEstimator:
         centers: np.ndarray,
         box_centers: np.ndarray,
         origin: np.ndarray | None,
-        first: Pose,
+        first_pass: Pose,
     ) -> tuple[np.ndarray, Pose]:
         """Centers and first answers, those of clouds that show two people about the centers of their boxes: who is
         nearer to them is meant."""
-        assert first.second_person is not None
-        rows = np.flatnonzero(first.second_person > _TWO_PEOPLE)
+        assert first_pass.second_person is not None
+        rows = np.flatnonzero(first_pass.second_person > _TWO_PEOPLE)
         if not len(rows):
-            return centers, first
+            return centers, first_pass
         centers = centers.copy()
         centers[rows] = np.round(box_centers[rows], _CENTER_DECIMALS)
-        again = self._transformed(self._first, [clouds[row] for row in rows], centers[rows], origin, None)
-        changed: dict[str, Any] = {}
+        second_pass = self._transformed(self._first, [clouds[row] for row in rows], centers[rows], origin, None)
+        changes: dict[str, Any] = {}
         for name in ("joints", *PER_JOINT, *PER_PERSON):
-            if (value := getattr(first, name)) is not None:
-                changed[name] = value.copy()
-                changed[name][rows] = getattr(again, name)
-        return centers, replace(first, **changed)
+            if (value := getattr(first_pass, name)) is not None:
+                changes[name] = value.copy()
+                changes[name][rows] = getattr(second_pass, name)
+        return centers, replace(first_pass, **changes)

@@ -62,44 +62,46 @@ class Clips:
                 f"clips: expected windows of {CLIP_FRAMES} rows, each of the {count} clouds in one of them, as "
                 f"Clips.of_run({count}) has them, got {reprlib.repr(windows.tolist())}"
             )
-        around = {}
+        surroundings = {}
         for name in ("background", "neighbors"):
-            if (given := getattr(self, name)) is None:
+            if (clouds := getattr(self, name)) is None:
                 continue
-            if len(given) != count:
-                raise InputError(f"clips: expected as many clouds of {name} as clouds, {count}, got {len(given)}")
-            around[name] = [as_points(cloud, f"{name}[{i}]") for i, cloud in enumerate(given)]
-        return replace(self, windows=windows, **around)
+            if len(clouds) != count:
+                raise InputError(f"clips: expected as many clouds of {name} as clouds, {count}, got {len(clouds)}")
+            surroundings[name] = [as_points(cloud, f"{name}[{i}]") for i, cloud in enumerate(clouds)]
+        return replace(self, windows=windows, **surroundings)
 
     def around(self, rows: np.ndarray) -> dict[str, list[np.ndarray]]:
         """The clouds about the persons of some rows, by name."""
         clouds = {"background": self.background, "neighbors": self.neighbors}
         return {
-            name: [np.zeros((0, 3)) if given is None else np.asarray(given[row], float) for row in rows]
-            for name, given in clouds.items()
+            name: [np.zeros((0, 3)) if person_clouds is None else np.asarray(person_clouds[row], float) for row in rows]
+            for name, person_clouds in clouds.items()
         }
 
     def mapped(self, change: Callable[[list[np.ndarray]], list[np.ndarray]]) -> "Clips":
         """With the clouds about the persons changed."""
         rows = np.arange(1 + self.windows.max())
-        around = self.around(rows)
-        return replace(self, background=change(around["background"]), neighbors=change(around["neighbors"]))
+        surroundings = self.around(rows)
+        return replace(self, background=change(surroundings["background"]), neighbors=change(surroundings["neighbors"]))
 
     def usable(self, keep: np.ndarray) -> "Clips":
         """Of windows the rows that are to be kept (N,) bool, the next or the last one filling up for each other;
         windows without any are gone."""
-        filled = []
+        windows = []
         for window in self.windows:
-            kept = np.flatnonzero(keep[window])
-            if len(kept):
-                filled.append(window[kept[np.searchsorted(kept, np.arange(CLIP_FRAMES)).clip(0, len(kept) - 1)]])
-        return replace(self, windows=np.array(filled, int).reshape(-1, CLIP_FRAMES))
+            positions = np.flatnonzero(keep[window])
+            if len(positions):
+                windows.append(
+                    window[positions[np.searchsorted(positions, np.arange(CLIP_FRAMES)).clip(0, len(positions) - 1)]]
+                )
+        return replace(self, windows=np.array(windows, int).reshape(-1, CLIP_FRAMES))
 
     def batches(self, count: int) -> Iterator[tuple[np.ndarray, "Clips"]]:
         """So many windows at a time: rows (n,) of their clouds, and the clips of these alone."""
         for start in range(0, len(self.windows), count):
-            rows, own = np.unique(self.windows[start : start + count], return_inverse=True)
-            yield rows, Clips(windows=own.reshape(-1, CLIP_FRAMES), **self.around(rows))
+            rows, local_rows = np.unique(self.windows[start : start + count], return_inverse=True)
+            yield rows, Clips(windows=local_rows.reshape(-1, CLIP_FRAMES), **self.around(rows))
 
 
 def as_points(points: Any, what: str = "points") -> np.ndarray:
@@ -129,9 +131,9 @@ def as_points(points: Any, what: str = "points") -> np.ndarray:
         )
     if array.dtype.kind not in "fiu":
         raise InputError(f"{what} must be an (n, 3) array of numbers, got {array.dtype} of shape {array.shape}")
-    transposed = is_transposed(array.shape)
-    if array.ndim != 2 or array.shape[1] < 3 or transposed:
-        remedy = ": give points.T" if transposed else ""
+    looks_transposed = is_transposed(array.shape)
+    if array.ndim != 2 or array.shape[1] < 3 or looks_transposed:
+        remedy = ": give points.T" if looks_transposed else ""
         raise InputError(f"{what} must be (n, 3) or (n, 3 + more) with x, y, z first, got shape {array.shape}{remedy}")
     return array[:, :3].astype(np.float64)
 
@@ -142,8 +144,8 @@ def _by_name(points: Any, what: str) -> Any:
     if names is None or not len(names) or not all(isinstance(name, str) for name in names):
         return points
     try:
-        chosen = [points[names[i]] for i in pick_xyz(names)]
-        return (np.ma if isinstance(points, np.ma.MaskedArray) else np).stack(chosen, -1)
+        columns = [points[names[i]] for i in pick_xyz(names)]
+        return (np.ma if isinstance(points, np.ma.MaskedArray) else np).stack(columns, -1)
     except (FormatError, ValueError) as problem:
         # two columns of one name cannot be told apart
         raise InputError(f"{what}: {problem}") from None
@@ -189,15 +191,15 @@ def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
 def only_returns(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """points (n, 3) m without rows that arithmetic would choke on or that are no returns, and a note for each kind."""
     notes = []
-    usable = within_reach(points)
-    if dropped := int((~usable).sum()):
-        notes.append(f"dropped {dropped} of {len(points)} points that were NaN, infinite or beyond {FARTHEST:g} m")
+    is_usable = within_reach(points)
+    if num_dropped := int((~is_usable).sum()):
+        notes.append(f"dropped {num_dropped} of {len(points)} points that were NaN, infinite or beyond {FARTHEST:g} m")
     # so organized clouds fill the pixels that nothing came back from; a single one may be a point of a centered cloud
-    empty = ~points.any(1)
-    if (zeros := int(empty.sum())) > 1:
-        notes.append(f"dropped {zeros} of {len(points)} points at 0,0,0, which are no returns")
-        usable &= ~empty
-    return (points[usable], notes) if notes else (points, [])
+    is_zero = ~points.any(1)
+    if (num_zeros := int(is_zero.sum())) > 1:
+        notes.append(f"dropped {num_zeros} of {len(points)} points at 0,0,0, which are no returns")
+        is_usable &= ~is_zero
+    return (points[is_usable], notes) if notes else (points, [])
 
 
 def is_few(points: np.ndarray) -> bool:
@@ -217,15 +219,15 @@ def candidates(points: np.ndarray) -> list[np.ndarray]:
     """
     if (np.ptp(points[:, :2], axis=0) < _TIGHT).all():
         return [points]
-    near = points[(np.abs(points - np.median(points, axis=0))[:, :2] < _SEARCH).all(1)]
-    if len(near) < MIN_POINTS:
+    near_points = points[(np.abs(points - np.median(points, axis=0))[:, :2] < _SEARCH).all(1)]
+    if len(near_points) < MIN_POINTS:
         return [points]
-    ground = np.percentile(near[:, 2], 2)
-    upper = near[(near[:, 2] > ground + _ABOVE_GROUND) & (near[:, 2] < ground + _REACH)]
-    if len(upper) < MIN_POINTS:
+    ground = np.percentile(near_points[:, 2], 2)
+    upper_points = near_points[(near_points[:, 2] > ground + _ABOVE_GROUND) & (near_points[:, 2] < ground + _REACH)]
+    if len(upper_points) < MIN_POINTS:
         return [points]
-    corner = upper.min(0)
-    cells = ((upper - corner) / _CELL).astype(int)
+    corner = upper_points.min(0)
+    cells = ((upper_points - corner) / _CELL).astype(int)
     grid = np.zeros(cells.max(0) + 1, bool)
     grid[tuple(cells.T)] = True
     score = _heights(grid, *_COLUMN) - _RING_WEIGHT * _heights(grid, *_RING)
@@ -234,30 +236,30 @@ def candidates(points: np.ndarray) -> list[np.ndarray]:
     places = corner[:2] + (places + 0.5) * _CELL
     clouds = [points]
     for _ in range(_COLUMNS):
-        best = int(np.argmax(score))
-        if np.isneginf(score[best]):
+        best_index = int(np.argmax(score))
+        if np.isneginf(score[best_index]):
             break
-        inside = upper[_distance(upper, places[best]) < _AROUND / 2]
-        middle = center_of(inside)[:2] if len(inside) else places[best]
+        column_points = upper_points[_distance(upper_points, places[best_index]) < _AROUND / 2]
+        middle = center_of(column_points)[:2] if len(column_points) else places[best_index]
         # without the trees above
         cloud = points[(_distance(points, middle) < _AROUND) & (points[:, 2] < ground + _REACH)]
         if len(cloud) >= MIN_POINTS:
             clouds.append(cloud)
-        score[_distance(places, places[best]) < _APART] = -np.inf
+        score[_distance(places, places[best_index]) < _APART] = -np.inf
     return clouds
 
 
-def _heights(grid: np.ndarray, near: float, far: float) -> np.ndarray:
-    """grid (X, Y, Z) bool -> (X, Y): at how many heights any cell `near` to `far` cells away is filled."""
-    reach = int(far)
+def _heights(grid: np.ndarray, inner: float, outer: float) -> np.ndarray:
+    """grid (X, Y, Z) bool -> (X, Y): at how many heights any cell `inner` to `outer` cells away is filled."""
+    reach = int(outer)
     x, y, _ = grid.shape
-    padded = np.pad(grid, ((reach, reach), (reach, reach), (0, 0)))
-    filled = np.zeros_like(grid)
+    padded_grid = np.pad(grid, ((reach, reach), (reach, reach), (0, 0)))
+    is_filled = np.zeros_like(grid)
     for i in range(2 * reach + 1):
         for j in range(2 * reach + 1):
-            if near <= np.hypot(i - reach, j - reach) <= far:
-                filled |= padded[i : i + x, j : j + y]
-    return filled.sum(2)
+            if inner <= np.hypot(i - reach, j - reach) <= outer:
+                is_filled |= padded_grid[i : i + x, j : j + y]
+    return is_filled.sum(2)
 
 
 def _distance(points: np.ndarray, place: np.ndarray) -> np.ndarray:

@@ -64,12 +64,12 @@ def predict(
     options = (min_score, max_range, max_people, background)
     check_choice(boxes, crop, find or any(option is not None for option in options))
     _check_path(path)
-    started = time.perf_counter()
-    given = None if boxes is None else read_boxes(boxes, calib=calib)
+    start = time.perf_counter()
+    input_boxes = None if boxes is None else read_boxes(boxes, calib=calib)
     if up is None:
-        up = "z" if given is None else given.up
+        up = "z" if input_boxes is None else input_boxes.up
     rotation_from_up(up)
-    scan = Scan(points=np.zeros((0, 3)), boxes=given, origin=as_origin(sensor_origin), up=up_text(up))
+    scan = Scan(points=np.zeros((0, 3)), boxes=input_boxes, origin=as_origin(sensor_origin), up=up_text(up))
     scan = read_scan(scan, path, columns)
     find = find or boxes is None and not crop and is_wide(scan)
     if not find and any(option is not None for option in options):
@@ -77,11 +77,11 @@ def predict(
         scan = replace(scan, warnings=(*scan.warnings, note))
     if sensor_origin is None and (find or boxes is not None):
         scan = replace(scan, origin=np.zeros(3))
-    read = time.perf_counter()
+    read_end = time.perf_counter()
     search = search_options(*options, columns) if find else None
     # loaded once the input has proved readable
     _, poses = predict_scan(scan, lambda: predictor_of(model), search=search, skeleton=skeleton, progress=progress)
-    return replace(poses, timing_ms={"read": (read - started) * 1e3} | poses.timing_ms)
+    return replace(poses, timing_ms={"read": (read_end - start) * 1e3} | poses.timing_ms)
 
 
 def predictor_of(model: "Predictor | str | os.PathLike | Callable[[], Predictor]") -> "Predictor":
@@ -109,15 +109,15 @@ def predict_scan(
     Returns:
         The scan as it was searched, and the poses, whose `timing_ms` has "find", "load", "crop" and "predict".
     """
-    started = time.perf_counter()
+    start = time.perf_counter()
     times = {}
     if search is not None:
         scan = search_alone(scan, search) if isinstance(scan, Scan) else verify_people(scan, search, known)
-        times["find"] = time.perf_counter() - started
+        times["find"] = time.perf_counter() - start
     assert isinstance(scan, Scan)
-    searched = time.perf_counter()
+    search_end = time.perf_counter()
     predictor = model()
-    times["load"] = time.perf_counter() - searched
+    times["load"] = time.perf_counter() - search_end
     poses = pose_scan(scan, predictor, skeleton=skeleton, progress=progress)
     return scan, replace(poses, timing_ms={name: seconds * 1e3 for name, seconds in times.items()} | poses.timing_ms)
 
@@ -125,8 +125,8 @@ def predict_scan(
 def is_wide(scan: Scan) -> bool:
     """Whether the scan is larger than a crop of one person."""
     # a map of 10^8 points is not turned for nothing
-    upright = scan.points if scan.up in UP_AXES else scan.clouds()[0]
-    return bool(np.ptp(upright, axis=0).max() >= CROP_SIZE)
+    upright_points = scan.points if scan.up in UP_AXES else scan.clouds()[0]
+    return bool(np.ptp(upright_points, axis=0).max() >= CROP_SIZE)
 
 
 def check_choice(boxes: object, crop: bool, searched: bool) -> None:

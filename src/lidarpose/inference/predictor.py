@@ -99,15 +99,15 @@ def load(
             raise file_error(path, "torch runs a .safetensors file, not .onnx: name the one that it was made from")
         if threads is not None:
             raise InputError("threads are of the backend onnx: for torch call torch.set_num_threads")
-        chosen = _torch_backend(path, device, compile)
+        network_backend = _torch_backend(path, device, compile)
     elif not is_plain:
-        asked = "torch.compile" if compile else f"device {device!r}"
-        raise InputError(f"{asked} needs the backend torch and a .safetensors file, got the backend onnx")
+        option = "torch.compile" if compile else f"device {device!r}"
+        raise InputError(f"{option} needs the backend torch and a .safetensors file, got the backend onnx")
     elif is_bundled or is_exported:
-        chosen = OnnxBackend(path if is_exported else path.with_suffix(".onnx"), threads=threads)
+        network_backend = OnnxBackend(path if is_exported else path.with_suffix(".onnx"), threads=threads)
     else:
-        chosen = exported_beside(path, threads=threads)
-    return Predictor(chosen, name=path.stem, decode=decode, tta=tta)
+        network_backend = exported_beside(path, threads=threads)
+    return Predictor(network_backend, name=path.stem, decode=decode, tta=tta)
 
 
 def _torch_backend(path: Path, device: str, compile: bool) -> Backend:
@@ -148,12 +148,12 @@ class Predictor(PoseEstimator):
 
         Raises InputError for an unknown name, or one of a joint that the network lacks.
         """
-        own = self.skeleton
+        network_skeleton = self.skeleton
         if name is None:
-            return SMPL24 if set(SMPL24.joints) <= set(own.joints) else own
-        wanted = skeleton_of(name)
-        own.map_to(wanted)
-        return wanted
+            return SMPL24 if set(SMPL24.joints) <= set(network_skeleton.joints) else network_skeleton
+        skeleton = skeleton_of(name)
+        network_skeleton.map_to(skeleton)
+        return skeleton
 
     def __repr__(self) -> str:
         return f"Predictor({self.model['name']!r}, {self.skeleton.name}, {self.backend.name}, tta={len(self._tta)})"
@@ -207,7 +207,7 @@ class Predictor(PoseEstimator):
         Raises:
             InputError: arrays of another shape or type.
         """
-        wanted = self.in_skeleton(skeleton)
+        target_skeleton = self.in_skeleton(skeleton)
         if clips is not None and getattr(self.backend, "frames", 1) == 1:
             raise InputError(f"clips are for networks of clips, {self.model['name']} reads single frames")
         if find and boxes is not None:
@@ -215,9 +215,9 @@ class Predictor(PoseEstimator):
         if boxes is not None or find:
             cloud, notes = only_returns(as_points(points))
             origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)
-            given = None if boxes is None else read_boxes(boxes)
-            up = "z" if given is None else given.up
-            scan = Scan(points=cloud, boxes=given, origin=origin, up=up, warnings=tuple(notes))
+            input_boxes = None if boxes is None else read_boxes(boxes)
+            up = "z" if input_boxes is None else input_boxes.up
+            scan = Scan(points=cloud, boxes=input_boxes, origin=origin, up=up, warnings=tuple(notes))
             if find:
                 from lidarpose.inference.detection import Search, find_people
 
@@ -225,11 +225,11 @@ class Predictor(PoseEstimator):
             return pose_scan(scan, self, skeleton=skeleton, progress=progress)
         origin = as_origin(sensor_origin)
         if not _is_many(points):
-            return self._people([as_points(points)], origin, wanted, False)[0]
+            return self._people([as_points(points)], origin, target_skeleton, False)[0]
         clouds = [as_points(cloud, f"points[{i}]") for i, cloud in enumerate(points)]
         clips = None if clips is None else clips.checked(len(clouds))
-        people = self._people(clouds, origin, wanted, progress, clips)
-        return Poses(people=tuple(people), skeleton=wanted, model=self.model)
+        people = self._people(clouds, origin, target_skeleton, progress, clips)
+        return Poses(people=tuple(people), skeleton=target_skeleton, model=self.model)
 
     def predict_clip(
         self,
@@ -253,20 +253,20 @@ class Predictor(PoseEstimator):
         Raises:
             InputError: as `predict` does, and for other times.
         """
-        wanted = self.in_skeleton(skeleton)
+        target_skeleton = self.in_skeleton(skeleton)
         if not _is_many(clouds):
             raise InputError("predict_clip: expected a list of clouds, one a frame, got one cloud: use predict")
         seconds = clip_times(times, len(clouds))
         clips = Clips.of_run(len(clouds)) if len(clouds) and getattr(self.backend, "frames", 1) > 1 else None
-        each = [as_points(cloud, f"clouds[{i}]") for i, cloud in enumerate(clouds)]
-        people = self._people(each, as_origin(sensor_origin), wanted, progress, clips)
-        track = TrackPoses.of_poses(seconds, [person.pose for person in people], wanted)
-        steady = follow(track) if live else smooth(track).poses()
+        frame_clouds = [as_points(cloud, f"clouds[{i}]") for i, cloud in enumerate(clouds)]
+        people = self._people(frame_clouds, as_origin(sensor_origin), target_skeleton, progress, clips)
+        track = TrackPoses.of_poses(seconds, [person.pose for person in people], target_skeleton)
+        steady_poses = follow(track) if live else smooth(track).poses()
         frames = [
             replace(person, id=i, pose=_with_own(person, pose), warnings=_steady_warnings(person, pose))
-            for i, (person, pose) in enumerate(zip(people, steady, strict=True))
+            for i, (person, pose) in enumerate(zip(people, steady_poses, strict=True))
         ]
-        return Poses(people=tuple(frames), skeleton=wanted, model=self.model)
+        return Poses(people=tuple(frames), skeleton=target_skeleton, model=self.model)
 
     def predict_in(
         self,
@@ -285,68 +285,79 @@ class Predictor(PoseEstimator):
             box_centers: (N, 3) m of the boxes that cut the clouds out: where a cloud shows two people, who is nearer to
                 the center is meant.
         """
-        wanted = self.in_skeleton(skeleton)
-        people = self._people(list(clouds), origin, wanted, progress, centers=pelvises, box_centers=box_centers)
-        return Poses(people=tuple(people), skeleton=wanted, model=self.model)
+        target_skeleton = self.in_skeleton(skeleton)
+        people = self._people(
+            list(clouds), origin, target_skeleton, progress, centers=pelvises, box_centers=box_centers
+        )
+        return Poses(people=tuple(people), skeleton=target_skeleton, model=self.model)
 
-    def _people(self, clouds, origin, wanted, progress, clips=None, centers=None, box_centers=None) -> list[PersonPose]:
-        cleaned = [clean(cloud) for cloud in clouds]
-        is_usable = np.array([not is_few(points) for points, _ in cleaned], bool)
+    def _people(
+        self, clouds, origin, target_skeleton, progress, clips=None, centers=None, box_centers=None
+    ) -> list[PersonPose]:
+        cleaned_clouds = [clean(cloud) for cloud in clouds]
+        is_usable = np.array([not is_few(points) for points, _ in cleaned_clouds], bool)
         in_box = centers is not None or box_centers is not None
-        best = self._best(cleaned, is_usable, origin, progress, clips, centers, box_centers)
+        best_poses = self._best(cleaned_clouds, is_usable, origin, progress, clips, centers, box_centers)
         poses: list[Pose | None] = [None] * len(clouds)
-        doubtful: list[int] = []
-        for i, (points, notes) in enumerate(cleaned):
+        unsure_rows: list[int] = []
+        for i, (points, notes) in enumerate(cleaned_clouds):
             if not is_usable[i]:
-                points_of = "points" if len(points) < MIN_POINTS else "different points"
-                notes.append(f"no pose: under {MIN_POINTS} {points_of}")
+                noun = "points" if len(points) < MIN_POINTS else "different points"
+                notes.append(f"no pose: under {MIN_POINTS} {noun}")
                 continue
-            unit = unit_warning(np.ptp(points, axis=0), what="the person")
-            if i not in best:
-                few = f"no pose: under {MIN_POINTS} points within {WINDOW:.0f} m of the person's middle"
-                notes += filter(None, (unit, few))
+            unit_note = unit_warning(np.ptp(points, axis=0), what="the person")
+            if i not in best_poses:
+                pose_note = f"no pose: under {MIN_POINTS} points within {WINDOW:.0f} m of the person's middle"
+                notes += filter(None, (unit_note, pose_note))
                 continue
-            pose, part = best[i]
-            poses[i] = wanted_pose = pose.to(wanted)
-            notes += filter(None, (unit, company_warning(pose, in_box=in_box), _range_warning(wanted_pose)))
-            if unit:
+            pose, part = best_poses[i]
+            poses[i] = target_pose = pose.to(target_skeleton)
+            notes += filter(None, (unit_note, company_warning(pose, in_box=in_box), _range_warning(target_pose)))
+            if unit_note:
                 continue
             if warning := oversize_warning(points, pose):
                 notes.append(warning)
             elif centers is None and looks_unsure(pose, part):
-                doubtful.append(i)
+                unsure_rows.append(i)
         # a second look at the few whose pose looks unsure; where pelvises are known people were seen upright before
-        flipped = [best[i][1] * UPSIDE_DOWN for i in doubtful]
-        flipped_poses = self.poses(flipped, None if origin is None else origin * UPSIDE_DOWN)
-        for i, turned in zip(doubtful, flipped_poses, strict=True):
-            if warning := upside_down_warning(best[i][0], turned):
-                cleaned[i][1].append(warning)
+        flipped_clouds = [best_poses[i][1] * UPSIDE_DOWN for i in unsure_rows]
+        flipped_poses = self.poses(flipped_clouds, None if origin is None else origin * UPSIDE_DOWN)
+        for i, flipped_pose in zip(unsure_rows, flipped_poses, strict=True):
+            if warning := upside_down_warning(best_poses[i][0], flipped_pose):
+                cleaned_clouds[i][1].append(warning)
         return [
-            PersonPose(pose=pose, skeleton=wanted, points=points, warnings=tuple(notes), model=self.model)
-            for pose, (points, notes) in zip(poses, cleaned, strict=True)
+            PersonPose(pose=pose, skeleton=target_skeleton, points=points, warnings=tuple(notes), model=self.model)
+            for pose, (points, notes) in zip(poses, cleaned_clouds, strict=True)
         ]
 
     def _best(
-        self, cleaned, is_usable, origin, progress, clips, centers, box_centers
+        self, cleaned_clouds, is_usable, origin, progress, clips, centers, box_centers
     ) -> dict[int, tuple[Pose, np.ndarray]]:
         """By person the pose, where there is one, and what of the cloud (n, 3) m it is of."""
         if clips is not None:
             # rows of clips are those of all clouds
-            parts = list(enumerate(points for points, _ in cleaned))
-            answers = self.poses([part for _, part in parts], origin, clips=clips.usable(is_usable), progress=progress)
+            parts = list(enumerate(points for points, _ in cleaned_clouds))
+            poses = self.poses([part for _, part in parts], origin, clips=clips.usable(is_usable), progress=progress)
         else:
-            usable = [(i, cleaned[i][0]) for i in np.flatnonzero(is_usable).tolist()]
+            usable_clouds = [(i, cleaned_clouds[i][0]) for i in np.flatnonzero(is_usable).tolist()]
             # a person's first candidate is the whole cloud
-            parts = [(i, part) for i, cloud in usable for part in (candidates(cloud) if centers is None else [cloud])]
+            parts = [
+                (i, part) for i, cloud in usable_clouds for part in (candidates(cloud) if centers is None else [cloud])
+            ]
             rows = [i for i, _ in parts]
-            about, boxes = (None if each is None else each[rows] for each in (centers, box_centers))
+            part_centers, part_box_centers = (
+                None if values is None else values[rows] for values in (centers, box_centers)
+            )
             clouds = [part for _, part in parts]
-            answers = self.poses(clouds, origin, centers=about, box_centers=boxes, progress=progress)
-        answered: dict[int, list[tuple[Pose, np.ndarray]]] = {}
-        for (i, part), pose in zip(parts, answers, strict=True):
+            poses = self.poses(clouds, origin, centers=part_centers, box_centers=part_box_centers, progress=progress)
+        poses_by_person: dict[int, list[tuple[Pose, np.ndarray]]] = {}
+        for (i, part), pose in zip(parts, poses, strict=True):
             if pose is not None:
-                answered.setdefault(i, []).append((pose, part))
-        return {i: _meant(some, None if box_centers is None else box_centers[i]) for i, some in answered.items()}
+                poses_by_person.setdefault(i, []).append((pose, part))
+        return {
+            i: _meant(person_poses, None if box_centers is None else box_centers[i])
+            for i, person_poses in poses_by_person.items()
+        }
 
 
 def _meant(answers: list[tuple[Pose, np.ndarray]], box_center: np.ndarray | None) -> tuple[Pose, np.ndarray]:
@@ -355,28 +366,32 @@ def _meant(answers: list[tuple[Pose, np.ndarray]], box_center: np.ndarray | None
 
     Of a network without confidence the first.
     """
-    sure = [0.0 if pose.confidence is None else float(pose.confidence.mean()) for pose, _ in answers]
-    if len(answers) == 1 or not any(sure):
+    confidences = [0.0 if pose.confidence is None else float(pose.confidence.mean()) for pose, _ in answers]
+    if len(answers) == 1 or not any(confidences):
         return answers[0]
     middles = np.stack([pose.joints[list(pose.skeleton.middle)].mean(0)[:2] for pose, _ in answers])
-    able = np.array(sure) > _SURE * max(sure)
-    near = able
+    is_confident = np.array(confidences) > _SURE * max(confidences)
+    is_eligible = is_confident
     if box_center is not None:
-        away = np.where(able, np.linalg.norm(middles - box_center[:2], axis=1), np.inf)
-        near = able & (np.linalg.norm(middles - middles[away.argmin()], axis=1) < _SAME)
-    best = int(np.where(near, sure, -1.0).argmax())
-    pose, part = answers[best]
+        distances = np.where(is_confident, np.linalg.norm(middles - box_center[:2], axis=1), np.inf)
+        is_eligible = is_confident & (np.linalg.norm(middles - middles[distances.argmin()], axis=1) < _SAME)
+    best_row = int(np.where(is_eligible, confidences, -1.0).argmax())
+    pose, part = answers[best_row]
     if pose.second_person is None or pose.person is None:
         return pose, part
-    beside = np.linalg.norm(middles - middles[best], axis=1) > _SAME
-    others = [pose_beside.person for (pose_beside, _), is_other in zip(answers, beside & able, strict=True) if is_other]
-    return replace(pose, second_person=np.max([pose.second_person, *others])), part
+    is_beside = np.linalg.norm(middles - middles[best_row], axis=1) > _SAME
+    other_probabilities = [
+        other_pose.person
+        for (other_pose, _), is_other in zip(answers, is_beside & is_confident, strict=True)
+        if is_other
+    ]
+    return replace(pose, second_person=np.max([pose.second_person, *other_probabilities])), part
 
 
 def _range_warning(pose: Pose) -> str | None:
     if pose.in_range is None or pose.in_range.all():
         return None
-    names = [name for name, inside in zip(pose.skeleton.joints, pose.in_range, strict=True) if not inside]
+    names = [name for name, is_in_range in zip(pose.skeleton.joints, pose.in_range, strict=True) if not is_in_range]
     return f"at the end of the heatmap's range, so perhaps farther out than given: {first_names(names)}"
 
 
@@ -405,8 +420,8 @@ def _is_many(points) -> bool:
 def _is_row(value) -> bool:
     """One point: a flat list or array of numbers. Anything ragged is none, and what is empty is a cloud."""
     if isinstance(value, list | tuple):
-        flat = not any(isinstance(entry, list | tuple) or getattr(entry, "ndim", 0) for entry in value)
+        is_flat = not any(isinstance(entry, list | tuple) or getattr(entry, "ndim", 0) for entry in value)
     else:
         # records are a cloud
-        flat = getattr(value, "ndim", 0) == 1 and not getattr(getattr(value, "dtype", None), "names", None)
-    return flat and len(value) > 0
+        is_flat = getattr(value, "ndim", 0) == 1 and not getattr(getattr(value, "dtype", None), "names", None)
+    return is_flat and len(value) > 0

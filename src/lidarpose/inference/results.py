@@ -104,7 +104,7 @@ class PersonPose:
         """Names of the joints that are not `in_range`."""
         if self.in_range is None:
             return []
-        return [name for name, inside in zip(self.skeleton.joints, self.in_range, strict=True) if not inside]
+        return [name for name, is_inside in zip(self.skeleton.joints, self.in_range, strict=True) if not is_inside]
 
     @property
     def score(self) -> float | None:
@@ -160,12 +160,12 @@ class PersonPose:
     def __repr__(self) -> str:
         name = "" if self.id is None else f"id={self.id!r}, "
         if self.pose is None:
-            answer = "no pose"
+            description = "no pose"
         elif self.pose.confidence is None:
-            answer = self.skeleton.name
+            description = self.skeleton.name
         else:
-            answer = f"{self.skeleton.name}, confidence {self.confidence.mean():.2f}"
-        return f"PersonPose({name}{answer}, {self.num_points:,} points{_count(self.warnings, 'warning')})"
+            description = f"{self.skeleton.name}, confidence {self.confidence.mean():.2f}"
+        return f"PersonPose({name}{description}, {self.num_points:,} points{_count(self.warnings, 'warning')})"
 
     def _repr_png_(self) -> bytes:
         return bytes(self.picture())
@@ -203,16 +203,18 @@ class Poses(Sequence[PersonPose]):
         if isinstance(index, slice):
             return replace(self, people=self.people[index])
         if isinstance(index, str):
-            named = [person for person in self.people if str(person.id) == index]
-            if not named:
+            matches = [person for person in self.people if str(person.id) == index]
+            if not matches:
                 raise KeyError(f"nobody has the id {index!r}: ids are {[person.id for person in self.people]}")
-            return named[0]
+            return matches[0]
         return self.people[index]
 
     def __repr__(self) -> str:
-        posed = sum(person.has_pose for person in self.people)
+        num_posed = sum(person.has_pose for person in self.people)
         source = "" if self.source is None else f", from {self.source!r}"
-        return f"Poses({posed} of {len(self)} people, {self.skeleton.name}{source}{_count(self.warnings, 'warning')})"
+        return (
+            f"Poses({num_posed} of {len(self)} people, {self.skeleton.name}{source}{_count(self.warnings, 'warning')})"
+        )
 
     def _repr_html_(self) -> str:
         rows = [("th", ("id", "points", "confidence", "warnings"))]
@@ -242,10 +244,10 @@ class Poses(Sequence[PersonPose]):
             if person.pose is None:
                 continue
             values = [getattr(person.pose, name) for name in PER_JOINT]
-            once = [np.nan if x is None else x for x in (person.person, person.second_person, person.score)]
+            person_values = [np.nan if x is None else x for x in (person.person, person.second_person, person.score)]
             for j, joint in enumerate(self.skeleton.joints):
-                known = [np.nan if value is None else value[j] for value in values]
-                rows.append((number, person.id, joint, *person.pose.joints[j], *known, *once))
+                joint_values = [np.nan if value is None else value[j] for value in values]
+                rows.append((number, person.id, joint, *person.pose.joints[j], *joint_values, *person_values))
         return pandas.DataFrame(rows, columns=["person", "id", *JOINT_COLUMNS])
 
     def to_dict(self) -> dict:
@@ -270,13 +272,13 @@ class Poses(Sequence[PersonPose]):
     def to_json(self) -> str:
         """`to_dict` as JSON, people a line each."""
         document = self.to_dict()
-        last = {key: document.pop(key) for key in ("people", "timing_ms")}
-        return people_json(document | last)
+        last_entries = {key: document.pop(key) for key in ("people", "timing_ms")}
+        return people_json(document | last_entries)
 
     def save(self, path: str | Path) -> None:
         """Writes `to_json`, or `to_dataframe` to a .csv, whole or not at all."""
-        as_csv = str(path).lower().endswith(".csv")
-        write_atomic(path, self.to_dataframe().to_csv(index=False) if as_csv else self.to_json())
+        is_csv = str(path).lower().endswith(".csv")
+        write_atomic(path, self.to_dataframe().to_csv(index=False) if is_csv else self.to_json())
 
     def picture(self, path: str | Path | None = None, *, title: str = "") -> Picture:
         """Everybody from the front and the side on one PNG; also written to `path` where given.
@@ -290,8 +292,8 @@ class Poses(Sequence[PersonPose]):
         panels, scan = self._panels()
         if scan is None:
             return Picture(draw_people(panels, path, title=title))
-        above = draw_scans([scan], title=title)
-        return Picture(stack_pictures([above, draw_people(panels)] if panels else [above], path))
+        scan_picture = draw_scans([scan], title=title)
+        return Picture(stack_pictures([scan_picture, draw_people(panels)] if panels else [scan_picture], path))
 
     def html(self, path: str | Path | None = None, *, title: str = "") -> str:
         """A page on which everybody is turned in 3D, under the scan where people were searched for; also written to
@@ -309,12 +311,12 @@ class Poses(Sequence[PersonPose]):
         """What is drawn: everybody, and the scan where people were searched for."""
         from lidarpose.viz.person_view import Panel
 
-        upright = [_upright(person, self.up) for person in self.people]
+        upright_people = [_upright(person, self.up) for person in self.people]
         panels = [
-            Panel(points=p.points, pose=p.pose, label=_label(given), box=p.box, distance=self._distance(given))
-            for p, given in zip(upright, self.people, strict=True)
+            Panel(points=p.points, pose=p.pose, label=_label(person), box=p.box, distance=self._distance(person))
+            for p, person in zip(upright_people, self.people, strict=True)
         ]
-        return panels, None if self.scan is None else self._from_above(self.scan, upright)
+        return panels, None if self.scan is None else self._from_above(self.scan, upright_people)
 
     def _distance(self, person: PersonPose) -> float | None:
         """From the sensor, m, where people were searched for; NaN where its place is unknown."""
@@ -322,17 +324,17 @@ class Poses(Sequence[PersonPose]):
             return None
         return np.nan if self.origin is None else float(np.linalg.norm(np.median(person.points, 0) - self.origin))
 
-    def _from_above(self, points: np.ndarray, upright: list[PersonPose]) -> "ScanPanel":
+    def _from_above(self, points: np.ndarray, people: list[PersonPose]) -> "ScanPanel":
         """What was searched, points (n, 3) m, with the people, z up."""
         from lidarpose.viz.bird_eye import ScanPanel
 
         R_level_input = rotation_from_up(self.up)
-        posed = [person.pose.joints for person in upright if person.pose is not None]
-        label = f"{counted(len(upright), 'person', 'people')} found" if upright else "nobody found"
+        joints = [person.pose.joints for person in people if person.pose is not None]
+        label = f"{counted(len(people), 'person', 'people')} found" if people else "nobody found"
         return ScanPanel(
             points=points @ R_level_input.T,
-            boxes=[box for person in upright if (box := person.box or _box_around(person))],
-            poses=Pose(joints=np.stack(posed), skeleton=self.skeleton) if posed else None,
+            boxes=[box for person in people if (box := person.box or _box_around(person))],
+            poses=Pose(joints=np.stack(joints), skeleton=self.skeleton) if joints else None,
             label=label,
             sensor=None if self.origin is None else tuple((R_level_input @ self.origin)[:2].tolist()),
         )
@@ -356,10 +358,10 @@ def _box_around(person: PersonPose) -> Box | None:
         return None
     forward = None if person.pose is None else facing(person.pose)
     yaw = 0.0 if forward is None else float(np.arctan2(forward[1], forward[0]))
-    R_level_own = rotation_about("z", yaw)
-    own = person.points @ R_level_own
-    low, high = own.min(0), own.max(0)
-    return Box(center=R_level_own @ ((low + high) / 2), size=high - low + 0.1, yaw=yaw, id=person.id)
+    R_level_local = rotation_about("z", yaw)
+    local_points = person.points @ R_level_local
+    low, high = local_points.min(0), local_points.max(0)
+    return Box(center=R_level_local @ ((low + high) / 2), size=high - low + 0.1, yaw=yaw, id=person.id)
 
 
 def _label(person: PersonPose) -> str:

@@ -104,36 +104,38 @@ def read_scan(scan: Scan, path: str | os.PathLike, columns: int | None) -> Scan:
 
 def pose_scan(scan: Scan, predictor: Predictor, *, skeleton: str | None = None, progress: bool = False) -> Poses:
     """Poses of the scan's people in the input's frame, with warnings; `timing_ms` has "crop" and "predict"."""
-    started = time.perf_counter()
+    start = time.perf_counter()
     clouds = scan.clouds()
-    cropped = time.perf_counter()
+    crop_end = time.perf_counter()
     warnings = list(scan.warnings)
     if warning := origin_warning(scan):
         warnings.append(warning)
         scan = replace(scan, origin=None)
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     if scan.pelvises is not None and clouds:
-        level = predictor.predict_in(clouds, origin, skeleton, progress, pelvises=scan.pelvises @ scan.R_level_input.T)
+        level_poses = predictor.predict_in(
+            clouds, origin, skeleton, progress, pelvises=scan.pelvises @ scan.R_level_input.T
+        )
     elif scan.boxes:
         box_centers = np.stack([scan.R_level_input @ box.center for box in scan.boxes])
-        level = predictor.predict_in(clouds, origin, skeleton, progress, box_centers=box_centers)
+        level_poses = predictor.predict_in(clouds, origin, skeleton, progress, box_centers=box_centers)
     else:
-        level = predictor.predict(clouds, sensor_origin=origin, skeleton=skeleton, progress=progress)
-    predict_ms = (time.perf_counter() - cropped) * 1e3
-    level = replace(level, people=_named(level, scan.boxes))
-    warnings += check_scan(scan, level)
-    people = [_in_input(person, scan) for person in level]
+        level_poses = predictor.predict(clouds, sensor_origin=origin, skeleton=skeleton, progress=progress)
+    predict_ms = (time.perf_counter() - crop_end) * 1e3
+    level_poses = replace(level_poses, people=_named(level_poses, scan.boxes))
+    warnings += check_scan(scan, level_poses)
+    people = [_in_input(person, scan) for person in level_poses]
     if scan.boxes is None:
         # a crop's warnings are its person's
         people = [replace(people[0], warnings=(*scan.warnings, *people[0].warnings))]
         warnings = warnings[len(scan.warnings) :]
     per_person = predict_ms / max(sum(person.has_pose for person in people), 1)
     return replace(
-        level,
+        level_poses,
         people=tuple(people),
         source=scan.source,
         warnings=tuple(warnings),
-        timing_ms={"crop": (cropped - started) * 1e3, "predict": predict_ms, "per_person": per_person},
+        timing_ms={"crop": (crop_end - start) * 1e3, "predict": predict_ms, "per_person": per_person},
         up=scan.up,
         scan=None if scan.detected_rows is None else scan.points,
         origin=None if scan.detected_rows is None else scan.origin,
@@ -144,15 +146,15 @@ def _named(people: Sequence[PersonPose], boxes: list[Box] | None) -> tuple[Perso
     """People with the ids of their boxes, or their positions, counted on where that is another's id."""
     if boxes is None:
         return (replace(people[0], id=0),)
-    taken = {box.id for box in boxes}
-    free = (number for number in count(len(boxes)) if number not in taken)
-    named = []
+    box_ids = {box.id for box in boxes}
+    free_ids = (number for number in count(len(boxes)) if number not in box_ids)
+    named_people = []
     for i, (person, box) in enumerate(zip(people, boxes, strict=True)):
-        id = box.id if box.id is not None else next(free) if i in taken else i
+        id = box.id if box.id is not None else next(free_ids) if i in box_ids else i
         # where a box is of other units, which the scan's warnings say, its points are not the person's fault
         is_misfit = person.has_pose and unit_warning(box.size, what="it")
-        named.append(replace(person, id=id, box=box, warnings=() if is_misfit else person.warnings))
-    return tuple(named)
+        named_people.append(replace(person, id=id, box=box, warnings=() if is_misfit else person.warnings))
+    return tuple(named_people)
 
 
 def _in_input(person: PersonPose, scan: Scan) -> PersonPose:

@@ -103,14 +103,14 @@ class DaptBackend(_PaperBackend):
 
     def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
         config = self.network.config
-        near = [cloud[(np.abs(cloud) < WINDOW).all(1)] for cloud in clouds]
-        out = self.network.outputs(near)
+        near_clouds = [cloud[(np.abs(cloud) < WINDOW).all(1)] for cloud in clouds]
+        outputs = self.network.outputs(near_clouds)
         order = config.order_in(self.header.skeleton)
-        if "logits_x" not in out:
-            return Raw.from_joints(out["coordinates"][:, order])
+        if "logits_x" not in outputs:
+            return Raw.from_joints(outputs["coordinates"][:, order])
         return Raw(
             vote=np.zeros((len(clouds), len(order), 3), np.float32),
-            heatmaps=tuple(out[f"logits_{axis}"][:, order] for axis in "xyz"),
+            heatmaps=tuple(outputs[f"logits_{axis}"][:, order] for axis in "xyz"),
             low=config.low,
             step=config.step,
         )
@@ -140,19 +140,19 @@ class ClipBackend(_PaperBackend):
     def run(self, clouds: list[np.ndarray], view: np.ndarray, clip: Clips | None = None) -> Raw:
         rows = np.arange(len(clouds))
         clip = Clips(windows=np.repeat(rows[:, None], CLIP_FRAMES, 1)) if clip is None else clip
-        config, given = self.network.config, {"person": clouds, **clip.around(rows)}
+        config, clouds_by_name = self.network.config, {"person": clouds, **clip.around(rows)}
         inputs = {}
         for name in config.clouds:
             reach = WINDOW if name == "person" else np.inf
-            points, valid = pad_frames(given[name], config, [0] * len(rows), window=reach)
+            points, valid = pad_frames(clouds_by_name[name], config, [0] * len(rows), window=reach)
             inputs[name] = torch.as_tensor(points).to(self.device), torch.as_tensor(valid).to(self.device)
         index = torch.as_tensor(clip.windows, device=self.device)
         # each frame once, however often it is in a clip
         outputs = self.network.decode({name: value[index] for name, value in self.network.encode(inputs).items()})
         joints = np.full((len(clouds), len(SMPL24), 3), np.nan, np.float32)
-        own, at = np.unique(clip.windows, return_index=True)
+        frame_rows, positions = np.unique(clip.windows, return_index=True)
         # who fills a clip alone is in the middle of it
         is_alone = np.ptp(clip.windows, axis=1) == 0
-        at = at + CLIP_FRAMES // 2 * is_alone[at // CLIP_FRAMES]
-        joints[own] = outputs.posed().flatten(0, 1)[at].float().cpu().numpy()
+        positions = positions + CLIP_FRAMES // 2 * is_alone[positions // CLIP_FRAMES]
+        joints[frame_rows] = outputs.posed().flatten(0, 1)[positions].float().cpu().numpy()
         return Raw.from_joints(joints)

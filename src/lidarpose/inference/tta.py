@@ -61,10 +61,10 @@ def apply(
 ) -> tuple[list[np.ndarray], np.ndarray]:
     """Clouds (n, 3) m about centers (B, 3) under the transform, and their view features (B, 5) from a sensor at
     origin (3,) or None."""
-    R, middle = transform.R_view_person, centers + transform.shift
-    view = np.stack([view_features(center, origin) for center in middle])
+    R, shifted_centers = transform.R_view_person, centers + transform.shift
+    view = np.stack([view_features(center, origin) for center in shifted_centers])
     view[:, :3] = view[:, :3] @ R.T
-    return [(points - center) @ R.T for points, center in zip(clouds, middle, strict=True)], view
+    return [(points - center) @ R.T for points, center in zip(clouds, shifted_centers, strict=True)], view
 
 
 def invert(poses: Pose, transform: TTATransform) -> Pose:
@@ -73,8 +73,8 @@ def invert(poses: Pose, transform: TTATransform) -> Pose:
     if not transform.mirrored:
         return poses
     flip = np.array(poses.skeleton.flip)
-    flipped: dict[str, Any] = {name: value[:, flip] for name, value in _values(poses).items()}
-    return replace(poses, **flipped)
+    flipped_values: dict[str, Any] = {name: value[:, flip] for name, value in _values(poses).items()}
+    return replace(poses, **flipped_values)
 
 
 def average(poses: list[Pose]) -> Pose:
@@ -83,23 +83,23 @@ def average(poses: list[Pose]) -> Pose:
     if len(poses) == 1:
         return poses[0]
     names = [*_values(poses[0]), *(name for name in PER_PERSON if getattr(poses[0], name) is not None)]
-    stacks = {name: np.stack([getattr(each, name) for each in poses]).astype(float) for name in names}
+    stacks = {name: np.stack([getattr(pose, name) for pose in poses]).astype(float) for name in names}
     weight = np.ones(stacks["joints"].shape[:2])
     if "confidence" in stacks:
         weight = stacks["confidence"].mean(-1) ** _POWER
         # where no answer is sure at all, all count the same
         weight = np.where(weight.sum(0) > 0, weight, 1.0)
-    out: dict[str, Any] = {
+    values: dict[str, Any] = {
         name: np.average(stack, 0, np.broadcast_to(weight.reshape(weight.shape + (1,) * (stack.ndim - 2)), stack.shape))
         for name, stack in stacks.items()
     }
-    if "in_range" in out:
+    if "in_range" in values:
         # out of range where most answers say so
-        out["in_range"] = out["in_range"] > 0.5
-    return replace(poses[0], **out)
+        values["in_range"] = values["in_range"] > 0.5
+    return replace(poses[0], **values)
 
 
 def _values(poses: Pose) -> dict[str, np.ndarray]:
     """Joints and what the network says of each."""
-    named = {name: getattr(poses, name) for name in ("joints", *PER_JOINT)}
-    return {name: value for name, value in named.items() if value is not None}
+    values = {name: getattr(poses, name) for name in ("joints", *PER_JOINT)}
+    return {name: value for name, value in values.items() if value is not None}

@@ -83,8 +83,10 @@ class KnownPlaces:
 
     def level(self, R_level_input: np.ndarray) -> "KnownPlaces":
         """In the scan's level frame."""
-        turned = {name: getattr(self, name) @ R_level_input.T for name in ("pelvises", "tracks", "rejected")}
-        return replace(self, boxes=[replace(box, center=R_level_input @ box.center) for box in self.boxes], **turned)
+        level_points = {name: getattr(self, name) @ R_level_input.T for name in ("pelvises", "tracks", "rejected")}
+        return replace(
+            self, boxes=[replace(box, center=R_level_input @ box.center) for box in self.boxes], **level_points
+        )
 
 
 @cache
@@ -102,9 +104,9 @@ def verification_features(
         features (D, 6) in the order of `FEATURES`, and the poses, joints (D, 26, 3) m in the frame of the points; of
         fewer than 5 points they are NaN.
     """
-    every = np.arange(len(detections))
+    detection_rows = np.arange(len(detections))
     clouds = [points[rows] for rows in _rows_near(detections.centers, points)]
-    return _posed(detections, every, clouds, origin, _verifier())
+    return _posed(detections, detection_rows, clouds, origin, _verifier())
 
 
 def final_score(features: np.ndarray, header: dict) -> np.ndarray:
@@ -128,47 +130,49 @@ def score_terms(features: np.ndarray) -> dict[str, np.ndarray]:
 
 def inside_column(points: np.ndarray, center: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Which points (n, 3) m are posed of a detection with this center and box size (3,) m: (n,) bool."""
-    above = points[:, 2] - center[2]
-    inside = (above > -size[2] / 2 - _BELOW) & (above < size[2] / 2 + _ABOVE)
-    return inside & (np.hypot(*(points[:, :2] - center[:2]).T) < _COLUMN)
+    height = points[:, 2] - center[2]
+    is_inside = (height > -size[2] / 2 - _BELOW) & (height < size[2] / 2 + _ABOVE)
+    return is_inside & (np.hypot(*(points[:, :2] - center[:2]).T) < _COLUMN)
 
 
 def _posed(
-    detections: Detections, chosen: np.ndarray, clouds: list[np.ndarray], origin: np.ndarray | None, backend: Backend
+    detections: Detections, rows: np.ndarray, clouds: list[np.ndarray], origin: np.ndarray | None, backend: Backend
 ) -> tuple[np.ndarray, Pose]:
-    """As `verification_features`, of the chosen detections (C,) and the points (n, 3) m near each of these; of the
-    others what comes from points is NaN."""
+    """As `verification_features`, of the detections in `rows` (C,) and the points (n, 3) m near each of these; of
+    the others what comes from points is NaN."""
     columns = [np.zeros((0, 3))] * len(detections)
-    for i, cloud in zip(chosen.tolist(), clouds, strict=True):
+    for i, cloud in zip(rows.tolist(), clouds, strict=True):
         columns[i] = cloud[inside_column(cloud, detections.centers[i], detections.sizes[i])]
-    known = sorted((i for i, column in enumerate(columns) if len(column) >= MIN_POINTS), key=lambda i: len(columns[i]))
+    posed_rows = sorted(
+        (i for i, column in enumerate(columns) if len(column) >= MIN_POINTS), key=lambda i: len(columns[i])
+    )
     skeleton = backend.header.skeleton
     joints = np.full((len(columns), len(skeleton), 3), np.nan)
     confidence, spread = np.full((2, *joints.shape[:2]), np.nan)
     odds = np.full(len(columns), np.nan)
-    for start in range(0, len(known), _BATCH):
-        batch = known[start : start + _BATCH]
+    for start in range(0, len(posed_rows), _BATCH):
+        batch = posed_rows[start : start + _BATCH]
         clouds, view = apply(TTATransform(), [columns[i] for i in batch], detections.centers[batch], origin)
         raw = backend.run(clouds, view)
         pose = estimates(raw, decoder("window"), skeleton)
         joints[batch] = pose.joints + detections.centers[batch][:, None]
         confidence[batch], spread[batch] = pose.confidence, pose.spread
         odds[batch] = 0 if raw.person is None else np.clip(raw.person[:, 0], -_MOST_ODDS, _MOST_ODDS)
-    points = np.log1p([len(column) for column in columns])
+    log_points = np.log1p([len(column) for column in columns])
     with np.errstate(invalid="ignore"):
-        features = (detections.logit, confidence.mean(1), np.log(spread).mean(1), points, detections.mounted, odds)
+        features = (detections.logit, confidence.mean(1), np.log(spread).mean(1), log_points, detections.mounted, odds)
     poses = Pose(joints=joints, skeleton=skeleton, confidence=confidence, spread=spread)
     return np.stack(features, -1).reshape(-1, len(FEATURES)), poses
 
 
 def _highest_score(detections: Detections, header: dict) -> np.ndarray:
     """(D,): what `final_score` can be at most, whatever the pose. The score's logit is linear in what is unknown."""
-    highest = np.zeros(len(detections))
+    highest_scores = np.zeros(len(detections))
     for confidence, log_spread, log_points, odds in product(_CONFIDENCES, _LOG_SPREADS, _LOG_POINTS, _ODDS):
-        posed = np.broadcast_to([confidence, log_spread, log_points], (len(detections), 3))
-        columns = (detections.logit, posed, detections.mounted, np.full(len(detections), odds))
-        highest = np.maximum(highest, final_score(np.column_stack(columns), header))
-    return highest
+        pose_features = np.broadcast_to([confidence, log_spread, log_points], (len(detections), 3))
+        columns = (detections.logit, pose_features, detections.mounted, np.full(len(detections), odds))
+        highest_scores = np.maximum(highest_scores, final_score(np.column_stack(columns), header))
+    return highest_scores
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -200,71 +204,79 @@ def verified(
         header: the detector's.
         least_score: people of a lower score are left out; near where tracks are expected, `WEAK_SCORE` is enough.
     """
-    highest = _highest_score(detections, header)
-    expected, least = np.full(len(detections), -1), np.full(len(detections), least_score)
+    highest_scores = _highest_score(detections, header)
+    known_index, thresholds = np.full(len(detections), -1), np.full(len(detections), least_score)
     if known is not None:
-        expected = _expected(detections, highest >= least_score, known)
-        least = _least_scores(detections, expected, least_score, known)
-    possible = np.flatnonzero(highest >= least)
-    near = dict(zip(possible.tolist(), _rows_near(detections.centers[possible], points), strict=True))
-    posed = possible[expected[possible] < 0]
-    features, poses = _posed(detections, posed, [points[near[i]] for i in posed.tolist()], origin, _verifier())
+        known_index = _expected(detections, highest_scores >= least_score, known)
+        thresholds = _least_scores(detections, known_index, least_score, known)
+    possible_rows = np.flatnonzero(highest_scores >= thresholds)
+    near_rows = dict(zip(possible_rows.tolist(), _rows_near(detections.centers[possible_rows], points), strict=True))
+    posed_rows = possible_rows[known_index[possible_rows] < 0]
+    features, poses = _posed(
+        detections, posed_rows, [points[near_rows[i]] for i in posed_rows.tolist()], origin, _verifier()
+    )
     scores = final_score(features, header)
-    pelvis = poses.joints[:, poses.skeleton.index("pelvis")].copy()
-    rejected = detections.centers[posed][scores[posed] < _NOBODY * least_score]
+    pelvises = poses.joints[:, poses.skeleton.index("pelvis")].copy()
+    rejected = detections.centers[posed_rows][scores[posed_rows] < _NOBODY * least_score]
     if known is not None:
-        spared = np.flatnonzero(expected >= 0)
-        scores[spared] = [known.boxes[k].score for k in expected[spared].tolist()]
-        pelvis[spared] = known.pelvises[expected[spared]]
-    chosen: list[int] = []
+        known_rows = np.flatnonzero(known_index >= 0)
+        scores[known_rows] = [known.boxes[k].score for k in known_index[known_rows].tolist()]
+        pelvises[known_rows] = known.pelvises[known_index[known_rows]]
+    person_rows: list[int] = []
     for i in np.argsort(-scores, kind="stable").tolist():
-        is_new = not (np.linalg.norm(pelvis[chosen] - pelvis[i], axis=1) < _SAME_PERSON).any()
-        if scores[i] >= least[i] and is_new and not np.isnan(pelvis[i]).any():
-            chosen.append(i)
+        is_new = not (np.linalg.norm(pelvises[person_rows] - pelvises[i], axis=1) < _SAME_PERSON).any()
+        if scores[i] >= thresholds[i] and is_new and not np.isnan(pelvises[i]).any():
+            person_rows.append(i)
     boxes: list[Box] = []
     rows: list[np.ndarray] = []
-    shown: list[int] = []
-    for i in chosen:
-        if known is not None and expected[i] >= 0:
-            box = known.boxes[expected[i]]
-            cropped, mounted = replace(box, size=box.size + 2 * _MOVED), box.mounted
+    kept_rows: list[int] = []
+    for i in person_rows:
+        if known is not None and known_index[i] >= 0:
+            box = known.boxes[known_index[i]]
+            crop_box, mounted = replace(box, size=box.size + 2 * _MOVED), box.mounted
         else:
-            others = [np.hypot(*(pelvis[k] - pelvis[i])[:2]) for k in chosen if k != i and scores[k] >= least_score]
-            alone = min(others, default=np.inf)
-            box = cropped = _box_about(Pose(joints=poses.joints[i], skeleton=poses.skeleton), alone)
+            distances = [
+                np.hypot(*(pelvises[k] - pelvises[i])[:2]) for k in person_rows if k != i and scores[k] >= least_score
+            ]
+            nearest_distance = min(distances, default=np.inf)
+            box = crop_box = _box_about(Pose(joints=poses.joints[i], skeleton=poses.skeleton), nearest_distance)
             mounted = bool(detections.mounted[i] > 0.5)
-        inside = cropped.contains(points[near[i]])
-        if inside.sum() < MIN_POINTS or len(boxes) == max_people:
+        is_inside = crop_box.contains(points[near_rows[i]])
+        if is_inside.sum() < MIN_POINTS or len(boxes) == max_people:
             continue
         boxes.append(replace(box, id=len(boxes), score=round(float(scores[i]), _DECIMALS), mounted=mounted))
-        rows.append(near[i][inside])
-        shown.append(i)
-    return People(boxes=boxes, rows=rows, pelvises=pelvis[shown], verified=expected[shown] < 0, rejected=rejected)
+        rows.append(near_rows[i][is_inside])
+        kept_rows.append(i)
+    return People(
+        boxes=boxes, rows=rows, pelvises=pelvises[kept_rows], verified=known_index[kept_rows] < 0, rejected=rejected
+    )
 
 
-def _least_scores(detections: Detections, expected: np.ndarray, least_score: float, known: KnownPlaces) -> np.ndarray:
+def _least_scores(
+    detections: Detections, known_index: np.ndarray, least_score: float, known_places: KnownPlaces
+) -> np.ndarray:
     """(D,): what a detection's score must be: less where a known person is missed, infinite where it turned out to be
     nobody."""
-    least = np.full(len(detections), least_score)
-    is_missed = ~np.isin(np.arange(len(known.tracks)), expected)
-    is_near = (_apart(detections.centers, known.tracks[is_missed]) < known.reach[is_missed]).any(1)
-    least[is_near] = min(least_score, WEAK_SCORE)
-    is_nobody = (_apart(detections.centers, known.rejected) < _SAME_PLACE).any(1)
-    least[is_nobody & ~is_near & (expected < 0)] = np.inf
-    return least
+    thresholds = np.full(len(detections), least_score)
+    is_missed = ~np.isin(np.arange(len(known_places.tracks)), known_index)
+    is_near = (_apart(detections.centers, known_places.tracks[is_missed]) < known_places.reach[is_missed]).any(1)
+    thresholds[is_near] = min(least_score, WEAK_SCORE)
+    is_nobody = (_apart(detections.centers, known_places.rejected) < _SAME_PLACE).any(1)
+    thresholds[is_nobody & ~is_near & (known_index < 0)] = np.inf
+    return thresholds
 
 
-def _expected(detections: Detections, is_sure: np.ndarray, known: KnownPlaces) -> np.ndarray:
+def _expected(detections: Detections, is_sure: np.ndarray, known_places: KnownPlaces) -> np.ndarray:
     """Of each detection, those that are sure enough, which known person it is: (D,) int, -1: none."""
-    expected = np.full(len(detections), -1)
-    sure = np.flatnonzero(is_sure)
-    if len(sure) and known.boxes:
-        away = _apart(detections.centers[sure], known.tracks[: len(known.boxes)])
-        is_alone = (_apart(known.tracks, known.tracks) < _ALONE).sum(0)[: len(known.boxes)] == 1
-        nearest = away.argmin(0)
-        for k in np.flatnonzero(is_alone & (away.min(0) < _EXPECTED)):
-            expected[sure[nearest[k]]] = k
-    return expected
+    known_index = np.full(len(detections), -1)
+    sure_rows = np.flatnonzero(is_sure)
+    if len(sure_rows) and known_places.boxes:
+        distances = _apart(detections.centers[sure_rows], known_places.tracks[: len(known_places.boxes)])
+        is_alone = (_apart(known_places.tracks, known_places.tracks) < _ALONE).sum(0)[: len(known_places.boxes)] == 1
+        nearest_rows = distances.argmin(0)
+        for k in np.flatnonzero(is_alone & (distances.min(0) < _EXPECTED)):
+            known_index[sure_rows[nearest_rows[k]]] = k
+    return known_index
 
 
 def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -272,16 +284,17 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.linalg.norm(a[:, None, :2] - b[None, :, :2], axis=-1)
 
 
-def _box_about(pose: Pose, alone: float) -> Box:
-    """The box of a person by the pose, joints (J, 3) m; alone m: distance to the next person, who is to be kept out."""
+def _box_about(pose: Pose, nearest_distance: float) -> Box:
+    """The box of a person by the pose, joints (J, 3) m; nearest_distance: to the next person, m, who is to be kept
+    out."""
     forward = facing(pose)
     yaw = 0.0 if forward is None else float(np.arctan2(forward[1], forward[0]))
-    R_level_own = rotation_about("z", yaw)
-    own = pose.joints @ R_level_own
-    beside = max(_LEAST_ROOM, min(_ROOM, alone / 2 - _HALF_BODY))
+    R_level_local = rotation_about("z", yaw)
+    local_joints = pose.joints @ R_level_local
+    margin = max(_LEAST_ROOM, min(_ROOM, nearest_distance / 2 - _HALF_BODY))
     # soles are nearer to the lowest joint than the top of the head to the highest
-    low, high = own.min(0) - [beside, beside, 0.8 * _ROOM], own.max(0) + [beside, beside, 1.2 * _ROOM]
-    return rounded(Box(center=R_level_own @ ((low + high) / 2), size=high - low, yaw=yaw))
+    low, high = local_joints.min(0) - [margin, margin, 0.8 * _ROOM], local_joints.max(0) + [margin, margin, 1.2 * _ROOM]
+    return rounded(Box(center=R_level_local @ ((low + high) / 2), size=high - low, yaw=yaw))
 
 
 def rounded(box: Box) -> Box:
@@ -294,7 +307,7 @@ def _rows_near(centers: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
     """Of each center the rows (k,) of the points (n, 3) m about it, ascending."""
     strips, rows = Strips(points[:, 0]), []
     for x, y in centers[:, :2]:
-        near = strips.rows(x - _AROUND, x + _AROUND)
-        near = near[np.abs(points[near, 1] - y) < _AROUND]
-        rows.append(np.sort(near[np.abs(points[near, 0] - x) < _AROUND]))
+        near_rows = strips.rows(x - _AROUND, x + _AROUND)
+        near_rows = near_rows[np.abs(points[near_rows, 1] - y) < _AROUND]
+        rows.append(np.sort(near_rows[np.abs(points[near_rows, 0] - x) < _AROUND]))
     return rows

@@ -59,10 +59,10 @@ class Boxes(list[Box]):
     def __getitem__(self, index: slice) -> "Boxes": ...
 
     def __getitem__(self, index):
-        chosen = super().__getitem__(index)
+        item = super().__getitem__(index)
         if not isinstance(index, slice):
-            return chosen
-        return Boxes(chosen, source=self.source, warnings=self.warnings, detector=self.detector, up=self.up)
+            return item
+        return Boxes(item, source=self.source, warnings=self.warnings, detector=self.detector, up=self.up)
 
     def to_dict(self) -> dict:
         """The document of the schema lidarpose.boxes/1, which `read_boxes` reads."""
@@ -125,12 +125,14 @@ def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike
     try:
         content = source if isinstance(source, _Content) else _load_file(source, calib)
         boxes = [_box(entry, f"people[{i}]") for i, entry in enumerate(_entries(content))]
-        first: dict[str, int] = {}
+        first_index: dict[str, int] = {}
         for i, box in enumerate(boxes):
             # a table and `poses["1"]` do not tell 1 from "1"
-            if box.id is not None and first.setdefault(str(box.id), i) != i:
-                came = f"{_show(box.id)}, which people[{first[str(box.id)]}] has too"
-                raise FormatError(f"people[{i}].id: expected an id of its own, got {came}: rename one or leave it out")
+            if box.id is not None and first_index.setdefault(str(box.id), i) != i:
+                actual = f"{_show(box.id)}, which people[{first_index[str(box.id)]}] has too"
+                raise FormatError(
+                    f"people[{i}].id: expected an id of its own, got {actual}: rename one or leave it out"
+                )
         up = _up(content)
     except FormatError as problem:
         raise file_error("boxes" if isinstance(source, _Content) else source, problem) from None
@@ -223,8 +225,8 @@ def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | N
     for height, width, length, x, y, z, rotation_y in people:
         # the camera's y points down and a label's place is the middle of the box's bottom
         center = R_rect_velo.T @ (np.array([x, y - height / 2, z]) - t_rect_velo)
-        ahead = R_rect_velo.T @ np.array([math.cos(rotation_y), 0, -math.sin(rotation_y)])
-        rows.append([*center.tolist(), length, width, height, math.atan2(ahead[1], ahead[0])])
+        forward = R_rect_velo.T @ np.array([math.cos(rotation_y), 0, -math.sin(rotation_y)])
+        rows.append([*center.tolist(), length, width, height, math.atan2(forward[1], forward[0])])
     return rows
 
 
@@ -236,14 +238,14 @@ def _read_calibration(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
     for keys, shape in ((("R0_rect", "R_rect"), (3, 3)), (("Tr_velo_to_cam", "Tr_velo_cam"), (3, 4))):
         values = _parse_numbers([word for key in keys for word in lines.get(key, ())], math.prod(shape))
         if values is None:
-            came = shorten(", ".join(lines)) or "nothing"
-            raise file_error(path, f"expected {keys[0]}: and {math.prod(shape)} numbers, got {came}: copy it again")
+            actual = shorten(", ".join(lines)) or "nothing"
+            raise file_error(path, f"expected {keys[0]}: and {math.prod(shape)} numbers, got {actual}: copy it again")
         matrix = np.array(values).reshape(shape)
         if np.abs(matrix[:, :3] @ matrix[:, :3].T - np.eye(3)).max() > _ROTATION_TOLERANCE:
             raise file_error(path, f"expected a rotation as {keys[0]}, got a matrix that is none: copy it again")
         matrices.append(matrix)
-    rectify, T_cam_velo = matrices
-    return rectify @ T_cam_velo[:, :3], rectify @ T_cam_velo[:, 3]
+    R_rect_cam, T_cam_velo = matrices
+    return R_rect_cam @ T_cam_velo[:, :3], R_rect_cam @ T_cam_velo[:, 3]
 
 
 def _parse_numbers(words: list[str], count: int) -> list[float] | None:
@@ -337,13 +339,13 @@ def _id(entry: dict, where: str) -> str | int | None:
     return None
 
 
-def _keys(entry: dict, wanted: str) -> str:
+def _keys(entry: dict, expected_key: str) -> str:
     """What the entry has instead of the wanted key, with the nearest spelling."""
     if not entry:
         return "got {}"
     names = [str(key) for key in entry]
-    near = difflib.get_close_matches(wanted, names, n=1, cutoff=0.6)
-    hint = f"; rename {near[0]!r}" if near else ""
+    matches = difflib.get_close_matches(expected_key, names, n=1, cutoff=0.6)
+    hint = f"; rename {matches[0]!r}" if matches else ""
     return f"got the keys {shorten(', '.join(names), 60)}{hint}"
 
 

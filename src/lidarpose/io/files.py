@@ -156,8 +156,8 @@ def _nearest(path: str | os.PathLike) -> str:
         return f"; the folder {folder} does not exist either"
     if name in names:
         return "; it is a link to what is not there"
-    near = difflib.get_close_matches(name, names, n=1, cutoff=0.7)
-    return f"; did you mean {near[0]}?" if near else "; check the path"
+    matches = difflib.get_close_matches(name, names, n=1, cutoff=0.7)
+    return f"; did you mean {matches[0]}?" if matches else "; check the path"
 
 
 def check_writable(path: str | os.PathLike) -> None:
@@ -203,20 +203,20 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
         if not stat.S_ISREG(mode):
             raise file_error(path, "is a device or pipe; give the name of a file to write")
 
-    made: list[Path] = []
+    new_folders: list[Path] = []
     # a character that is cut in two is left out
-    kept = target.name.encode("utf-8", "ignore")[-_MAX_KEPT_NAME:].decode("utf-8", "ignore")
+    name_end = target.name.encode("utf-8", "ignore")[-_MAX_KEPT_NAME:].decode("utf-8", "ignore")
     # random: containers on one disk have the same process ids
-    temporary = target.parent / f".{secrets.token_hex(8)}-{kept}"
+    temporary = target.parent / f".{secrets.token_hex(8)}-{name_end}"
     try:
         for folder in (*reversed(target.parent.parents), target.parent):
             if not folder.is_dir():
                 folder.mkdir(exist_ok=True)
-                made.append(folder)
+                new_folders.append(folder)
         # made at once, so that a folder without write access is known before hours of work go into the block
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except OSError as error:
-        _remove(temporary, made)
+        _remove(temporary, new_folders)
         raise _write_error(path, target.parent, error) from None
     try:
         yield temporary
@@ -224,7 +224,7 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
             os.fsync(file.fileno())
         os.replace(temporary, target)
     except BaseException as error:
-        _remove(temporary, made)
+        _remove(temporary, new_folders)
         if isinstance(error, OSError) and _is_about(error, temporary):
             raise _write_error(path, target.parent, error) from None
         raise
@@ -355,10 +355,10 @@ def _write_error(path: object, folder: Path, error: OSError) -> InputError:
     return file_error(path, f"cannot write into the folder {folder} ({error.strerror or error}); {remedy}")
 
 
-def _remove(temporary: Path, made: list[Path]) -> None:
+def _remove(temporary: Path, new_folders: list[Path]) -> None:
     with suppress(OSError):
         temporary.unlink()
-    for folder in reversed(made):
+    for folder in reversed(new_folders):
         with suppress(OSError):
             folder.rmdir()
 

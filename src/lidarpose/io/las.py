@@ -63,16 +63,16 @@ def _unpack(data: bytes, start: int, size: int, num_points: int) -> bytes:
         import lazrs
     except ModuleNotFoundError as error:
         raise missing_extra(error, "reading .laz") from None
-    place = struct.unpack_from("<H", data, 94)[0]
+    offset = struct.unpack_from("<H", data, 94)[0]
     for _ in range(struct.unpack_from("<I", data, 100)[0]):
-        if place + 54 > min(start, len(data)):
+        if offset + 54 > min(start, len(data)):
             break
-        user, record, length = struct.unpack_from("<16sHH", data, place + 2)
-        place += 54 + length
+        user, record, length = struct.unpack_from("<16sHH", data, offset + 2)
+        offset += 54 + length
         if (user.rstrip(b"\0"), record) == _LASZIP:
             points = bytearray(num_points * size)
             try:
-                record_data = data[place - length : place]
+                record_data = data[offset - length : offset]
                 lazrs.LasZipDecompressor(_Unseekable(data[start:]), record_data).decompress_many(points)
             # a damaged file may stop lazrs in the middle, by an error that is no Exception
             except BaseException as error:

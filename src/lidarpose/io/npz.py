@@ -40,10 +40,10 @@ def read_npz(
     data = read_bytes(path, expected=expected)
     try:
         with open_npz(data) as (archive, members):
-            known = [name for name in wanted if name in members]
-            contents = unpack(archive, [members[name] for name in known], len(data))
+            present_names = [name for name in wanted if name in members]
+            contents = unpack(archive, [members[name] for name in present_names], len(data))
             # copied, since what lies in a file's bytes cannot be written to
-            arrays = {name: load_array(content).copy() for name, content in zip(known, contents, strict=True)}
+            arrays = {name: load_array(content).copy() for name, content in zip(present_names, contents, strict=True)}
             return arrays, sorted(members)
     except FormatError as problem:
         raise file_error(path, problem) from None
@@ -56,12 +56,12 @@ def open_npz(data: bytes):
     """Yields the archive in a file's bytes and its members by the names of arrays; raises FormatError."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            arrays = [member for member in archive.infolist() if member.filename.endswith(".npy")]
+            members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
             # numpy writes no others, and zipfile unpacks them without bounds
-            if other := [member for member in arrays if member.compress_type not in _METHODS]:
-                came = f"another compression of {shorten(other[0].filename)}"
-                raise FormatError("an npz that is stored or deflated", came, "save it with numpy.savez_compressed")
-            yield archive, {member.filename.removesuffix(".npy"): member for member in arrays}
+            if other_members := [member for member in members if member.compress_type not in _METHODS]:
+                actual = f"another compression of {shorten(other_members[0].filename)}"
+                raise FormatError("an npz that is stored or deflated", actual, "save it with numpy.savez_compressed")
+            yield archive, {member.filename.removesuffix(".npy"): member for member in members}
     except (FormatError, MemoryError):
         raise
     # zipfile and zlib raise many kinds for a damaged archive
@@ -75,8 +75,8 @@ def open_npz(data: bytes):
 def unpack(archive: zipfile.ZipFile, members: list[zipfile.ZipInfo], size: int) -> Iterator[bytes]:
     """The content of each member of an archive of `size` bytes, of no more bytes than are announced; raises
     FormatError where those are too many."""
-    packed = min(size, sum(member.compress_size for member in members))
-    check_unpacked(packed, sum(member.file_size for member in members))
+    packed_size = min(size, sum(member.compress_size for member in members))
+    check_unpacked(packed_size, sum(member.file_size for member in members))
     for member in members:
         with archive.open(member) as file:
             # read() would unpack everything before it looks at the announced size
@@ -94,8 +94,8 @@ def array_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype, Literal["C
     try:
         version = np.lib.format.read_magic(file)
         # version 3 differs from 2 by the characters that field names may have
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, is_fortran, dtype = read(file)
+        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, is_fortran, dtype = read_header(file)
         return shape, dtype, "F" if is_fortran else "C"
     except Exception as error:
         reason = shorten(str(error))

@@ -23,8 +23,8 @@ _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": "
 
 def _columns(data: bytes, num_points: int, types: Sequence[str], starts: Sequence[int], steps: Sequence[int]):
     """x y z (n, 3) of bytes: the type of each, where its first value begins, and how far it is to the next one."""
-    where = zip(types, starts, steps, strict=True)
-    return np.stack([np.ndarray(num_points, kind, data, start, step) for kind, start, step in where], axis=-1)
+    layouts = zip(types, starts, steps, strict=True)
+    return np.stack([np.ndarray(num_points, kind, data, start, step) for kind, start, step in layouts], axis=-1)
 
 
 def parse_pcd(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
@@ -34,34 +34,34 @@ def parse_pcd(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]
     # the older versions of the format leave out COUNT
     sizes, types, count_words = (header.get(key, ["1"] * len(names)) for key in ("SIZE", "TYPE", "COUNT"))
     if not len(sizes) == len(types) == len(count_words) == len(names):
-        came = f"{len(names)} fields, {len(sizes)} sizes, {len(types)} types and {len(count_words)} counts"
-        raise FormatError("a PCD header with as many SIZE, TYPE, COUNT as FIELDS", came, "export it again")
+        actual = f"{len(names)} fields, {len(sizes)} sizes, {len(types)} types and {len(count_words)} counts"
+        raise FormatError("a PCD header with as many SIZE, TYPE, COUNT as FIELDS", actual, "export it again")
     counts = [parse_count(c, "COUNT") for c in count_words]
     formats = [t.lower() + s for t, s in zip(types, sizes, strict=True)]
     for text in set(formats) - set(_PCD_TYPES):
         raise FormatError("PCD TYPE F, I or U with SIZE 1, 2, 4 or 8", f"{shorten(text)!r}", "export it again")
     size_keys = ("POINTS",) if "POINTS" in header else ("WIDTH", "HEIGHT")
     num_points = math.prod(parse_count(" ".join(header.get(key, ())), key) for key in size_keys)
-    pick = pick_xyz(names)
-    if any(counts[i] != 1 for i in pick):
+    xyz_indices = pick_xyz(names)
+    if any(counts[i] != 1 for i in xyz_indices):
         raise FormatError("expected COUNT 1 for x, y and z in the PCD header: export the points without features")
     if encoding not in ("ascii", "binary", "binary_compressed"):
         raise FormatError("PCD DATA ascii, binary or binary_compressed", f"{encoding!r}", "export it again")
     if not num_points:
         return np.empty((0, 3)), names, ()
     if encoding == "ascii":
-        cells = [sum(counts[:i]) for i in pick]
+        cells = [sum(counts[:i]) for i in xyz_indices]
         return parse_rows(decode(data[start:]), num_points, cells, sum(counts)), names, ()
     widths = [int(s) * c for s, c in zip(sizes, counts, strict=True)]
-    offsets, row_size = [sum(widths[:i]) for i in pick], sum(widths)
+    offsets, row_size = [sum(widths[:i]) for i in xyz_indices], sum(widths)
     if encoding == "binary":
         check_bytes(data, start, num_points * row_size, num_points)
         starts, steps = [start + offset for offset in offsets], [row_size] * 3
     else:
         # field by field: all x, then all y
         data = _decompress(data, start, num_points * row_size, num_points)
-        starts, steps = [num_points * offset for offset in offsets], [widths[i] for i in pick]
-    return _columns(data, num_points, [f"<{formats[i]}" for i in pick], starts, steps), names, ()
+        starts, steps = [num_points * offset for offset in offsets], [widths[i] for i in xyz_indices]
+    return _columns(data, num_points, [f"<{formats[i]}" for i in xyz_indices], starts, steps), names, ()
 
 
 def _pcd_header(data: bytes) -> tuple[dict[str, list[str]], str, int]:
@@ -81,14 +81,14 @@ def _decompress(data: bytes, start: int, size: int, num_points: int) -> bytes:
     from lzf import decompress
 
     check_bytes(data, start, 8, num_points)
-    packed, unpacked = (int(n) for n in np.frombuffer(data, "<u4", 2, start))
-    check_bytes(data, start + 8, packed, num_points)
-    if unpacked != size:
-        came = f"a compressed part of {packed} bytes for {unpacked}"
-        raise FormatError(f"{size} bytes for {num_points} points of the header", came, "export it again")
-    check_unpacked(packed, unpacked)
+    packed_size, unpacked_size = (int(n) for n in np.frombuffer(data, "<u4", 2, start))
+    check_bytes(data, start + 8, packed_size, num_points)
+    if unpacked_size != size:
+        actual = f"a compressed part of {packed_size} bytes for {unpacked_size}"
+        raise FormatError(f"{size} bytes for {num_points} points of the header", actual, "export it again")
+    check_unpacked(packed_size, unpacked_size)
     try:
-        body = decompress(data[start + 8 : start + 8 + packed], unpacked)
+        body = decompress(data[start + 8 : start + 8 + packed_size], unpacked_size)
     except ValueError:
         body = None
     if body is None or len(body) != size:
@@ -101,10 +101,10 @@ def parse_ply(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]
     encoding, elements, body_start = _ply_header(data)
     start, skip_lines = body_start, 0
     for name, num_points, properties in elements:
-        odd = next((kind for _, kind in properties if kind not in _PLY_TYPES), None)
-        if odd and (name == "vertex" or encoding != "ascii"):
-            came = f"{shorten(odd)!r} in {shorten(name)}"
-            raise FormatError("PLY vertices of plain numbers, before any list", came, "export the points alone")
+        unknown_type = next((kind for _, kind in properties if kind not in _PLY_TYPES), None)
+        if unknown_type and (name == "vertex" or encoding != "ascii"):
+            actual = f"{shorten(unknown_type)!r} in {shorten(name)}"
+            raise FormatError("PLY vertices of plain numbers, before any list", actual, "export the points alone")
         types = [_BYTE_ORDERS[encoding] + _PLY_TYPES.get(kind, "u1") for _, kind in properties]
         widths = [np.dtype(kind).itemsize for kind in types]
         if name == "vertex":
@@ -114,14 +114,14 @@ def parse_ply(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]
     else:
         raise FormatError("a PLY element 'vertex'", "none", "export the points")
     names = tuple(name for name, _ in properties)
-    pick = pick_xyz(names)
+    xyz_indices = pick_xyz(names)
     if not num_points:
         return np.empty((0, 3)), names, ()
     if encoding == "ascii":
-        return parse_rows(decode(data[body_start:]), num_points, pick, len(names), skip=skip_lines), names, ()
+        return parse_rows(decode(data[body_start:]), num_points, xyz_indices, len(names), skip=skip_lines), names, ()
     check_bytes(data, start, num_points * sum(widths), num_points)
-    starts = [start + sum(widths[:i]) for i in pick]
-    return _columns(data, num_points, [types[i] for i in pick], starts, [sum(widths)] * 3), names, ()
+    starts = [start + sum(widths[:i]) for i in xyz_indices]
+    return _columns(data, num_points, [types[i] for i in xyz_indices], starts, [sum(widths)] * 3), names, ()
 
 
 def _ply_header(data: bytes) -> tuple[str, list[tuple[str, int, list[tuple[str, str]]]], int]:

@@ -148,17 +148,17 @@ class _DataUnpickler(pickle._Unpickler):
             # a defaultdict's first is what makes its values
             pairs = next((part for part in args if not isinstance(part, _Name)), ())
             pairs = pairs.items() if type(pairs) is dict else pairs
-            made: Any = self.dict_of([part for key, value in pairs for part in (key, value)])
+            result: Any = self.dict_of([part for key, value in pairs for part in (key, value)])
         elif name in _ITEMS:
             (items,) = args or [()]
-            made = _ITEMS[name](self.keys(items) if "set" in name else items)
+            result = _ITEMS[name](self.keys(items) if "set" in name else items)
         elif name in _CALLS:
-            made = _CALLS[name](*args)
+            result = _CALLS[name](*args)
         elif name in _CLASSES:
             raise TypeError(f"a call of {name}")
         else:
             return _Stub(name, args)
-        return self.charged(made)
+        return self.charged(result)
 
     def set_state(self) -> None:
         """The stub on the stack becomes what it stands for."""
@@ -179,12 +179,12 @@ class _DataUnpickler(pickle._Unpickler):
         self.stack[-1] = value
         object.__setattr__(stub, "value", value)
 
-    def charged(self, made: Any) -> Any:
+    def charged(self, value: Any) -> Any:
         """The value, once it is sure that all values together do not outgrow the file."""
-        self.copies_left -= getattr(made, "nbytes", None) or (len(made) if hasattr(made, "__len__") else 0)
+        self.copies_left -= getattr(value, "nbytes", None) or (len(value) if hasattr(value, "__len__") else 0)
         if self.copies_left < 0:
             raise FormatError(f"has arrays of more than {_COPIES} times its size: ask for npz")
-        return made
+        return value
 
     def dict_of(self, items: list) -> dict:
         """A dict of keys and values by turns."""
@@ -258,9 +258,9 @@ def _check_levels(value: Any, levels: dict[int, int | None], depth: int = 0) -> 
         parts = value.flat
     if id(value) not in levels:
         levels[id(value)] = None
-        inner = (part for part in parts if type(part) not in _PLAIN and (type(part) not in _CONTAINERS or part))
-        below = (_check_levels(part, levels, depth + 1) for part in inner) if depth < MAX_DEPTH else ()
-        levels[id(value)] = 1 + max(below, default=0)
+        children = (part for part in parts if type(part) not in _PLAIN and (type(part) not in _CONTAINERS or part))
+        child_levels = (_check_levels(part, levels, depth + 1) for part in children) if depth < MAX_DEPTH else ()
+        levels[id(value)] = 1 + max(child_levels, default=0)
     count = levels[id(value)]
     if count is None:
         raise FormatError("holds a list or dict that contains itself: ask for npz")
@@ -308,8 +308,8 @@ def _array(data: Any, dtype: object, shape: object, order: object = "C") -> np.n
         raise FormatError(f"has an array of a {type(data).__name__}: {_REMEDY}")
     # the product of thousands of numbers would take long
     if len(shape) > 64 or len(data) != math.prod(shape) * (1 if is_object else dtype.itemsize):
-        came = f"{shorten(str(shape[:64]))} with {len(data)} {'items' if is_object else 'bytes'}"
-        raise FormatError(f"has an array of the shape {came}: {_REMEDY}")
+        actual = f"{shorten(str(shape[:64]))} with {len(data)} {'items' if is_object else 'bytes'}"
+        raise FormatError(f"has an array of the shape {actual}: {_REMEDY}")
     if not is_object:
         return np.ndarray(shape, dtype, data, order=layout).copy(layout)
     flat = np.empty(len(data), dtype)
@@ -349,26 +349,26 @@ def _chumpy(name: str, state: Any) -> np.ndarray | Unread:
     """A Ch holds its numbers as `x`; a Select is a choice from another, by flat indices."""
     source, indices = state.get("a"), state.get("idxs")
     if name == "chumpy.reordering.Select" and isinstance(source, np.ndarray) and isinstance(indices, np.ndarray):
-        selected = source.flat[indices.astype(np.int64)]
+        selection = source.flat[indices.astype(np.int64)]
         shape = state.get("preferred_shape")
-        return selected if shape is None else selected.reshape(shape)
+        return selection if shape is None else selection.reshape(shape)
     return state["x"] if isinstance(state.get("x"), np.ndarray) else Unread(name)
 
 
-def _dense(name: str, state: Any, most: int) -> np.ndarray:
+def _dense(name: str, state: Any, max_numbers: int) -> np.ndarray:
     """A compressed sparse matrix, of at most so many numbers: indptr (lines + 1,), indices and data (entries,)."""
     try:
         rows, columns = map(operator.index, state.get("_shape", state.get("shape")))
         starts, indices, data = (state[part] for part in ("indptr", "indices", "data"))
-        if rows * columns > most:
-            came = f"{rows} x {columns}; up to {MAX_DENSE} numbers are read in all"
-            raise FormatError(f"has a {name} of {came}: ask for npz")
-        dense = np.zeros((columns, rows) if "csc" in name else (rows, columns), data.dtype)
+        if rows * columns > max_numbers:
+            actual = f"{rows} x {columns}; up to {MAX_DENSE} numbers are read in all"
+            raise FormatError(f"has a {name} of {actual}: ask for npz")
+        matrix = np.zeros((columns, rows) if "csc" in name else (rows, columns), data.dtype)
         counts = np.diff(starts.astype(np.int64))
-        fits = starts[0] == 0 and indices.shape == data.shape == (starts[-1],) and (counts >= 0).all()
-        if not fits or (indices < 0).any() or data.dtype.kind not in "fiub":
+        is_consistent = starts[0] == 0 and indices.shape == data.shape == (starts[-1],) and (counts >= 0).all()
+        if not is_consistent or (indices < 0).any() or data.dtype.kind not in "fiub":
             raise ValueError
-        np.add.at(dense, (np.repeat(np.arange(len(dense)), counts), indices), data)
+        np.add.at(matrix, (np.repeat(np.arange(len(matrix)), counts), indices), data)
     except (AttributeError, IndexError, KeyError, TypeError, ValueError):
         raise FormatError(f"has a {name} whose parts do not fit together: {_REMEDY}") from None
-    return dense.T.copy() if "csc" in name else dense
+    return matrix.T.copy() if "csc" in name else matrix

@@ -114,8 +114,8 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
             else:
                 points, fields, notes = _PARSERS[suffix](data)
             points = np.ascontiguousarray(points, dtype=np.float64)
-            finite = np.isfinite(points).all(axis=1)
-        num_dropped = len(points) - int(finite.sum())
+            is_finite = np.isfinite(points).all(axis=1)
+        num_dropped = len(points) - int(is_finite.sum())
         if not len(points):
             raise FormatError("has no points; expected at least one: was it saved completely?")
         if num_dropped == len(points):
@@ -131,16 +131,20 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
         raise file_error(path, f"cannot be read as a {suffix} file ({reason}); export it again") from None
     if num_dropped:
         notes = (*notes, f"dropped {num_dropped} of {len(points)} points that were NaN, infinite or incomplete")
-        points = points[finite]
+        points = points[is_finite]
     return Cloud(points=points, num_dropped=num_dropped, fields=tuple(fields), warnings=tuple(notes))
 
 
 def _refuse_foreign(data: bytes, suffix: str) -> None:
     """Refuses content that is plainly something else than the suffix says, and suffixes nobody here can read."""
-    for other, pattern in _MAGIC.items():
+    for content_suffix, pattern in _MAGIC.items():
         if re.match(pattern, data):
-            if other != suffix.replace(".laz", ".las"):
-                raise FormatError(f"a {suffix or 'known'} file", f"a {other} file's content", f"rename it to {other}")
+            if content_suffix != suffix.replace(".laz", ".las"):
+                raise FormatError(
+                    f"a {suffix or 'known'} file",
+                    f"a {content_suffix} file's content",
+                    f"rename it to {content_suffix}",
+                )
             return
     for pattern, problem in _FOREIGN.items():
         if re.match(pattern, data):
@@ -160,46 +164,48 @@ def _parse_bin(data: bytes, columns: int | None):
     if columns is None:
         columns, notes = _guess_columns(data)
     if len(data) % (4 * columns):
-        fits = [str(c) for c in range(3, 9) if len(data) % (4 * c) == 0]
+        fitting_columns = [str(c) for c in range(3, 9) if len(data) % (4 * c) == 0]
         remedy = (
-            f"say how many values a row has (columns {' or '.join(fits)})"
-            if fits
+            f"say how many values a row has (columns {' or '.join(fitting_columns)})"
+            if fitting_columns
             else "it is cut off or not raw float32, copy it again"
         )
-        came = f"{len(data)} bytes, which do not divide by {4 * columns}"
-        raise FormatError(f"rows of {columns} float32 (x y z first)", came, remedy)
+        actual = f"{len(data)} bytes, which do not divide by {4 * columns}"
+        raise FormatError(f"rows of {columns} float32 (x y z first)", actual, remedy)
     points = np.frombuffer(data, "<f4").reshape(-1, columns)[:, :3].astype(np.float64)
     share = float((np.isfinite(points) & (np.abs(points) > _MAX_PLAUSIBLE)).any(axis=1).mean())
     if share > _MAX_IMPLAUSIBLE_SHARE:
-        came = f"{share:.0%} of rows beyond {_MAX_PLAUSIBLE:g} m"
-        raise FormatError(f"rows of {columns} float32 in meters", came, "another format, or another number of columns?")
+        actual = f"{share:.0%} of rows beyond {_MAX_PLAUSIBLE:g} m"
+        raise FormatError(
+            f"rows of {columns} float32 in meters", actual, "another format, or another number of columns?"
+        )
     return points, {4: KITTI_FIELDS, 5: NUSCENES_FIELDS}.get(columns) or numbered(columns), notes
 
 
 def _guess_columns(data: bytes) -> tuple[int, tuple[str, ...]]:
     """(values a row, warnings): KITTI's 4 but where the size or the content speaks for nuScenes' 5, or for 3."""
     four, five = len(KITTI_FIELDS), len(NUSCENES_FIELDS)
-    fits = [columns for columns in (four, five, 3) if len(data) % (4 * columns) == 0]
-    usual = four if four in fits or five not in fits else five
-    why, other = "the size divides by 5 values and not by 4" if usual == five else "", four
+    candidates = [columns for columns in (four, five, 3) if len(data) % (4 * columns) == 0]
+    guess = four if four in candidates or five not in candidates else five
+    reason, alternative = "the size divides by 5 values and not by 4" if guess == five else "", four
     values = np.frombuffer(data[: len(data) // 4 * 4], "<f4")
-    if five in fits:
+    if five in candidates:
         # a fifth value that is always a beam number is no accident, misaligned meters are not whole
         ring = values.reshape(-1, five)[:, -1]
         if ((ring >= 0) & (ring < _MAX_BEAMS) & (ring == np.floor(ring))).all() and ring.any():
-            usual, fits, why = five, [five], "every fifth value is a beam number"
-    if usual in fits and len(fits) > 1:
-        width = {columns: _width(values.reshape(-1, columns)) for columns in fits}
-        best = min(fits, key=width.__getitem__)
-        if width[best] < width[usual] - _NARROWER:
-            usual, why = best, f"rows of {usual} would mix its columns up"
-        elif best != usual:
-            why, other = f"nothing speaks clearly for rows of {best}", best
-    if not why:
-        return usual, ()
+            guess, candidates, reason = five, [five], "every fifth value is a beam number"
+    if guess in candidates and len(candidates) > 1:
+        widths = {columns: _width(values.reshape(-1, columns)) for columns in candidates}
+        narrowest = min(candidates, key=widths.__getitem__)
+        if widths[narrowest] < widths[guess] - _NARROWER:
+            guess, reason = narrowest, f"rows of {guess} would mix its columns up"
+        elif narrowest != guess:
+            reason, alternative = f"nothing speaks clearly for rows of {narrowest}", narrowest
+    if not reason:
+        return guess, ()
     names = {four: " (KITTI)", five: " (nuScenes)"}
-    remedy = f"give columns {other}{names.get(other, '')} if that is wrong"
-    return usual, (f"read as rows of {usual} float32{names.get(usual, '')}, since {why}; {remedy}",)
+    remedy = f"give columns {alternative}{names.get(alternative, '')} if that is wrong"
+    return guess, (f"read as rows of {guess} float32{names.get(guess, '')}, since {reason}; {remedy}",)
 
 
 def _width(rows: np.ndarray) -> float:
@@ -225,28 +231,28 @@ def _parse_npz(data: bytes):
             if (len(shape) == 2 and shape[1] >= 3 and dtype.kind in "fiu") or (dtype.names and len(shape) == 1):
                 keys.append(key)
         if not keys or len(keys) > 1 and keys[0] not in ("points", "xyz"):
-            came = shorten(", ".join(members)) or "no array"
-            raise FormatError("'points', 'xyz' or one (n, 3+) array alone", came, "save it with points=")
+            actual = shorten(", ".join(members)) or "no array"
+            raise FormatError("'points', 'xyz' or one (n, 3+) array alone", actual, "save it with points=")
         (content,) = unpack(archive, [members[keys[0]]], len(data))
         return _points_of(load_array(content), f"the array {shorten(keys[0])!r}")
 
 
-def _points_of(array: np.ndarray, what: str):
+def _points_of(array: np.ndarray, label: str):
     if array.dtype.names:
         names = array.dtype.names
         parts = [array[names[i]] for i in pick_xyz(names)]
         if any(part.ndim != 1 or part.dtype.kind not in "fiu" for part in parts):
-            raise FormatError(f"(n,) records with numbers x, y, z in {what}", array.shape, "save (n, 3) floats")
+            raise FormatError(f"(n,) records with numbers x, y, z in {label}", array.shape, "save (n, 3) floats")
         return np.stack([part.astype(np.float64) for part in parts], axis=-1), names, ()
     if array.dtype.kind not in "fiu":
-        raise FormatError(f"numbers in {what}", f"dtype {array.dtype}", "save a float array")
+        raise FormatError(f"numbers in {label}", f"dtype {array.dtype}", "save a float array")
     if array.ndim != 2 or array.shape[1] < 3 or is_transposed(array.shape):
         remedy = "save x, y and z of each point" if array.ndim == 2 else "save a row for each point"
         if array.ndim == 2 and 3 <= array.shape[0] <= FEW_ROWS:
             remedy = "save its transpose, points.T"
         elif array.ndim > 2 and array.shape[-1] >= 3:
             remedy = f"save points.reshape(-1, {array.shape[-1]})"
-        raise FormatError(f"{what} to have the shape (n, 3+)", array.shape, remedy)
+        raise FormatError(f"{label} to have the shape (n, 3+)", array.shape, remedy)
     return array[:, :3].astype(np.float64), numbered(array.shape[1]), ()
 
 

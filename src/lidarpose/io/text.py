@@ -19,11 +19,11 @@ _MISSING = ("", "na", "n/a", "nan", "-nan", "+nan", "null", "none", "<na>")
 
 def pick_xyz(names: Sequence[str]) -> list[int]:
     """The positions of x, y and z among column names, in any case."""
-    low = [name.strip().lower() for name in names]
-    if not {"x", "y", "z"} <= set(low):
-        came = shorten(" ".join(names)) or "none"
-        raise FormatError("columns x, y and z", came, "export or rename x, y, z")
-    return [low.index(axis) for axis in "xyz"]
+    lower_names = [name.strip().lower() for name in names]
+    if not {"x", "y", "z"} <= set(lower_names):
+        actual = shorten(" ".join(names)) or "none"
+        raise FormatError("columns x, y and z", actual, "export or rename x, y, z")
+    return [lower_names.index(axis) for axis in "xyz"]
 
 
 def numbered(columns: int) -> tuple[str, ...]:
@@ -46,8 +46,8 @@ def parse_count(text: str, what: str) -> int:
 def check_bytes(data: bytes, start: int, size: int, num_points: int) -> None:
     """Raises FormatError where fewer than `size` bytes follow `start`."""
     if len(data) - start < size:
-        came = max(len(data) - start, 0)
-        raise FormatError(f"is cut off: expected {size} bytes for {num_points} points, got {came}; copy it again")
+        num_bytes = max(len(data) - start, 0)
+        raise FormatError(f"is cut off: expected {size} bytes for {num_points} points, got {num_bytes}; copy it again")
 
 
 def parse_rows(text: str, num_rows: int, columns: list[int], num_cells: int, *, skip: int = 0) -> np.ndarray:
@@ -61,8 +61,8 @@ def parse_rows(text: str, num_rows: int, columns: list[int], num_cells: int, *, 
         raise FormatError(f"is cut off: expected {num_rows} points, got {len(rows)}; copy or export it again")
     for number, row in enumerate(rows, 1):
         if row.count(" ") + 1 != num_cells:
-            came = f"{row.count(' ') + 1} in {shorten(row)!r} on line {number} of the points"
-            raise FormatError(f"{num_cells} values a row, as the header says", came, "export it again")
+            actual = f"{row.count(' ') + 1} in {shorten(row)!r} on line {number} of the points"
+            raise FormatError(f"{num_cells} values a row, as the header says", actual, "export it again")
     try:
         return np.loadtxt(rows, np.float64, comments=None, usecols=columns, ndmin=2)
     except ValueError as error:
@@ -89,37 +89,37 @@ def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...
         _check_width(body, names, separator, num_skipped)
     points = _read_csv(body, pick_xyz(names), separator=separator, decimal=decimal, num_skipped=num_skipped)
     if not has_header and is_transposed((len(points), len(names))):
-        came = f"{len(points)} of {len(names)}"
-        raise FormatError("a line of x y z for each point", came, "save its transpose")
+        actual = f"{len(points)} of {len(names)}"
+        raise FormatError("a line of x y z for each point", actual, "save its transpose")
     return points, tuple(names), ()
 
 
 def _find_columns(text: str) -> tuple[Sequence[str], int, bool, str | None, str]:
     """(names of the columns, lines before the first row, whether a header names them, separator, decimal mark)."""
-    skip, comment = 0, ""
+    num_skipped, comment = 0, ""
     for line in io.StringIO(text):
-        first = line.split("#")[0].strip()
-        if first:
+        first_line = line.split("#")[0].strip()
+        if first_line:
             break
         comment = line.lstrip("# \t").strip() or comment
-        skip += 1
+        num_skipped += 1
     else:
         raise FormatError("has no points; expected lines of x y z: was it saved completely?")
-    separator, decimal = _separator(first)
+    separator, decimal = _separator(first_line)
     # CloudCompare marks its header by slashes
-    cells = _split(first.removeprefix("//").strip(), separator)
-    came = f"on line {skip + 1}, {shorten(first)!r}"
+    cells = _split(first_line.removeprefix("//").strip(), separator)
+    where = f"on line {num_skipped + 1}, {shorten(first_line)!r}"
     if not all(_is_number(cell, decimal) for cell in cells):
         if not {"x", "y", "z"} <= {cell.lower() for cell in cells}:
-            raise FormatError("numbers, or a header with x, y and z", f"others {came}", "export or rename x, y, z")
-        return cells, skip + 1, True, separator, decimal
+            raise FormatError("numbers, or a header with x, y and z", f"others {where}", "export or rename x, y, z")
+        return cells, num_skipped + 1, True, separator, decimal
     if len(cells) < 3:
-        raise FormatError("at least 3 columns x y z", f"{len(cells)} {came}", "export x, y and z")
+        raise FormatError("at least 3 columns x y z", f"{len(cells)} {where}", "export x, y and z")
     # a comment above names them where it has as many words with x, y and z: numpy.savetxt writes its header so
     for words in (_split(comment, mark) for mark in (None, ",", ";")):
         if len(words) == len(cells) and {"x", "y", "z"} <= {word.lower() for word in words}:
-            return words, skip, False, separator, decimal
-    return numbered(len(cells)), skip, False, separator, decimal
+            return words, num_skipped, False, separator, decimal
+    return numbered(len(cells)), num_skipped, False, separator, decimal
 
 
 def _check_width(body: str, names: Sequence[str], separator: str | None, num_skipped: int) -> None:
@@ -163,8 +163,8 @@ def _wrong_line(
     for number, line in enumerate(lines, num_skipped + 1):
         cells = _split(line.strip(), separator)
         if line.strip() and not all(i < len(cells) and _is_number(cells[i], decimal) for i in columns):
-            came = f"{shorten(line)!r} on line {number}{where}"
-            return FormatError("numbers for x, y and z", came, "correct that line")
+            actual = f"{shorten(line)!r} on line {number}{where}"
+            return FormatError("numbers for x, y and z", actual, "correct that line")
     return FormatError(f"expected rows of numbers ({shorten(str(reason))}): export it again")
 
 

@@ -160,13 +160,13 @@ def listing() -> list[str]:
             count = len(device.frame(0).azimuth)
             kind = "rosette" if device.duration else "camera"
             beams = f"{count:,} in {device.duration * 1e3:.0f} ms" if device.duration else f"{count:,} pixels"
-            wide = np.degrees(device.azimuths[1] - device.azimuths[0])
+            field_of_view = np.degrees(device.azimuths[1] - device.azimuths[0])
         else:
-            kind, beams, wide = "spinning", f"{device.rows} x {device.columns}", 360.0
+            kind, beams, field_of_view = "spinning", f"{device.rows} x {device.columns}", 360.0
         source = _SOURCES.get(name, "nominal" if name.startswith("os") else "maker")
         ranges = f"{device.range_min:g}-{device.range_max:g}"
         elevation = f"{low:+.1f} to {high:+.1f}"
-        rows.append((name, kind, beams, f"{wide:.4g}", elevation, ranges, f"{device.height:g}", source))
+        rows.append((name, kind, beams, f"{field_of_view:.4g}", elevation, ranges, f"{device.height:g}", source))
     widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
     return ["  ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
 
@@ -270,8 +270,8 @@ def _from_json(path: Path, text: str) -> dict:
 
 
 def _own_form(path: Path, content: dict) -> dict:
-    if unknown := next((key for key in content if key not in _KEYS), None):
-        raise file_error(path, str(unknown_name("key", unknown, _KEYS)))
+    if unknown_key := next((key for key in content if key not in _KEYS), None):
+        raise file_error(path, str(unknown_name("key", unknown_key, _KEYS)))
     fields = {"elevations": content["elevations_deg"], "offsets": content.get("azimuth_offsets_deg")}
     fields |= {key: content[key] for key in ("columns", "name") if key in content}
     for key in _NUMBERS:
@@ -302,24 +302,28 @@ def _from_csv(path: Path, text: str) -> dict:
     if not rows:
         raise file_error(path, "holds no rows; expected one a laser")
     header = [cell.lower() for cell in rows[0]]
-    elevation, offset, offset_name = 0, None, None
+    elevation_column, offset_column, offset_name = 0, None, None
     if any(cell and not _is_number(cell) for cell in header):
         rows = rows[1:]
-        names = {re.sub("[ -]", "_", cell.split("(")[0].strip()): k for k, cell in enumerate(header)}
-        elevation_name = next((name for name in _ELEVATIONS if name in names), None)
-        offset_name = next((name for name in (*_OFFSETS, *_CLOCKWISE) if name in names), None)
-        offset = names[offset_name] if offset_name else None
+        column_by_name = {re.sub("[ -]", "_", cell.split("(")[0].strip()): k for k, cell in enumerate(header)}
+        elevation_name = next((name for name in _ELEVATIONS if name in column_by_name), None)
+        offset_name = next((name for name in (*_OFFSETS, *_CLOCKWISE) if name in column_by_name), None)
+        offset_column = column_by_name[offset_name] if offset_name else None
         if elevation_name is None:
             raise file_error(path, f"has no column named elevation, got {', '.join(header)}")
-        elevation = names[elevation_name]
+        elevation_column = column_by_name[elevation_name]
         # beams without their offsets would be another sensor
-        if offset is None and (unknown := next((n for n in names if re.search("azimuth|offset|horiz", n)), None)):
-            raise file_error(path, f"unknown column {unknown!r}: name it azimuth_offset, or azimuth if clockwise")
+        if offset_column is None and (
+            unknown_column := next((n for n in column_by_name if re.search("azimuth|offset|horiz", n)), None)
+        ):
+            raise file_error(
+                path, f"unknown column {unknown_column!r}: name it azimuth_offset, or azimuth if clockwise"
+            )
     elif len(rows[0]) > 1:
         raise file_error(path, f"has {len(rows[0])} columns and no header; name them: elevation, azimuth")
     try:
-        offsets = None if offset is None else [float(row[offset]) for row in rows]
-        elevations = [float(row[elevation]) for row in rows]
+        offsets = None if offset_column is None else [float(row[offset_column]) for row in rows]
+        elevations = [float(row[elevation_column]) for row in rows]
     except (ValueError, IndexError):
         raise file_error(path, "must hold a number of degrees in every row") from None
     return {"elevations": elevations, "offsets": offsets, "clockwise": offset_name in _CLOCKWISE}

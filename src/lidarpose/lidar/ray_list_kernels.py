@@ -21,7 +21,7 @@ def ray_list(vertices, faces, directions, shift, time):
     shift (V, 3): how far the vertices move from time 0 to 1, time (N,) of the rays; both None if nothing moves.
     """
     count = len(directions)
-    best = np.full(count, np.inf)
+    best_depth = np.full(count, np.inf)
     face = np.full(count, -1, np.int32)
     cube = np.empty(count, np.int8)
     for i in range(count):
@@ -57,11 +57,11 @@ def ray_list(vertices, faces, directions, shift, time):
                 start[cell[i] + 1] += 1
         for b in range(grid * grid):
             start[b + 1] += start[b]
-        order, filled = np.empty(n, np.int64), start.copy()
+        order, next_slot = np.empty(n, np.int64), start.copy()
         for i in range(count):
             if cube[i] == side:
-                order[filled[cell[i]]] = i
-                filled[cell[i]] += 1
+                order[next_slot[cell[i]]] = i
+                next_slot[cell[i]] += 1
         _cells(vertices, shift, axis, sign, u0, v0, scale_u, scale_v, grid, cells)
         for f in range(len(faces)):
             i0, i1, i2 = 4 * np.int64(faces[f, 0]), 4 * np.int64(faces[f, 1]), 4 * np.int64(faces[f, 2])
@@ -70,30 +70,30 @@ def ray_list(vertices, faces, directions, shift, time):
             b0 = max(min(cells[np.uintp(i0 + 1)], cells[np.uintp(i1 + 1)], cells[np.uintp(i2 + 1)]), 0)
             a1 = min(max(cells[np.uintp(i0 + 2)], cells[np.uintp(i1 + 2)], cells[np.uintp(i2 + 2)]), grid - 1)
             b1 = min(max(cells[np.uintp(i0 + 3)], cells[np.uintp(i1 + 3)], cells[np.uintp(i2 + 3)]), grid - 1)
-            rays = 0
+            ray_count = 0
             if b0 <= b1:
                 for a in range(a0, a1 + 1):
-                    rays += start[a * grid + b1 + 1] - start[a * grid + b0]
-            if not rays:
+                    ray_count += start[a * grid + b1 + 1] - start[a * grid + b0]
+            if not ray_count:
                 continue
-            front = -np.inf
+            max_depth = -np.inf
             low_p, high_p, low_q, high_q = np.inf, -np.inf, np.inf, -np.inf
             for j in range(3):
                 i = faces[f, j]
                 w[j] = sign * vertices[i, axis]
                 p[j], q[j] = vertices[i, across], vertices[i, along]
-                front = max(front, w[j])
+                max_depth = max(max_depth, w[j])
                 low_p, high_p = min(low_p, p[j]), max(high_p, p[j])
                 low_q, high_q = min(low_q, q[j]), max(high_q, q[j])
                 if shift is not None:
                     dw[j] = sign * shift[i, axis]
                     dp[j], dq[j] = shift[i, across], shift[i, along]
-                    front = max(front, w[j] + dw[j])
+                    max_depth = max(max_depth, w[j] + dw[j])
                     low_p, high_p = min(low_p, p[j] + dp[j]), max(high_p, p[j] + dp[j])
                     low_q, high_q = min(low_q, q[j] + dq[j]), max(high_q, q[j] + dq[j])
             # rays of this side go at most as far aside as ahead: what lies farther aside meets none of them
-            aside = max(low_p, -high_p, low_q, -high_q)
-            if front <= 0 or front * _SLACK < aside:
+            least_aside = max(low_p, -high_p, low_q, -high_q)
+            if max_depth <= 0 or max_depth * _SLACK < least_aside:
                 continue
             w0, w1, w2 = w[0], w[1], w[2]
             p0, p1, p2 = p[0], p[1], p[2]
@@ -116,12 +116,12 @@ def ray_list(vertices, faces, directions, shift, time):
                         total = e0 + e1 + e2
                         if total != 0:
                             depth = (e0 * w0 + e1 * w1 + e2 * w2) / total
-                            if AXIS < depth < best[i]:
-                                best[i] = depth
+                            if AXIS < depth < best_depth[i]:
+                                best_depth[i] = depth
                                 face[i] = f
     for i in range(count):
-        best[i] /= abs(directions[i, cube[i] // 2])
-    return best.astype(np.float32), face
+        best_depth[i] /= abs(directions[i, cube[i] // 2])
+    return best_depth.astype(np.float32), face
 
 
 @compiled
@@ -131,20 +131,20 @@ def _cells(vertices, shift, axis, sign, u0, v0, scale_u, scale_v, grid, cells):
     across, along = (axis + 1) % 3, (axis + 2) % 3
     for i in range(len(vertices)):
         w, p, q = sign * vertices[i, axis], vertices[i, across], vertices[i, along]
-        ahead = (w > AXIS) & (w * STEEP > abs(p)) & (w * STEEP > abs(q))
-        inverse = 1 / (w if ahead else 1.0)
+        is_ahead = (w > AXIS) & (w * STEEP > abs(p)) & (w * STEEP > abs(q))
+        inverse = 1 / (w if is_ahead else 1.0)
         low_u, low_v = p * inverse, q * inverse
         high_u, high_v = low_u, low_v
         if shift is not None:
             # what moves along a line that is all ahead moves along a line on the cube's side: its ends bound it
             w, p, q = w + sign * shift[i, axis], p + shift[i, across], q + shift[i, along]
-            also = (w > AXIS) & (w * STEEP > abs(p)) & (w * STEEP > abs(q))
-            inverse = 1 / (w if also else 1.0)
+            is_ahead_later = (w > AXIS) & (w * STEEP > abs(p)) & (w * STEEP > abs(q))
+            inverse = 1 / (w if is_ahead_later else 1.0)
             low_u, high_u = min(low_u, p * inverse), max(high_u, p * inverse)
             low_v, high_v = min(low_v, q * inverse), max(high_v, q * inverse)
-            ahead &= also
+            is_ahead &= is_ahead_later
         low_u, high_u, low_v, high_v = low_u - ROUNDING, high_u + ROUNDING, low_v - ROUNDING, high_v + ROUNDING
-        cells[4 * i] = np.int32(min(max((low_u - u0) * scale_u, -1.0), float(grid))) if ahead else -1
-        cells[4 * i + 1] = np.int32(min(max((low_v - v0) * scale_v, -1.0), float(grid))) if ahead else -1
-        cells[4 * i + 2] = np.int32(min(max((high_u - u0) * scale_u, -1.0), float(grid))) if ahead else grid
-        cells[4 * i + 3] = np.int32(min(max((high_v - v0) * scale_v, -1.0), float(grid))) if ahead else grid
+        cells[4 * i] = np.int32(min(max((low_u - u0) * scale_u, -1.0), float(grid))) if is_ahead else -1
+        cells[4 * i + 1] = np.int32(min(max((low_v - v0) * scale_v, -1.0), float(grid))) if is_ahead else -1
+        cells[4 * i + 2] = np.int32(min(max((high_u - u0) * scale_u, -1.0), float(grid))) if is_ahead else grid
+        cells[4 * i + 3] = np.int32(min(max((high_v - v0) * scale_v, -1.0), float(grid))) if is_ahead else grid

@@ -120,18 +120,20 @@ def _phase(turns_a_minute: float, seconds: np.ndarray) -> np.ndarray:
 def _refracted(rays: np.ndarray, normal: np.ndarray, ratio: float) -> np.ndarray:
     """Unit rays (N, 3) behind a surface, by Snell's law. normal (N, 3) or (3,), along the rays; ratio: index in front
     over index behind."""
-    along = (rays * normal).sum(-1, keepdims=True)
-    behind = np.sqrt(1 - ratio**2 * (1 - along**2))
-    return ratio * rays + (behind - ratio * along) * normal
+    cos_incidence = (rays * normal).sum(-1, keepdims=True)
+    cos_refraction = np.sqrt(1 - ratio**2 * (1 - cos_incidence**2))
+    return ratio * rays + (cos_refraction - ratio * cos_incidence) * normal
 
 
 def _through_wedge(rays: np.ndarray, phase: np.ndarray, index: float, *, slant_first: bool) -> np.ndarray:
     """Unit rays (N, 3) about +x behind a wedge that has turned by `phase` (N,) rad about x."""
-    flat = np.array([1.0, 0.0, 0.0])
-    lean = np.sin(_SLANT)
-    slanted = np.stack([np.full_like(phase, np.cos(_SLANT)), lean * np.cos(phase), lean * np.sin(phase)], -1)
-    first, second = (slanted, flat) if slant_first else (flat, slanted)
-    return _refracted(_refracted(rays, first, 1 / index), second, index)
+    flat_normal = np.array([1.0, 0.0, 0.0])
+    sin_slant = np.sin(_SLANT)
+    slanted_normal = np.stack(
+        [np.full_like(phase, np.cos(_SLANT)), sin_slant * np.cos(phase), sin_slant * np.sin(phase)], -1
+    )
+    first_normal, second_normal = (slanted_normal, flat_normal) if slant_first else (flat_normal, slanted_normal)
+    return _refracted(_refracted(rays, first_normal, 1 / index), second_normal, index)
 
 
 def _angles(rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -163,8 +165,8 @@ def _avia(frame: int):
     share = np.repeat(np.arange(4000) / 4000, _AVIA_LINES)
     t = (frame + share) * _FRAME
     line = np.tile(np.arange(_AVIA_LINES, dtype=np.int32), 4000)
-    up = ((_AVIA_LINES - 1) / 2 - line) * _AVIA_SPACING
-    rays = np.stack([np.cos(up), np.zeros(len(t)), np.sin(up)], -1)
+    line_elevation = ((_AVIA_LINES - 1) / 2 - line) * _AVIA_SPACING
+    rays = np.stack([np.cos(line_elevation), np.zeros(len(t)), np.sin(line_elevation)], -1)
     rays = _through_wedge(rays, _phase(_AVIA_TURNS[0], t) + np.pi, _AVIA_INDEX, slant_first=True)
     rays = _through_wedge(rays, _phase(_AVIA_TURNS[1], t), _AVIA_INDEX, slant_first=False)
     return *_angles(rays), share, line
@@ -194,22 +196,22 @@ def _mid360(frame: int):
     lag = mirror - _phase(_MID360_HEAD, t) - _MID360_STARTS[1]
     bend = sum(size * np.exp(1j * (mirror - m * lag)) for m, size in _MID360_BEND.items())
     fan = sum(size * np.exp(1j * (a * mirror + b * lag)) for (a, b), size in _MID360_FAN.items())
-    across = np.pi / 180 * (bend + 1j * _MID360_LASERS[line] * fan)
-    off = np.abs(across)
-    sideways = across / off * np.sin(off)
-    rays = np.stack([sideways.real, sideways.imag, np.cos(off)], -1)
-    lean = np.sin(_MID360_LEAN)
-    normal = np.stack([lean * np.cos(mirror), lean * np.sin(mirror), np.full(len(t), np.cos(_MID360_LEAN))], -1)
+    deflection = np.pi / 180 * (bend + 1j * _MID360_LASERS[line] * fan)
+    deflection_angle = np.abs(deflection)
+    sideways = deflection / deflection_angle * np.sin(deflection_angle)
+    rays = np.stack([sideways.real, sideways.imag, np.cos(deflection_angle)], -1)
+    sin_lean = np.sin(_MID360_LEAN)
+    normal = np.stack([sin_lean * np.cos(mirror), sin_lean * np.sin(mirror), np.full(len(t), np.cos(_MID360_LEAN))], -1)
     rays = rays - 2 * (rays * normal).sum(-1, keepdims=True) * normal
     # it runs clockwise as seen from above
     azimuth, elevation = _angles(rays)
     return -azimuth, elevation, share, line
 
 
-def _pinhole(frame: int, *, columns: int = 320, rows: int = 240, wide: float = 58.4, tall: float = 45.5):
+def _pinhole(frame: int, *, columns: int = 320, rows: int = 240, width_deg: float = 58.4, height_deg: float = 45.5):
     """A pinhole camera's pixels, all at once; the line is the row, 0 the lowest."""
-    y = np.tan(np.radians(wide / 2)) * (1 - 2 * (np.arange(columns) + 0.5) / columns)
-    z = np.tan(np.radians(tall / 2)) * (2 * (np.arange(rows) + 0.5) / rows - 1)
+    y = np.tan(np.radians(width_deg / 2)) * (1 - 2 * (np.arange(columns) + 0.5) / columns)
+    z = np.tan(np.radians(height_deg / 2)) * (2 * (np.arange(rows) + 0.5) / rows - 1)
     y, z = (grid.ravel() for grid in np.meshgrid(y, z))
     line = np.repeat(np.arange(rows, dtype=np.int32), columns)
     return np.arctan2(y, 1.0), np.arctan2(z, np.hypot(1.0, y)), np.zeros(len(y)), line

@@ -91,19 +91,19 @@ def cast_rays(
     scale = np.empty(len(azimuth))
     if inverse_x.size:
         rows = np.argsort(elevation, kind="stable")
-        table = np.tan(elevation[rows])
-        turned = np.mod(azimuth, 2 * np.pi)
-        columns = np.argsort(turned, kind="stable")
-        for part in _sectors(turned[columns]):
-            picked = columns[part]
-            start = turned[picked[0]]
-            ahead = np.mod(turned[picked] - start, 2 * np.pi)
-            center = start + ahead[-1] / 2
-            relative = ahead - ahead[-1] / 2
-            scale[picked] = 1 / np.cos(relative)
+        tangents = np.tan(elevation[rows])
+        wrapped_azimuth = np.mod(azimuth, 2 * np.pi)
+        columns = np.argsort(wrapped_azimuth, kind="stable")
+        for sector in _sectors(wrapped_azimuth[columns]):
+            sector_columns = columns[sector]
+            start = wrapped_azimuth[sector_columns[0]]
+            azimuth_from_start = np.mod(wrapped_azimuth[sector_columns] - start, 2 * np.pi)
+            center = start + azimuth_from_start[-1] / 2
+            azimuth_from_center = azimuth_from_start - azimuth_from_start[-1] / 2
+            scale[sector_columns] = 1 / np.cos(azimuth_from_center)
             raster(
-                vertices, faces, center, np.tan(relative), np.cos(relative), table,
-                picked, rows, inverse_x, face,
+                vertices, faces, center, np.tan(azimuth_from_center), np.cos(azimuth_from_center), tangents,
+                sector_columns, rows, inverse_x, face,
             )  # fmt: skip
     # x / (cos a cos e) of x in the sectors' frames
     with np.errstate(divide="ignore"):
@@ -111,14 +111,14 @@ def cast_rays(
     return distance.astype(np.float32), face
 
 
-def _sectors(turned: np.ndarray) -> list[np.ndarray]:
+def _sectors(azimuths: np.ndarray) -> list[np.ndarray]:
     """Index lists that split sorted azimuths in [0, 2 pi) into sectors, starting after the widest gap."""
-    gaps = np.diff(turned, append=turned[0] + 2 * np.pi)
-    order = np.roll(np.arange(len(turned)), -(int(np.argmax(gaps)) + 1))
-    ahead = np.mod(turned[order] - turned[order[0]], 2 * np.pi)
+    gaps = np.diff(azimuths, append=azimuths[0] + 2 * np.pi)
+    order = np.roll(np.arange(len(azimuths)), -(int(np.argmax(gaps)) + 1))
+    azimuth_from_start = np.mod(azimuths[order] - azimuths[order[0]], 2 * np.pi)
     sectors, start = [], 0
     while start < len(order):
-        stop = int(np.searchsorted(ahead, ahead[start] + SECTOR, side="right"))
+        stop = int(np.searchsorted(azimuth_from_start, azimuth_from_start[start] + SECTOR, side="right"))
         sectors.append(order[start:stop])
         start = stop
     return sectors
@@ -175,16 +175,16 @@ def scan(
     if sensor.origins:
         options: dict[str, Any] = {"divergence": divergence, "sub_beams": sub_beams, "pulse": pulse, "margin": margin}
         parts = []
-        for height, single, _ in sensor.origins:
+        for height, origin_sensor, _ in sensor.origins:
             origin = np.array([0, 0, height])
-            parts.append(scan(vertices - origin, faces, single, window_vertices=body - origin, **options))
+            parts.append(scan(vertices - origin, faces, origin_sensor, window_vertices=body - origin, **options))
         return _join_origins(sensor, parts)
     window = (0, 0, 0, 0)
     if len(body):
         center, left, right, low, high = bounds(body)
         margin += divergence / 2
-        near = sensor.window(center + left - margin, center + right + margin, low - margin, high + margin)
-        window = near.column0, near.columns, near.row0, near.rows
+        beam_window = sensor.window(center + left - margin, center + right + margin, low - margin, high + margin)
+        window = beam_window.column0, beam_window.columns, beam_window.row0, beam_window.rows
     offsets, weights, tangents = np.zeros(1), np.ones((1, 1)), sensor.tangents[:, None]
     if divergence:
         offsets, weights = footprint(divergence, sub_beams)
@@ -201,24 +201,24 @@ def scan(
 def footprint(divergence: float, sub_beams: int) -> tuple[np.ndarray, np.ndarray]:
     """Offsets (S,) rad of the sub-beams in azimuth and in elevation, and the power (S, S) in each, in all 1."""
     offsets = ((np.arange(sub_beams) + 0.5) / sub_beams - 0.5) * divergence
-    across = np.exp(-2 * (offsets / (divergence / 2)) ** 2)
-    weights = across[:, None] * across
+    profile = np.exp(-2 * (offsets / (divergence / 2)) ** 2)
+    weights = profile[:, None] * profile
     return offsets, weights / weights.sum()
 
 
 def _join_origins(sensor: Sensor, parts: list[Hits]) -> Hits:
     """The hits of each of the `Sensor.origins`, ordered by column, then ring, in one window."""
     # columns of all origins counted from the first one of any
-    turn, base = sensor.columns, parts[0].column0
-    starts = [(part.column0 - base + turn // 2) % turn - turn // 2 for part in parts]
-    first = min(starts)
-    points, column, ring, inside = [], [], [], []
+    turn_columns, base_column = sensor.columns, parts[0].column0
+    starts = [(part.column0 - base_column + turn_columns // 2) % turn_columns - turn_columns // 2 for part in parts]
+    first_column = min(starts)
+    points, column, ring, window_rings = [], [], [], []
     for part, start, (height, _, rings) in zip(parts, starts, sensor.origins, strict=True):
         points.append(part.points + np.array([0, 0, height], np.float32))
-        column.append(part.column + np.int32(start - first))
+        column.append(part.column + np.int32(start - first_column))
         ring.append(rings[part.ring].astype(np.int32))
-        inside.append(rings[part.row0 : part.row0 + part.rows])
-    rows = np.concatenate(inside)
+        window_rings.append(rings[part.row0 : part.row0 + part.rows])
+    rows = np.concatenate(window_rings)
     row0, end = (int(rows.min()), int(rows.max()) + 1) if len(rows) else (0, 0)
     all_columns, all_rings = np.concatenate(column), np.concatenate(ring)
     order = np.lexsort([all_rings, all_columns])
@@ -227,9 +227,11 @@ def _join_origins(sensor: Sensor, parts: list[Hits]) -> Hits:
         face=np.concatenate([part.face for part in parts])[order],
         column=all_columns[order],
         ring=all_rings[order],
-        columns=min(max(start - first + part.columns for part, start in zip(parts, starts, strict=True)), turn),
+        columns=min(
+            max(start - first_column + part.columns for part, start in zip(parts, starts, strict=True)), turn_columns
+        ),
         rows=end - row0,
-        column0=(base + first) % turn,
+        column0=(base_column + first_column) % turn_columns,
         row0=row0,
     )
 
@@ -282,15 +284,15 @@ def scan_pattern(
     body = vertices[:body_vertices]
     if moved is not None and len(body):
         body = np.concatenate([body, moved[:body_vertices]])
-    picked = _rays_near(rays, body, margin)
-    time = rays.time[picked] if moved is not None else None
-    distance, face = cast_ray_list(vertices, faces, rays.directions[picked], moved=moved, time=time)
+    ray_indices = _rays_near(rays, body, margin)
+    time = rays.time[ray_indices] if moved is not None else None
+    distance, face = cast_ray_list(vertices, faces, rays.directions[ray_indices], moved=moved, time=time)
     # no hit is infinitely far
-    seen = np.flatnonzero((distance >= pattern.range_min) & (distance <= pattern.range_max))
-    index = picked[seen]
+    hit_rows = np.flatnonzero((distance >= pattern.range_min) & (distance <= pattern.range_max))
+    index = ray_indices[hit_rows]
     return Hits(
-        points=(rays.directions[index] * distance[seen, None]).astype(np.float32),
-        face=face[seen],
+        points=(rays.directions[index] * distance[hit_rows, None]).astype(np.float32),
+        face=face[hit_rows],
         column=index.astype(np.int32),
         ring=rays.line[index],
         columns=0,
@@ -307,16 +309,18 @@ def _rays_near(rays: Rays, body: np.ndarray, margin: float) -> np.ndarray:
     center, left, right, low, high = bounds(np.ascontiguousarray(body, np.float64))
     left, right = left - margin, right + margin
     if right - left >= 2 * np.pi:
-        picked = np.arange(len(rays.azimuth))
+        ray_indices = np.arange(len(rays.azimuth))
     else:
         start = np.mod(center + left + np.pi, 2 * np.pi) - np.pi
         stop = start + right - left
         a, b = np.searchsorted(rays.azimuth, start, "left"), np.searchsorted(rays.azimuth, stop, "right")
-        picked = np.arange(a, b)
+        ray_indices = np.arange(a, b)
         if stop > np.pi:
-            picked = np.concatenate([np.arange(np.searchsorted(rays.azimuth, stop - 2 * np.pi, "right")), picked])
-    elevation = rays.elevation[picked]
-    return picked[(elevation >= low - margin) & (elevation <= high + margin)]
+            ray_indices = np.concatenate(
+                [np.arange(np.searchsorted(rays.azimuth, stop - 2 * np.pi, "right")), ray_indices]
+            )
+    elevation = rays.elevation[ray_indices]
+    return ray_indices[(elevation >= low - margin) & (elevation <= high + margin)]
 
 
 def cast_ray_list(
@@ -361,8 +365,8 @@ def _as_points(name: str, values: Any) -> np.ndarray:
     if values.ndim != 2 or values.shape[1] != 3:
         raise InputError(f"{name} must be (n, 3), got {values.shape}")
     if values.size and not (values.max() < FARTHEST and values.min() > -FARTHEST):
-        bad = int((~(np.abs(values) < FARTHEST).all(1)).sum())
-        raise InputError(f"{name} must be finite and below {FARTHEST:.0e} m, but {bad} of {len(values)} are not")
+        bad_count = int((~(np.abs(values) < FARTHEST).all(1)).sum())
+        raise InputError(f"{name} must be finite and below {FARTHEST:.0e} m, but {bad_count} of {len(values)} are not")
     return values
 
 
@@ -381,10 +385,11 @@ def _as_times(time: np.ndarray, count: int) -> np.ndarray:
     time = _as_floats("time", time, f"({count},) numbers, one a ray")
     if time.shape != (count,):
         raise InputError(f"time must be ({count},), one a ray, got {time.shape}")
-    outside = np.flatnonzero(~((time >= 0) & (time <= 1)))
-    if len(outside):
+    outside_indices = np.flatnonzero(~((time >= 0) & (time <= 1)))
+    if len(outside_indices):
         raise InputError(
-            f"time must be within 0 and 1, the ends of the motion, got {time[outside[0]]} for ray {outside[0]}"
+            f"time must be within 0 and 1, the ends of the motion, got {time[outside_indices[0]]} "
+            f"for ray {outside_indices[0]}"
         )
     return time
 

@@ -107,42 +107,42 @@ def _projected(vertices, c, s, P, Y):
 
     Returns how many are not ahead; theirs mean nothing.
     """
-    flat, beside = vertices.reshape(-1), 0
+    flat, beside_count = vertices.reshape(-1), 0
     for i in range(len(vertices)):
         east, north, z = flat[np.uintp(3 * i)], flat[np.uintp(3 * i + 1)], flat[np.uintp(3 * i + 2)]
         x = c * east + s * north
         y = c * north - s * east
-        ahead = (x > AXIS) & (x * STEEP > abs(y)) & (x * STEEP > abs(z))
-        beside += not ahead
-        inverse = 1 / (x if ahead else 1.0)
+        is_ahead = (x > AXIS) & (x * STEEP > abs(y)) & (x * STEEP > abs(z))
+        beside_count += not is_ahead
+        inverse = 1 / (x if is_ahead else 1.0)
         Y[np.uintp(i)] = y * inverse
         P[np.uintp(3 * i)] = y * inverse
         P[np.uintp(3 * i + 1)] = z * inverse
         P[np.uintp(3 * i + 2)] = inverse
-    return beside
+    return beside_count
 
 
 @compiled
 def _crossing(faces, column):
     """The faces whose corners do not all lie between the same two columns, ascending."""
-    corners, crosses = faces.reshape(-1), np.empty(len(faces), np.bool_)
+    corners, is_crossing = faces.reshape(-1), np.empty(len(faces), np.bool_)
     for f in range(len(faces)):
         a = column[np.uintp(corners[np.uintp(3 * f)])]
         b = column[np.uintp(corners[np.uintp(3 * f + 1)])]
         d = column[np.uintp(corners[np.uintp(3 * f + 2)])]
-        crosses[f] = (a != b) | (b != d)
-    return _picked(crosses)
+        is_crossing[f] = (a != b) | (b != d)
+    return _picked(is_crossing)
 
 
 @compiled
-def _picked(wanted):
-    """The numbers of those wanted."""
-    picked = np.empty(len(wanted) + 1, np.int32)
+def _picked(mask):
+    """The indices at which the mask is true."""
+    indices = np.empty(len(mask) + 1, np.int32)
     n = np.uintp(0)
-    for i in range(len(wanted)):
-        picked[n] = i
-        n += np.uintp(wanted[i])
-    return picked[:n]
+    for i in range(len(mask)):
+        indices[n] = i
+        n += np.uintp(mask[i])
+    return indices[:n]
 
 
 @compiled
@@ -155,9 +155,9 @@ def raster(vertices, faces, center, column_tan, column_cos, row_tan, column_inde
     c, s = np.cos(center), np.sin(center)
     # what is read together is kept together
     P, Y = np.empty(3 * len(vertices)), np.empty(len(vertices))
-    beside = _projected(vertices, c, s, P, Y)
+    beside_count = _projected(vertices, c, s, P, Y)
     column, rows = _find_all(Y, _table(column_tan)), _table(row_tan)
-    ahead = _ahead(vertices, c, s) if beside else np.empty(0, np.bool_)
+    is_ahead = _ahead(vertices, c, s) if beside_count else np.empty(0, np.bool_)
     lines = np.empty(2 * len(column_tan))
     for k in range(len(column_tan)):
         lines[2 * k], lines[2 * k + 1] = column_tan[k], column_cos[k]
@@ -165,26 +165,26 @@ def raster(vertices, faces, center, column_tan, column_cos, row_tan, column_inde
     n = 0
     for f in _crossing(faces, column):
         a, b, d = np.int64(faces[f, 0]), np.int64(faces[f, 1]), np.int64(faces[f, 2])
-        if beside and not (ahead[a] and ahead[b] and ahead[d]):
+        if beside_count and not (is_ahead[a] and is_ahead[b] and is_ahead[d]):
             continue
         # sorted from right to left, by column and vertex
         a, b, d = a | np.int64(column[a]) << 32, b | np.int64(column[b]) << 32, d | np.int64(column[d]) << 32
         first, last = min(a, b, d), max(a, b, d)
         middle = a ^ b ^ d ^ first ^ last
-        turn = middle >> 32
+        split = middle >> 32
         a, b, d = first & _LOW, middle & _LOW, last & _LOW
         for k in range(first >> 32, last >> 32):
             pairs[np.uintp(n)], pairs[np.uintp(n + 1)] = a, d
-            pairs[np.uintp(n + 2)], pairs[np.uintp(n + 3)] = a if k < turn else b, b if k < turn else d
+            pairs[np.uintp(n + 2)], pairs[np.uintp(n + 3)] = a if k < split else b, b if k < split else d
             pairs[np.uintp(n + 4)], pairs[np.uintp(n + 5)] = k, f
             n += 8
         if n >= 8 * _BLOCK:
             _fill(pairs[:n], P, lines, rows, column_index, row_index, inverse_x, face)
             n = 0
     _fill(pairs[:n], P, lines, rows, column_index, row_index, inverse_x, face)
-    if beside:
+    if beside_count:
         _raster_beside(
-            vertices, faces, c, s, ahead, P, column, column_tan, column_cos, rows, column_index, row_index,
+            vertices, faces, c, s, is_ahead, P, column, column_tan, column_cos, rows, column_index, row_index,
             inverse_x, face,
         )  # fmt: skip
 
@@ -213,10 +213,10 @@ def _fill(pairs, P, lines, rows, column_index, row_index, inverse_x, face):
         ends[np.uintp(4 * m + 3)] = pi + u * (P[np.uintp(q + 2)] - pi)
         lower[m] = min(ends[np.uintp(4 * m)], ends[np.uintp(4 * m + 2)])
     start, values = _find_all(lower, rows), rows.values
-    met = np.empty(count, np.bool_)
+    has_hit = np.empty(count, np.bool_)
     for m in range(count):
-        met[m] = values[np.uintp(start[m])] < max(ends[np.uintp(4 * m)], ends[np.uintp(4 * m + 2)])
-    for m in _picked(met):
+        has_hit[m] = values[np.uintp(start[m])] < max(ends[np.uintp(4 * m)], ends[np.uintp(4 * m + 2)])
+    for m in _picked(has_hit):
         t0, i0, t1, i1 = ends[4 * m], ends[4 * m + 1], ends[4 * m + 2], ends[4 * m + 3]
         end, column = max(t0, t1), np.uintp(column_index[pairs[8 * m + 4]])
         r = np.uintp(start[m])
@@ -232,29 +232,29 @@ def _fill(pairs, P, lines, rows, column_index, row_index, inverse_x, face):
 @compiled
 def _ahead(vertices, c, s):
     """(V,) bool: which vertices are projected by `_projected`."""
-    ahead = np.empty(len(vertices), np.bool_)
+    is_ahead = np.empty(len(vertices), np.bool_)
     for i in range(len(vertices)):
         x = c * vertices[i, 0] + s * vertices[i, 1]
         y = c * vertices[i, 1] - s * vertices[i, 0]
-        ahead[i] = (x > AXIS) & (x * STEEP > abs(y)) & (x * STEEP > abs(vertices[i, 2]))
-    return ahead
+        is_ahead[i] = (x > AXIS) & (x * STEEP > abs(y)) & (x * STEEP > abs(vertices[i, 2]))
+    return is_ahead
 
 
 @compiled
 def _raster_beside(
-    vertices, faces, c, s, ahead, P, column, column_tan, column_cos, table, column_index, row_index, inverse_x, face
+    vertices, faces, c, s, is_ahead, P, column, column_tan, column_cos, table, column_index, row_index, inverse_x, face
 ):  # fmt: skip
-    """The part of `raster` for triangles with a vertex that is not `ahead`: slower, right for any triangle.
+    """The part of `raster` for triangles with a vertex that is not ahead: slower, right for any triangle.
 
     Crossings of edges between vertices ahead are computed as in `raster`, so the two fit without holes.
     """
     row_tan = table.values
     columns, rows = len(column_tan), len(row_tan) - 1
     x, y, z = np.empty(3), np.empty(3), np.empty(3)
-    left = np.empty(3, np.bool_)
+    is_left = np.empty(3, np.bool_)
     end_t, end_i, end_x, end_z = np.empty(2), np.empty(2), np.empty(2), np.empty(2)
     for f in range(len(faces)):
-        if ahead[faces[f, 0]] and ahead[faces[f, 1]] and ahead[faces[f, 2]]:
+        if is_ahead[faces[f, 0]] and is_ahead[faces[f, 1]] and is_ahead[faces[f, 2]]:
             continue
         first = last = 0
         for j in range(3):
@@ -262,30 +262,30 @@ def _raster_beside(
             x[j] = c * vertices[i, 0] + s * vertices[i, 1]
             y[j] = c * vertices[i, 1] - s * vertices[i, 0]
             z[j] = vertices[i, 2]
-            first += (column[i] > 0) if ahead[i] else (y[j] - column_tan[0] * x[j] > 0)
-            last += (column[i] > columns - 1) if ahead[i] else (y[j] - column_tan[columns - 1] * x[j] > 0)
+            first += (column[i] > 0) if is_ahead[i] else (y[j] - column_tan[0] * x[j] > 0)
+            last += (column[i] > columns - 1) if is_ahead[i] else (y[j] - column_tan[columns - 1] * x[j] > 0)
         # a vertex's side changes at most once over the columns
         if first == last and (first == 0 or first == 3) or max(x[0], x[1], x[2]) <= 0:
             continue
         for k in range(columns):
-            total = 0
+            left_count = 0
             for j in range(3):
                 i = faces[f, j]
-                left[j] = (k < column[i]) if ahead[i] else (y[j] - column_tan[k] * x[j] > 0)
-                total += left[j]
-            if total == 0 or total == 3:
+                is_left[j] = (k < column[i]) if is_ahead[i] else (y[j] - column_tan[k] * x[j] > 0)
+                left_count += is_left[j]
+            if left_count == 0 or left_count == 3:
                 continue
-            alone = 0
+            lone_corner = 0
             for j in range(3):
-                if left[j] == (total == 1):
-                    alone = j
+                if is_left[j] == (left_count == 1):
+                    lone_corner = j
             for e in range(2):
-                p = alone
-                q = (alone + 1 + e) % 3
-                if left[p]:
+                p = lone_corner
+                q = (lone_corner + 1 + e) % 3
+                if is_left[p]:
                     p, q = q, p
                 a, b = faces[f, p], faces[f, q]
-                if ahead[a] and ahead[b]:
+                if is_ahead[a] and is_ahead[b]:
                     u = (column_tan[k] - P[3 * a]) / (P[3 * b] - P[3 * a])
                     end_i[e] = P[3 * a + 2] + u * (P[3 * b + 2] - P[3 * a + 2])
                     end_t[e] = (P[3 * a + 1] + u * (P[3 * b + 1] - P[3 * a + 1])) * column_cos[k]
@@ -293,9 +293,9 @@ def _raster_beside(
                     end_z[e] = (P[3 * a + 1] + u * (P[3 * b + 1] - P[3 * a + 1])) * end_x[e]
                 else:
                     # of the sign that the side was found by, or an edge in the column's plane might cross nowhere
-                    before = (P[3 * a] - column_tan[k]) * x[p] if ahead[a] else y[p] - column_tan[k] * x[p]
-                    after = (P[3 * b] - column_tan[k]) * x[q] if ahead[b] else y[q] - column_tan[k] * x[q]
-                    u = before / (before - after)
+                    distance_p = (P[3 * a] - column_tan[k]) * x[p] if is_ahead[a] else y[p] - column_tan[k] * x[p]
+                    distance_q = (P[3 * b] - column_tan[k]) * x[q] if is_ahead[b] else y[q] - column_tan[k] * x[q]
+                    u = distance_p / (distance_p - distance_q)
                     end_x[e] = x[p] + u * (x[q] - x[p])
                     end_z[e] = z[p] + u * (z[q] - z[p])
                     if end_x[e] > AXIS:

@@ -66,17 +66,17 @@ def bounds(vertices):
         north += flat[np.uintp(3 * i + 1)]
     center = np.arctan2(north, east)
     c, s = np.cos(center), np.sin(center)
-    left, right, low, high, ahead = _MOST, -_MOST, _MOST, -_MOST, _MOST
+    left, right, low, high, ahead_margin = _MOST, -_MOST, _MOST, -_MOST, _MOST
     for i in range(len(vertices)):
         vx, vy, vz = flat[np.uintp(3 * i)], flat[np.uintp(3 * i + 1)], flat[np.uintp(3 * i + 2)]
         x, y = c * vx + s * vy, c * vy - s * vx
-        ahead = min(ahead, _ordered(min(x * STEEP - abs(y), x - AXIS)))
+        ahead_margin = min(ahead_margin, _ordered(min(x * STEEP - abs(y), x - AXIS)))
         azimuth = _ordered(y * (1 / (x if x > AXIS else 1.0)))
         # squared, with its sign
         slope = _ordered(vz * abs(vz) / (x * x + y * y if x > AXIS else 1.0))
         left, right = min(left, azimuth), max(right, azimuth)
         low, high = min(low, slope), max(high, slope)
-    if ahead > 0:
+    if ahead_margin > 0:
         left, right, low, high = _number(left), _number(right), _number(low), _number(high)
         low, high = np.sign(low) * np.sqrt(abs(low)), np.sign(high) * np.sqrt(abs(high))
         return center, np.arctan(left), np.arctan(right), np.arctan(low), np.arctan(high)
@@ -115,8 +115,8 @@ def _cast_grid(vertices, faces, beams, window, offsets, tangents):
     inverse_x = np.zeros((subs, columns, rows * subs))
     face = np.full((subs, columns, rows * subs), -1, np.int32)
     scale = np.ones(columns)
-    most = min(columns, beams.sector)
-    tan, cos, index = np.empty(most), np.empty(most), np.empty(most, np.int64)
+    max_columns = min(columns, beams.sector)
+    tan, cos, index = np.empty(max_columns), np.empty(max_columns), np.empty(max_columns, np.int64)
     row_tan, row_index = np.empty(rows * subs), np.empty(rows * subs, np.int64)
     for g in range(len(beams.group_shift)):
         n = 0
@@ -158,14 +158,14 @@ def _collect(inverse_x, face, scale, beams, column0, row0):
         for r in range(rows):
             n += inverse_x[k, r] > 0
     points = np.empty((n, 3), np.float32)
-    hit, column, ring = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
+    hit_face, column, ring = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
     if not n:
-        return points, hit, column, ring
+        return points, hit_face, column, ring
     per_ring = len(beams.group_shift) > 1
-    first = beams.start + column0 * beams.step
+    first_azimuth = beams.start + column0 * beams.step
     n = 0
     for k in range(columns):
-        azimuth = first + k * beams.step + (0.0 if per_ring else beams.shifts[row0])
+        azimuth = first_azimuth + k * beams.step + (0.0 if per_ring else beams.shifts[row0])
         c, s = np.cos(azimuth), np.sin(azimuth)
         for r in range(rows):
             if inverse_x[k, r] <= 0:
@@ -180,11 +180,11 @@ def _collect(inverse_x, face, scale, beams, column0, row0):
             points[n, 0] = horizontal * c
             points[n, 1] = horizontal * s
             points[n, 2] = horizontal * tangent
-            hit[n] = face[k, r]
+            hit_face[n] = face[k, r]
             column[n] = k
             ring[n] = row0 + r
             n += 1
-    return points[:n], hit[:n], column[:n], ring[:n]
+    return points[:n], hit_face[:n], column[:n], ring[:n]
 
 
 @compiled
@@ -210,9 +210,9 @@ def strongest_echo(distance, weights, order, pulse, farthest):
         power, sum_range, end = 0.0, 0.0, start
         while end < n and (end == start or distance[order[end]] - distance[order[end - 1]] <= pulse):
             r = distance[order[end]]
-            received = weights[order[end]] / (r * r)
-            power += received
-            sum_range += received * r
+            sub_beam_power = weights[order[end]] / (r * r)
+            power += sub_beam_power
+            sum_range += sub_beam_power * r
             end += 1
         if power > best:
             best, best_range, best_face = power, sum_range / power, order[start]
@@ -226,25 +226,27 @@ def strongest_echo(distance, weights, order, pulse, farthest):
 def _merge_echoes(inverse_x, face, scale, beams, row0, tangents, weights, pulse):
     """1/x and face (C, R) of the beams' returns, as if their axes had met them; inputs as `_cast_grid` gives them."""
     subs, columns, rows = len(weights), len(scale), inverse_x.shape[2] // len(weights)
-    merged, merged_face = np.zeros((columns, rows)), np.full((columns, rows), -1, np.int32)
-    distance, flat = np.empty(subs * subs), weights.copy().reshape(-1)
+    merged_inverse_x, merged_face = np.zeros((columns, rows)), np.full((columns, rows), -1, np.int32)
+    distance, flat_weights = np.empty(subs * subs), weights.copy().reshape(-1)
     order = np.empty(subs * subs, np.int64)
     for k in range(columns):
         for r in range(rows):
-            met = False
+            has_hit = False
             for a in range(subs):
                 for b in range(subs):
-                    near, tangent = inverse_x[a, k, r * subs + b], tangents[row0 + r, b]
-                    met |= near > 0
-                    distance[a * subs + b] = scale[k] * np.sqrt(1 + tangent * tangent) / near if near > 0 else np.inf
-            if not met:
+                    sub_inverse_x, tangent = inverse_x[a, k, r * subs + b], tangents[row0 + r, b]
+                    has_hit |= sub_inverse_x > 0
+                    distance[a * subs + b] = (
+                        scale[k] * np.sqrt(1 + tangent * tangent) / sub_inverse_x if sub_inverse_x > 0 else np.inf
+                    )
+            if not has_hit:
                 continue
-            range_, sub = strongest_echo(distance, flat, order, pulse, beams.farthest)
+            range_, sub = strongest_echo(distance, flat_weights, order, pulse, beams.farthest)
             if sub >= 0:
                 tangent = beams.tangents[row0 + r]
-                merged[k, r] = scale[k] * np.sqrt(1 + tangent * tangent) / range_
+                merged_inverse_x[k, r] = scale[k] * np.sqrt(1 + tangent * tangent) / range_
                 merged_face[k, r] = face[sub // subs, k, r * subs + sub % subs]
-    return merged, merged_face
+    return merged_inverse_x, merged_face
 
 
 @compiled

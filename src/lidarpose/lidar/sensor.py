@@ -72,9 +72,11 @@ class Sensor:
                 raise InputError(f"Sensor.{name} must be {elevations.shape}, one a ring, got {values.shape}")
             object.__setattr__(self, name, values)
         check_finite("Sensor.azimuth_step", self.azimuth_step)
-        turn = 2 * np.pi / self.azimuth_step if self.azimuth_step > 0 else 0
-        if turn < 1 or abs(turn - round(turn)) > 1e-3:
-            raise InputError(f"Sensor.azimuth_step must divide 2 pi, got {self.azimuth_step} rad, {turn:.4f} a turn")
+        column_count = 2 * np.pi / self.azimuth_step if self.azimuth_step > 0 else 0
+        if column_count < 1 or abs(column_count - round(column_count)) > 1e-3:
+            raise InputError(
+                f"Sensor.azimuth_step must divide 2 pi, got {self.azimuth_step} rad, {column_count:.4f} a turn"
+            )
         check_limits(self)
 
     @cached_property
@@ -103,9 +105,9 @@ class Sensor:
         if self.azimuth_offsets is None:
             return np.zeros(self.rows)
         columns = self.azimuth_offsets / self.azimuth_step
-        rest = columns - np.round(columns)
+        remainder = columns - np.round(columns)
         # a thousandth of a step is below any calibration
-        return np.where(np.abs(rest) < 1e-3, 0.0, rest) * self.azimuth_step
+        return np.where(np.abs(remainder) < 1e-3, 0.0, remainder) * self.azimuth_step
 
     @cached_property
     def shift_groups(self) -> tuple[tuple[float, np.ndarray], ...]:
@@ -122,8 +124,10 @@ class Sensor:
         for height in np.unique(self.origin_heights):
             rings = np.flatnonzero(self.origin_heights == height)
             offsets = None if self.azimuth_offsets is None else self.azimuth_offsets[rings]
-            single = replace(self, elevations=self.elevations[rings], azimuth_offsets=offsets, origin_heights=None)
-            origins.append((float(height), single, rings))
+            origin_sensor = replace(
+                self, elevations=self.elevations[rings], azimuth_offsets=offsets, origin_heights=None
+            )
+            origins.append((float(height), origin_sensor, rings))
         return tuple(origins)
 
     @property
@@ -133,13 +137,15 @@ class Sensor:
 
     def window(self, left: float, right: float, low: float, high: float) -> Window:
         """The beams with azimuth in [left, right] and elevation in [low, high], rad; left <= right, unwrapped."""
-        first = int(np.ceil((left - self.azimuth_start - self.azimuth_shifts.max()) / self.azimuth_step))
-        last = int(np.floor((right - self.azimuth_start - self.azimuth_shifts.min()) / self.azimuth_step))
-        count = max(0, last - first + 1)
+        first_column = int(np.ceil((left - self.azimuth_start - self.azimuth_shifts.max()) / self.azimuth_step))
+        last_column = int(np.floor((right - self.azimuth_start - self.azimuth_shifts.min()) / self.azimuth_step))
+        count = max(0, last_column - first_column + 1)
         if count >= self.columns:
-            first, count = 0, self.columns
+            first_column, count = 0, self.columns
         row0, end = np.searchsorted(self.elevations, low), np.searchsorted(self.elevations, high, side="right")
-        return Window(column0=first % self.columns, columns=count, row0=int(row0), rows=max(0, int(end) - int(row0)))
+        return Window(
+            column0=first_column % self.columns, columns=count, row0=int(row0), rows=max(0, int(end) - int(row0))
+        )
 
     def azimuths(self, window: Window) -> np.ndarray:
         """(C, R) rad: azimuth of each beam of a window, not wrapped at the seam."""

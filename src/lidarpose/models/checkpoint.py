@@ -56,13 +56,13 @@ class Header:
     def skeleton(self) -> Skeleton:
         """The joints that the network predicts. Raises InputError for a network whose joints make up no skeleton."""
         names = self.config.joints
-        inside = [candidate for candidate in SKELETONS.values() if set(candidate.joints) <= set(names)]
-        if not inside:
+        candidates = [candidate for candidate in SKELETONS.values() if set(candidate.joints) <= set(names)]
+        if not candidates:
             raise InputError(
                 f"the network {self.config.name} predicts {', '.join(names)}, which hold none of the skeletons "
                 f"{', '.join(SKELETONS)}: its joints cannot be drawn or named"
             )
-        return max(inside, key=len)
+        return max(candidates, key=len)
 
     def to_json(self) -> str:
         entry = {"schema": SCHEMA, "version": self.version, "network": self.network}
@@ -71,8 +71,8 @@ class Header:
 
 def runs_of(card: dict) -> list[dict]:
     """The cards of the runs that made weights: the last one's, that of the weights it began with, and so on."""
-    before = card.get("init_card")
-    return [card, *(runs_of(before) if isinstance(before, dict) else [])]
+    init_card = card.get("init_card")
+    return [card, *(runs_of(init_card) if isinstance(init_card, dict) else [])]
 
 
 # ---- reading and writing
@@ -147,9 +147,9 @@ class SafetensorsFile:
     @classmethod
     def open(cls, path: str | os.PathLike, *, prefix: str = "") -> SafetensorsFile:
         """prefix: dropped where all names of tensors begin with it. Raises InputError that names the damaged byte."""
-        kind = "is a folder" if os.path.isdir(path) else "" if os.path.isfile(path) else "does not exist"
-        if kind:
-            raise file_error(path, f"expected {_EXPECTED}, but it {kind}: check the path")
+        problem = "is a folder" if os.path.isdir(path) else "" if os.path.isfile(path) else "does not exist"
+        if problem:
+            raise file_error(path, f"expected {_EXPECTED}, but it {problem}: check the path")
         content = read_bytes(path, expected=_EXPECTED)
         header = _parse_safetensors(path, content)
         names = [name for name in header if name != "__metadata__"]
@@ -186,16 +186,16 @@ class SafetensorsFile:
             problem = f"has {len(shapes)} tensors, too few for {config.layers} layers by {source}: {remedy}"
             raise file_error(self.path, problem)
         with torch.device("meta"):
-            wanted = build(config).state_dict()
-        if absent := [name for name in wanted if name not in shapes]:
-            raise file_error(self.path, f"tensor {absent[0]} is missing, which {source} has: {remedy}")
-        if extra := sorted(shapes.keys() - wanted.keys()):
-            raise file_error(self.path, f"unknown tensor {extra[0]}, which {source} has not: {remedy}")
-        for name, value in wanted.items():
+            expected = build(config).state_dict()
+        if missing_names := [name for name in expected if name not in shapes]:
+            raise file_error(self.path, f"tensor {missing_names[0]} is missing, which {source} has: {remedy}")
+        if unknown_names := sorted(shapes.keys() - expected.keys()):
+            raise file_error(self.path, f"unknown tensor {unknown_names[0]}, which {source} has not: {remedy}")
+        for name, value in expected.items():
             if shapes[name] != tuple(value.shape):
                 problem = f"tensor {name} should be {tuple(value.shape)} by {source}, got {shapes[name]}: {remedy}"
                 raise file_error(self.path, problem)
-        state = self.load(wanted)
+        state = self.load(expected)
         network = build(config)
         network.load_state_dict(state)
         return network.eval()
@@ -207,14 +207,14 @@ class SafetensorsFile:
         from safetensors.torch import load
 
         try:
-            stored = load(self.content)
+            file_tensors = load(self.content)
         except (SafetensorError, ValueError, KeyError) as error:
             raise file_error(self.path, f"its header is damaged ({error}): {_AGAIN}") from None
         tensors = {}
-        for name, like in wanted.items():
-            value = stored[self.prefix + name]
-            tensors[name] = value.to(like.dtype)
-            is_float = value.is_floating_point() or not like.is_floating_point()
+        for name, template in wanted.items():
+            value = file_tensors[self.prefix + name]
+            tensors[name] = value.to(template.dtype)
+            is_float = value.is_floating_point() or not template.is_floating_point()
             if not is_float or not tensors[name].isfinite().all():
                 raise file_error(self.path, f"tensor {name} holds numbers that are not finite or no floats: {_AGAIN}")
         return tensors
@@ -223,15 +223,15 @@ class SafetensorsFile:
 def _parse_safetensors(path: str | os.PathLike, content: bytes) -> dict:
     """The header of a file: 8 bytes of a length, so much JSON, then the tensors. Raises InputError that says what is
     wrong, and where."""
-    again = "it was not copied completely: get it again"
+    remedy = "it was not copied completely: get it again"
     size = len(content)
     if size < 8:
-        raise file_error(path, f"expected {_EXPECTED}, but the file ends at byte {size}: {again}")
+        raise file_error(path, f"expected {_EXPECTED}, but the file ends at byte {size}: {remedy}")
     length = struct.unpack("<Q", content[:8])[0]
     if content[8:9] not in (b"", b"{") or not 0 < length <= _MOST_HEADER:
         raise file_error(path, f"expected {_EXPECTED}, but the file is something else: name a checkpoint")
     if size < 8 + length:
-        raise file_error(path, f"the file ends at byte {size:,}, within its header of {length:,} bytes: {again}")
+        raise file_error(path, f"the file ends at byte {size:,}, within its header of {length:,} bytes: {remedy}")
     end = 0
     try:
         header = json.loads(content[8 : 8 + length])
@@ -249,7 +249,7 @@ def _parse_safetensors(path: str | os.PathLike, content: bytes) -> dict:
     except (ValueError, AttributeError, KeyError, IndexError, TypeError, RecursionError) as error:
         raise file_error(path, f"its header is damaged ({error}): {_AGAIN}") from None
     if size != 8 + length + end:
-        problem = f"the file ends at byte {size:,} where its header says {8 + length + end:,}: {again}"
+        problem = f"the file ends at byte {size:,} where its header says {8 + length + end:,}: {remedy}"
         raise file_error(path, problem)
     return header
 
@@ -282,8 +282,8 @@ def _data_of(content: bytes) -> memoryview:
 
 def _digest(header: dict, data: memoryview) -> str:
     metadata = {name: text for name, text in header.get("__metadata__", {}).items() if name != DIGEST}
-    signed = json.dumps(header | {"__metadata__": metadata}, sort_keys=True, separators=(",", ":"))
-    digest = hashlib.sha256(signed.encode())
+    header_json = json.dumps(header | {"__metadata__": metadata}, sort_keys=True, separators=(",", ":"))
+    digest = hashlib.sha256(header_json.encode())
     digest.update(data)
     return digest.hexdigest()
 
@@ -303,20 +303,20 @@ def parse_header(path: str | os.PathLike, entry: str | None) -> Header:
         header = json.loads(entry)
         schema, version = header["schema"], header.get("version")
         if schema != SCHEMA:
-            by = f" of lidarpose {version}" if version else ""
+            writer = f" of lidarpose {version}" if version else ""
             remedy = f"use the lidarpose version that wrote it (this is {__version__})"
             if schema == f"{_FAMILY}/1":
                 remedy = f"this version ({__version__}) has replaced that network: use lidarpose {version} for it, "
                 remedy += "or train anew"
-            raise InputError(f"expected schema {SCHEMA}, got {schema}{by}: {remedy}")
+            raise InputError(f"expected schema {SCHEMA}, got {schema}{writer}: {remedy}")
         check_name("kind of network", header["network"], NETWORKS)
         config_class = NETWORKS[header["network"]].part("config")
         entries, card = header["config"], header["card"]
         for name, value in (("config", entries), ("card", card)):
             if not isinstance(value, dict):
                 raise TypeError(f"{name} is a {type(value).__name__}")
-        if extra := sorted(set(entries) - {field.name for field in fields(config_class)}):
-            raise InputError(f"unknown setting {extra[0]}: update lidarpose, a newer version wrote it")
+        if unknown_settings := sorted(set(entries) - {field.name for field in fields(config_class)}):
+            raise InputError(f"unknown setting {unknown_settings[0]}: update lidarpose, a newer version wrote it")
         return Header(version=str(header["version"]), config=config_class(**entries), card=card)
     except InputError as error:
         raise file_error(path, f"its header does not fit: {error}") from None

@@ -61,19 +61,19 @@ def _as_tuple(value: Any) -> Any:
 
 def _checked(f: Field, value: Any) -> Any:
     """A setting as its field declares it; tuples of free length are for the configuration itself to check."""
-    least, parts = f.metadata.get("least", 1), get_args(f.type)
+    least, type_args = f.metadata.get("least", 1), get_args(f.type)
     if f.type is int:
         return check_int(f.name, value, least=least, most=MOST)
-    if parts and set(parts) == {int}:
-        return check_counts(f.name, value, len(parts), least=least, levels=f.metadata.get("levels", ""))
-    of_type: dict[Any, tuple[Callable[[Any], bool], str]] = {
+    if type_args and set(type_args) == {int}:
+        return check_counts(f.name, value, len(type_args), least=least, levels=f.metadata.get("levels", ""))
+    checks: dict[Any, tuple[Callable[[Any], bool], str]] = {
         bool: (lambda flag: isinstance(flag, bool), "true or false"),
         float: (lambda number: is_number(number) and number > 0, "a positive number of meters"),
     }
     if f.metadata.get("probability"):
-        of_type[float] = (lambda number: is_number(number) and 0 <= number < 1, "a probability below 1")
-    is_good, expected = of_type.get(f.type, (lambda _: True, ""))
-    if not is_good(value):
+        checks[float] = (lambda number: is_number(number) and 0 <= number < 1, "a probability below 1")
+    is_valid, expected = checks.get(f.type, (lambda _: True, ""))
+    if not is_valid(value):
         raise InputError(f"{f.name} must be {expected}, got {value!r}")
     return value
 
@@ -117,8 +117,8 @@ class NetworkConfig(Config):
             object.__setattr__(self, "convolution", 0)
         super().__post_init__()
         if any(width % self.head_channels for width in self.channels[1:]):
-            divide = "channels of the mid and coarse level must divide by head_channels"
-            raise InputError(f"{divide}, got {self.channels} and {self.head_channels}")
+            problem = "channels of the mid and coarse level must divide by head_channels"
+            raise InputError(f"{problem}, got {self.channels} and {self.head_channels}")
         check_name("heatmap", self.heatmap, HEATMAPS)
         skeleton(self.skeleton)
 

@@ -42,13 +42,13 @@ def dark(logits: np.ndarray, *, low: float | np.ndarray, step: float | np.ndarra
     logits = _checked(logits)
     mode = logits.argmax(-1)
     bins = logits.shape[-1]
-    half = _TAPS // 2
-    kernel = np.exp(-0.5 * (np.arange(-half, half + 1) / _SIGMA) ** 2)
+    half_width = _TAPS // 2
+    kernel = np.exp(-0.5 * (np.arange(-half_width, half_width + 1) / _SIGMA) ** 2)
     kernel /= kernel.sum()
     # only the five bins about the mode are asked for; beyond an edge its own value is repeated
-    near = np.clip(mode[..., None] + np.arange(-2, 3), 0, bins - 1)
-    padded = np.pad(logits, [(0, 0)] * (logits.ndim - 1) + [(half, half)])
-    taps = near[..., None] + np.arange(_TAPS)
+    window_bins = np.clip(mode[..., None] + np.arange(-2, 3), 0, bins - 1)
+    padded = np.pad(logits, [(0, 0)] * (logits.ndim - 1) + [(half_width, half_width)])
+    taps = window_bins[..., None] + np.arange(_TAPS)
     values = np.take_along_axis(padded, taps.reshape(*mode.shape, 5 * _TAPS), -1).reshape(taps.shape) @ kernel
     m2, m1, zero, p1, p2 = np.moveaxis(np.log(np.clip(values, *_CLIP)), -1, 0)
     slope = 0.5 * (p1 - m1)
@@ -68,9 +68,9 @@ def window(
     logits = _checked(logits)
     bins = logits.shape[-1]
     mode = logits.argmax(-1)[..., None]
-    away = np.minimum(np.minimum(mode, bins - 1 - mode), reach)
+    half_width = np.minimum(np.minimum(mode, bins - 1 - mode), reach)
     index = np.arange(bins)
-    weight = np.exp(logits - np.take_along_axis(logits, mode, -1)) * (np.abs(index - mode) <= away)
+    weight = np.exp(logits - np.take_along_axis(logits, mode, -1)) * (np.abs(index - mode) <= half_width)
     return low + (weight * index).sum(-1) / weight.sum(-1) * step
 
 

@@ -96,10 +96,10 @@ def export_detector(network: DetectorNet, out: str | os.PathLike, *, card: dict)
     check_writable(out)
     network = copy.deepcopy(network).eval().half().float()
     shapes = network.config.shapes
-    free = ({0: "candidates"},) * len(INPUTS)
-    traced = tuple(torch.zeros(shape) for shape in shapes(2).values())
+    dynamic_axes = ({0: "candidates"},) * len(INPUTS)
+    example_inputs = tuple(torch.zeros(shape) for shape in shapes(2).values())
     metadata = {ENTRY: Header(config=network.config, card=card).to_json(), DIGEST: NO_DIGEST}
-    content = with_digest(module_to_onnx(network, traced, free, INPUTS, (OUTPUT,), metadata))
+    content = with_digest(module_to_onnx(network, example_inputs, dynamic_axes, INPUTS, (OUTPUT,), metadata))
     session = open_session(content, threads=1)
     rng = np.random.default_rng(0)
     for candidates in (1, 7):
@@ -113,10 +113,10 @@ def export_detector(network: DetectorNet, out: str | os.PathLike, *, card: dict)
 def trace(network: PoseNet) -> torch.export.ExportedProgram:
     """The network as a program whose numbers of people and rows are free."""
     arrays = _people(network, _TRACED)
-    free = tuple(dict.fromkeys(axes, torch.export.Dim.DYNAMIC) for axes in _axes(arrays))
+    dynamic_shapes = tuple(dict.fromkeys(axes, torch.export.Dim.DYNAMIC) for axes in _axes(arrays))
     module = ArrayModule(network.eval(), tuple(arrays))
     with torch.no_grad():
-        program = torch.export.export(module, _tensors(arrays), dynamic_shapes=(free,))
+        program = torch.export.export(module, _tensors(arrays), dynamic_shapes=(dynamic_shapes,))
     for node in program.graph.nodes:
         # paths of the machine that traced it
         node.meta.pop("stack_trace", None)
@@ -179,15 +179,15 @@ def check(network: PoseNet, run: Callable[[dict[str, np.ndarray]], list[np.ndarr
         arrays = _people(network, sizes)
         with torch.inference_mode():
             expected = ArrayModule(network.eval(), tuple(arrays))(*_tensors(arrays))
-        for name, tensor, got in zip(output_names(network.config), expected, run(arrays), strict=True):
-            _check_close(name, tensor.numpy(), got)
+        for name, tensor, actual in zip(output_names(network.config), expected, run(arrays), strict=True):
+            _check_close(name, tensor.numpy(), actual)
 
 
-def _check_close(name: str, expected: np.ndarray, got: np.ndarray) -> None:
-    off = np.abs(got - expected).max(initial=0) if got.shape == expected.shape else np.inf
-    if not off <= _TOLERANCE:
+def _check_close(name: str, expected: np.ndarray, actual: np.ndarray) -> None:
+    max_error = np.abs(actual - expected).max(initial=0) if actual.shape == expected.shape else np.inf
+    if not max_error <= _TOLERANCE:
         raise LidarPoseError(
-            f"the exported network's {name} is off by {off:g}, so nothing was written: report this with the "
+            f"the exported network's {name} is off by {max_error:g}, so nothing was written: report this with the "
             f"versions that `lidarpose info` prints"
         )
 
@@ -237,11 +237,11 @@ def _pack(graph) -> None:
 @contextlib.contextmanager
 def _silence():
     """Without what the exporter logs and warns of; errors are raised all the same."""
-    before = logging.root.manager.disable
+    disable_level = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
     finally:
-        logging.disable(before)
+        logging.disable(disable_level)

@@ -56,9 +56,9 @@ class RotaryEmbedding:
 
 def head_frequencies(heads: int, width: int) -> Tensor:
     """(H, 1, P / 3) rad/m for heads of `width` channels, P = 3 * (width // 6): heads share out the wavelengths."""
-    each = width // 6
-    frequencies = [2 * torch.pi / WAVELENGTHS[k % len(WAVELENGTHS)] for k in range(heads * each)]
-    return torch.tensor(frequencies).view(heads, 1, each)
+    count = width // 6
+    frequencies = [2 * torch.pi / WAVELENGTHS[k % len(WAVELENGTHS)] for k in range(heads * count)]
+    return torch.tensor(frequencies).view(heads, 1, count)
 
 
 def key_bias(valid: Tensor, dtype: torch.dtype) -> Tensor:
@@ -107,8 +107,8 @@ class SelfAttention(Attention):
         if places is not None:
             query, key = places.rotate(query, self.frequencies), places.rotate(key, self.frequencies)
         query, key, value = (x.transpose(1, 2) for x in (query, key, value))
-        mixed = attend(query, key, value, bias)
-        return self.out(mixed.transpose(1, 2).flatten(-2))
+        output = attend(query, key, value, bias)
+        return self.out(output.transpose(1, 2).flatten(-2))
 
 
 class CrossAttention(Attention):
@@ -134,14 +134,14 @@ class CrossAttention(Attention):
         query = self.query(queries).unflatten(-1, (self.heads, -1))
         query = (query_places.rotate(query, self.frequencies) * query.shape[-1] ** -0.5).transpose(1, 2)
         key = places.rotate(self.key(keys).unflatten(-1, (self.heads, -1)), self.frequencies).transpose(1, 2)
-        dense = self.density[:, None, None].to(bias.dtype) * log_count[:, None, None, :]
+        density_bias = self.density[:, None, None].to(bias.dtype) * log_count[:, None, None, :]
         # few queries: written out, since the fused kernels give no gradient to a bias
-        weight = (query @ key.transpose(-2, -1) + (bias + dense)).softmax(-1).to(keys.dtype)
+        weight = (query @ key.transpose(-2, -1) + (bias + density_bias)).softmax(-1).to(keys.dtype)
         # weights sum to 1, so the mean of the values is the value of the mean: no voxel's own is needed
-        mean = (weight.flatten(1, 2) @ keys).unflatten(1, (self.heads, -1))
+        mean_keys = (weight.flatten(1, 2) @ keys).unflatten(1, (self.heads, -1))
         values = self.value.weight.unflatten(0, (self.heads, -1))
-        mixed = (mean @ values.mT).transpose(1, 2).flatten(-2) + self.value.bias
-        return self.out(mixed)
+        output = (mean_keys @ values.mT).transpose(1, 2).flatten(-2) + self.value.bias
+        return self.out(output)
 
 
 class FeedForward(nn.Sequential):
@@ -214,11 +214,11 @@ class Convolution(nn.Module):
 
     def forward(self, rows: Tensor, neighbors: Tensor) -> Tensor:
         people, n, _ = rows.shape
-        padded = F.pad(self.narrow(self.norm(rows)), (0, 0, 0, 1)).flatten(0, 1)
+        padded_rows = F.pad(self.narrow(self.norm(rows)), (0, 0, 0, 1)).flatten(0, 1)
         # by row numbers of the whole batch: along dim 1 the gradient of gather is far slower on a CPU
         start = (n + 1) * torch.arange(people, device=rows.device)
         index = (neighbors + start[:, None, None]).flatten()
-        return rows + self.mix(padded.index_select(0, index).view(people, n, -1))
+        return rows + self.mix(padded_rows.index_select(0, index).view(people, n, -1))
 
 
 def membership(parent: Tensor, valid: Tensor, parents: int, dtype: torch.dtype) -> Tensor:
@@ -239,9 +239,9 @@ def bin_centers(bins: int, device: torch.device | None = None) -> Tensor:
     return _offset(torch.arange(bins, device=device), bins)
 
 
-def _offset(at: Tensor, bins: int) -> Tensor:
-    """at (...) bins -> (...) m from the heatmap's origin, which is the middle of all bins."""
-    return (at + 0.5 - bins / 2) * BIN
+def _offset(position: Tensor, bins: int) -> Tensor:
+    """position (...) bins -> (...) m from the heatmap's origin, which is the middle of all bins."""
+    return (position + 0.5 - bins / 2) * BIN
 
 
 def decode(logits: Tensor) -> Tensor:
@@ -302,9 +302,9 @@ class JointHead(nn.Module):
     def __init__(self, channels: int, voxel_channels: int, bins: int):
         super().__init__()
         self.bins = bins
-        wide = channels + voxel_channels
-        self.norm = nn.LayerNorm(wide)
-        self.hidden = nn.Sequential(nn.Linear(wide + 3, 2 * channels), nn.SiLU())
+        width = channels + voxel_channels
+        self.norm = nn.LayerNorm(width)
+        self.hidden = nn.Sequential(nn.Linear(width + 3, 2 * channels), nn.SiLU())
         self.heatmap = nn.Linear(2 * channels, 3 * bins) if bins else None
         self.certainty = nn.Linear(2 * channels, 3)
 

@@ -51,8 +51,8 @@ def input_name(name: str) -> str:
 def usable_threads() -> int:
     """Processors that this process may use, `_MOST_THREADS` at the most."""
     # macOS and Windows cannot be asked
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(usable, _MOST_THREADS)
+    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(processors, _MOST_THREADS)
 
 
 def _runtime():
@@ -124,14 +124,14 @@ def open_network(path: str | os.PathLike, *, threads: int | None = None) -> tupl
 
 def check_names(path: str | os.PathLike, session: Any, inputs: Sequence[str], outputs: Sequence[str]) -> None:
     """Raises InputError unless a session reads and gives arrays of these names."""
-    for what, values, expected in (
+    for kind, values, expected in (
         ("input", session.get_inputs(), inputs),
         ("output", session.get_outputs(), outputs),
     ):
-        if wrong := sorted({value.name for value in values} ^ set(expected)):
-            problem = "is missing" if wrong[0] in expected else "is unknown"
+        if mismatches := sorted({value.name for value in values} ^ set(expected)):
+            problem = "is missing" if mismatches[0] in expected else "is unknown"
             remedy = "make the file anew with `lidarpose export` of this version"
-            raise file_error(path, f"{what} {wrong[0]} {problem}: {remedy}")
+            raise file_error(path, f"{kind} {mismatches[0]} {problem}: {remedy}")
 
 
 def with_digest(content: bytes) -> bytes:
@@ -151,8 +151,8 @@ def check_digest(path: str | os.PathLike, content: bytes) -> bool:
 def _digest_start(content: bytes) -> int:
     """Where the digest begins, 0 where there is none: a key, a tag and a length of one byte each, then its digits."""
     key = DIGEST.encode()
-    at = content.rfind(key)
-    return at + len(key) + 2 if at >= 0 else 0
+    key_start = content.rfind(key)
+    return key_start + len(key) + 2 if key_start >= 0 else 0
 
 
 def _digest(content: bytes, start: int) -> bytes:

@@ -158,20 +158,20 @@ class PoseNet(nn.Module):
         coarse_rows = self.bottleneck(coarse_rows, coarse_places, coarse_bias, coarse.neighbors)
 
         anchors = self.anchors + self.anchor_view(batch.view)[:, None]
-        believed = RotaryEmbedding(torch.zeros_like(anchors[..., :3]))
-        anchors = self.exchanges[0](anchors, believed, coarse_rows, coarse_places, coarse.log_count, coarse_bias)
+        anchor_places = RotaryEmbedding(torch.zeros_like(anchors[..., :3]))
+        anchors = self.exchanges[0](anchors, anchor_places, coarse_rows, coarse_places, coarse.log_count, coarse_bias)
         coarse_joints = self.level_joints[0](anchors)
 
         mid_rows = mid_rows + coarse_of_mid.transpose(1, 2) @ self.up_mid(coarse_rows)
         mid_rows = self.decoder(mid_rows, mid_places, mid_bias, mid.neighbors)
-        believed = RotaryEmbedding(coarse_joints.detach())
-        anchors = self.exchanges[1](anchors, believed, mid_rows, mid_places, mid.log_count, mid_bias)
+        anchor_places = RotaryEmbedding(coarse_joints.detach())
+        anchors = self.exchanges[1](anchors, anchor_places, mid_rows, mid_places, mid.log_count, mid_bias)
         mid_joints = self.level_joints[1](anchors)
 
         fine_rows = fine_rows + mid_of_fine.transpose(1, 2) @ self.up_fine(mid_rows)
         fine_rows = fine_rows + self.fine_feed(self.fine_norm(fine_rows))
-        believed = RotaryEmbedding(mid_joints.detach())
-        anchors = self.exchanges[2](anchors, believed, fine_rows, fine_places, fine.log_count, fine_bias)
+        anchor_places = RotaryEmbedding(mid_joints.detach())
+        anchors = self.exchanges[2](anchors, anchor_places, fine_rows, fine_places, fine.log_count, fine_bias)
 
         vote, voter_features = torch.zeros_like(mid_joints), anchors[..., :0]
         if self.vote is not None:
@@ -211,8 +211,8 @@ class ArrayModule(nn.Module):
         self.outputs = output_names(network.config)
 
     def forward(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        out = self.network(Batch.from_arrays(dict(zip(self.names, tensors, strict=True)), tensors[0].device))
-        return tuple(getattr(out, name) for name in self.outputs)
+        outputs = self.network(Batch.from_arrays(dict(zip(self.names, tensors, strict=True)), tensors[0].device))
+        return tuple(getattr(outputs, name) for name in self.outputs)
 
 
 class _Stem(nn.Module):
@@ -233,11 +233,11 @@ class _Stem(nn.Module):
 class _Down(nn.Module):
     """Voxels of one level to their parents: the mean of the children, and where the parent lies."""
 
-    def __init__(self, channels: int, wider: int):
+    def __init__(self, channels: int, out_channels: int):
         super().__init__()
         self.norm = nn.LayerNorm(channels)
-        self.mix = nn.Linear(channels, wider)
-        self.place = nn.Linear(PLACE_FEATURES, wider)
+        self.mix = nn.Linear(channels, out_channels)
+        self.place = nn.Linear(PLACE_FEATURES, out_channels)
 
     def forward(self, rows: Tensor, member: Tensor, places: RotaryEmbedding) -> Tensor:
         mean = (member @ rows) / member.sum(-1, keepdim=True).clamp(min=1)
@@ -287,34 +287,34 @@ def expand_weights(network: PoseNet, config: NetworkConfig) -> PoseNet:
     same. What is drawn comes from torch's global generator. Raises InputError, one line, where `config` is narrower or
     shallower, or of another grid, skeleton, heatmap, width of heads or of convolutions.
     """
-    small = network.config
+    old_config = network.config
     # convolutions where there are none add nothing, as new blocks
-    same = (*_SAME, "convolution") if small.convolution else _SAME
-    for name in ("channels", "blocks", *same):
-        old, new = getattr(small, name), getattr(config, name)
-        shrinks = name not in same and any(b < a for a, b in zip(old, new, strict=True))
-        if shrinks or name in same and new != old:
+    fixed_settings = (*_SAME, "convolution") if old_config.convolution else _SAME
+    for name in ("channels", "blocks", *fixed_settings):
+        old_value, new_value = getattr(old_config, name), getattr(config, name)
+        is_smaller = name not in fixed_settings and any(b < a for a, b in zip(old_value, new_value, strict=True))
+        if is_smaller or name in fixed_settings and new_value != old_value:
             raise InputError(
-                f"a {config.size} network cannot begin as this {small.size} one: {name} is {new!r}, there {old!r}"
-                f"{', and none may shrink' if shrinks else ''}"
+                f"a {config.size} network cannot begin as this {old_config.size} one: {name} is {new_value!r}, "
+                f"there {old_value!r}{', and none may shrink' if is_smaller else ''}"
             )
-    larger = PoseNet(config)
-    learned = network.state_dict()
-    if small.channels != config.channels:
+    new_network = PoseNet(config)
+    old_state = network.state_dict()
+    if old_config.channels != config.channels:
         # small, soon learned, and of streams that mean something else now
-        learned = {name: value for name, value in learned.items() if not name.startswith("person.")}
-    state = larger.state_dict()
+        old_state = {name: value for name, value in old_state.items() if not name.startswith("person.")}
+    state = new_network.state_dict()
     for name, value in state.items():
-        if name in learned:
-            state[name] = _padded(name, learned[name], value, network, larger)
+        if name in old_state:
+            state[name] = _padded(name, old_state[name], value, network, new_network)
         elif name.rpartition(".")[0].endswith(_WRITERS):
             # of a new block: it adds nothing to what goes through it
             state[name] = torch.zeros_like(value)
-    larger.load_state_dict(state)
-    return larger.train()
+    new_network.load_state_dict(state)
+    return new_network.train()
 
 
-def _padded(name: str, old: Tensor, new: Tensor, small: PoseNet, larger: PoseNet) -> Tensor:
+def _padded(name: str, old: Tensor, new: Tensor, old_network: PoseNet, new_network: PoseNet) -> Tensor:
     """The old tensor in the larger one's shape; what is new of it as it was drawn, zero, or the mean of a stream."""
     layer, _, entry = name.rpartition(".")
     out = new.clone()
@@ -325,7 +325,7 @@ def _padded(name: str, old: Tensor, new: Tensor, small: PoseNet, larger: PoseNet
     if "norm" in layer:
         # the mean square over more channels is smaller by as much
         value = old * sqrt(len(old) / len(new)) if entry == "weight" else old
-        out[_places(small, larger)[: len(old)] if layer == "joint.norm" else torch.arange(len(old))] = value
+        out[_places(old_network, new_network)[: len(old)] if layer == "joint.norm" else torch.arange(len(old))] = value
         return out
     if layer == "vote.query":
         # its products are divided by the root of the width
@@ -337,19 +337,20 @@ def _padded(name: str, old: Tensor, new: Tensor, small: PoseNet, larger: PoseNet
     if old.ndim == 1:
         out[: len(old)] = old
         return out
-    columns = _places(small, larger) if layer == "joint.hidden.0" else torch.arange(old.shape[1])
+    columns = _places(old_network, new_network) if layer == "joint.hidden.0" else torch.arange(old.shape[1])
     if layer.endswith(_READERS):
-        fresh = torch.ones(new.shape[1], dtype=torch.bool)
-        fresh[columns] = False
-        out[:, fresh] = 0
+        is_new = torch.ones(new.shape[1], dtype=torch.bool)
+        is_new[columns] = False
+        out[:, is_new] = 0
     out[: len(old), columns] = old
     return out
 
 
-def _places(small: PoseNet, larger: PoseNet) -> Tensor:
+def _places(old_network: PoseNet, new_network: PoseNet) -> Tensor:
     """Where the joint head's old inputs lie among the new ones: the anchors', the voters', and the vote."""
-    (voters, width), (more_voters, wider) = (
-        (net.config.channels[0] if net.vote is not None else 0, net.config.channels[1]) for net in (small, larger)
+    (old_voters, old_width), (new_voters, new_width) = (
+        (net.config.channels[0] if net.vote is not None else 0, net.config.channels[1])
+        for net in (old_network, new_network)
     )
-    starts = ((0, width), (wider, voters), (wider + more_voters, 3))
+    starts = ((0, old_width), (new_width, old_voters), (new_width + new_voters, 3))
     return torch.cat([torch.arange(start, start + count) for start, count in starts])

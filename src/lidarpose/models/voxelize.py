@@ -98,17 +98,17 @@ def voxelize(
     if WINDOW / grid > _HALF:
         raise InputError(f"grid must be at least {WINDOW / _HALF:.4f} m, got {grid}")
     lengths = np.asarray(lengths)
-    kept, key, voxel_of_point, count = _fine_voxels(points, lengths, grid, max_voxels, seeds)
-    xyz = points[kept].astype(np.float64)
+    rows, key, voxel_of_point, count = _fine_voxels(points, lengths, grid, max_voxels, seeds)
+    xyz = points[rows].astype(np.float64)
     mean = _segment_sum(voxel_of_point, xyz, len(key)) / count[:, None]
-    square = _segment_sum(voxel_of_point, xyz**2, len(key)) / count[:, None]
-    deviation = np.sqrt(np.maximum(square - mean**2, 0))
+    mean_square = _segment_sum(voxel_of_point, xyz**2, len(key)) / count[:, None]
+    deviation = np.sqrt(np.maximum(mean_square - mean**2, 0))
     # from the voxel's own cell: a mean on its border may round into the next one
     offset = mean / grid - (np.stack(_axes(key), 1) - _HALF) - 0.5
 
     (fine, mid, coarse), slots = _levels(key, mean, count, len(lengths), neighbors)
     point_voxel = np.full(len(points), -1)
-    point_voxel[kept] = slots.row[voxel_of_point]
+    point_voxel[rows] = slots.row[voxel_of_point]
     return VoxelPyramid(
         fine=fine,
         mid=mid,
@@ -124,9 +124,9 @@ def view_features(center: np.ndarray, sensor_origin: np.ndarray | None) -> np.nd
     """(5,) for `VoxelPyramid.view`: unit vector from `center` to the sensor, log range, known; zeros for None."""
     if sensor_origin is None:
         return np.zeros(5, np.float32)
-    toward = np.asarray(sensor_origin, float) - center
-    distance = max(float(np.linalg.norm(toward)), 0.1)
-    return np.array([*(toward / distance), np.log(distance), 1.0], np.float32)
+    to_sensor = np.asarray(sensor_origin, float) - center
+    distance = max(float(np.linalg.norm(to_sensor)), 0.1)
+    return np.array([*(to_sensor / distance), np.log(distance), 1.0], np.float32)
 
 
 class _Slots:
@@ -146,33 +146,33 @@ class _Slots:
 
 
 def _fine_voxels(
-    points: np.ndarray, lengths: np.ndarray, grid: float, most: int, seeds: np.ndarray | None
+    points: np.ndarray, lengths: np.ndarray, grid: float, max_voxels: int, seeds: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Indices (K,) of the points that count, sorted keys (V,) of their voxels, the voxel (K,) of each point, and how
     many points (V,) each voxel has."""
-    near = np.flatnonzero((np.abs(points) < WINDOW).all(1))
-    person = np.repeat(np.arange(len(lengths)), lengths)[near]
-    x, y, z = np.floor(points[near] / grid).astype(np.int64).T + _HALF
+    rows = np.flatnonzero((np.abs(points) < WINDOW).all(1))
+    person = np.repeat(np.arange(len(lengths)), lengths)[rows]
+    x, y, z = np.floor(points[rows] / grid).astype(np.int64).T + _HALF
     key, voxel, count = np.unique(_key(person, x, y, z), return_inverse=True, return_counts=True)
-    voxels = np.bincount(key >> (3 * _BITS), minlength=len(lengths))
-    if voxels.max(initial=0) <= most:
-        return near, key, voxel, count
-    start = np.cumsum(voxels) - voxels
-    chosen = np.concatenate([start[b] + _thinned(n, most, seeds, b) for b, n in enumerate(voxels)])
-    number = np.full(len(key), -1)
-    number[chosen] = np.arange(len(chosen))
-    voxel = number[voxel]
-    left = voxel >= 0
-    return near[left], key[chosen], voxel[left], count[chosen]
+    voxel_counts = np.bincount(key >> (3 * _BITS), minlength=len(lengths))
+    if voxel_counts.max(initial=0) <= max_voxels:
+        return rows, key, voxel, count
+    start = np.cumsum(voxel_counts) - voxel_counts
+    kept_voxels = np.concatenate([start[b] + _thinned(n, max_voxels, seeds, b) for b, n in enumerate(voxel_counts)])
+    new_index = np.full(len(key), -1)
+    new_index[kept_voxels] = np.arange(len(kept_voxels))
+    voxel = new_index[voxel]
+    has_voxel = voxel >= 0
+    return rows[has_voxel], key[kept_voxels], voxel[has_voxel], count[kept_voxels]
 
 
-def _thinned(voxels: int, most: int, seeds: np.ndarray | None, person: int) -> np.ndarray:
+def _thinned(count: int, max_voxels: int, seeds: np.ndarray | None, person: int) -> np.ndarray:
     """Which of a person's voxels to keep, in order."""
-    if voxels <= most:
-        return np.arange(voxels)
+    if count <= max_voxels:
+        return np.arange(count)
     if seeds is None:
-        return np.arange(most) * voxels // most
-    return np.sort(np.random.default_rng(seeds[person]).choice(voxels, most, replace=False))
+        return np.arange(max_voxels) * count // max_voxels
+    return np.sort(np.random.default_rng(seeds[person]).choice(count, max_voxels, replace=False))
 
 
 def _levels(
@@ -180,28 +180,28 @@ def _levels(
 ) -> tuple[list[VoxelLevel], _Slots]:
     """The three levels over fine voxels of sorted keys (V,), and where the fine ones lie."""
     levels: list[VoxelLevel] = []
-    fine = own = _Slots(key >> (3 * _BITS), people)
+    fine_slots = slots = _Slots(key >> (3 * _BITS), people)
     total = mean * count[:, None]
     for level in range(3):
         parent = slot_of_parent = np.zeros(len(key), np.int64)
         if level < 2:
             x, y, z = _axes(key)
-            wider, parent = np.unique(_key(key >> (3 * _BITS), x >> 1, y >> 1, z >> 1), return_inverse=True)
-            above = _Slots(wider >> (3 * _BITS), people)
-            slot_of_parent = above.slot[parent]
+            parent_key, parent = np.unique(_key(key >> (3 * _BITS), x >> 1, y >> 1, z >> 1), return_inverse=True)
+            parent_slots = _Slots(parent_key >> (3 * _BITS), people)
+            slot_of_parent = parent_slots.slot[parent]
         levels.append(
             VoxelLevel(
-                position=own.pad((total / count[:, None] if level else mean).astype(np.float32)),
-                log_count=own.pad(np.log(count).astype(np.float32)),
-                valid=own.pad(np.ones(len(key), bool)),
-                parent=own.pad(slot_of_parent),
-                neighbors=own.pad(_neighbors(key, own), own.shape[1]) if neighbors and level else None,
+                position=slots.pad((total / count[:, None] if level else mean).astype(np.float32)),
+                log_count=slots.pad(np.log(count).astype(np.float32)),
+                valid=slots.pad(np.ones(len(key), bool)),
+                parent=slots.pad(slot_of_parent),
+                neighbors=slots.pad(_neighbors(key, slots), slots.shape[1]) if neighbors and level else None,
             )
         )
         if level < 2:
-            total, count = _segment_sum(parent, total, len(wider)), np.bincount(parent, count, len(wider))
-            key, own = wider, above
-    return levels, fine
+            total, count = _segment_sum(parent, total, len(parent_key)), np.bincount(parent, count, len(parent_key))
+            key, slots = parent_key, parent_slots
+    return levels, fine_slots
 
 
 def _key(person: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -211,17 +211,17 @@ def _key(person: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.
 
 def _axes(key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """x, y and z of `_key`."""
-    last = (1 << _BITS) - 1
-    return key >> (2 * _BITS) & last, key >> _BITS & last, key & last
+    mask = (1 << _BITS) - 1
+    return key >> (2 * _BITS) & mask, key >> _BITS & mask, key & mask
 
 
 def _neighbors(key: np.ndarray, slots: _Slots) -> np.ndarray:
     """(V, 27) int: slots of the voxels around each, x slowest; the padded width where there is none."""
     # cells reach neither end of their bits: no step runs over into another axis
     steps = _key(np.zeros(1, np.int64), *np.mgrid[:3, :3, :3].reshape(3, 27)) - _key(*np.array([0, 1, 1, 1]))
-    wanted = key[:, None] + steps
-    place = np.minimum(np.searchsorted(key, wanted), max(len(key) - 1, 0))
-    return np.where(key[place] == wanted, slots.slot[place], slots.shape[1]) if len(key) else wanted
+    neighbor_key = key[:, None] + steps
+    row = np.minimum(np.searchsorted(key, neighbor_key), max(len(key) - 1, 0))
+    return np.where(key[row] == neighbor_key, slots.slot[row], slots.shape[1]) if len(key) else neighbor_key
 
 
 def _segment_sum(segment: np.ndarray, values: np.ndarray, size: int) -> np.ndarray:

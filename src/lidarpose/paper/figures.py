@@ -34,46 +34,50 @@ def draw(name: str, cells: Sequence[Cell], out: Path) -> list[Path]:
     columns = list(dict.fromkeys(cell.column for cell in cells))
     paths = []
     for column in columns:
-        firsts = [cell for cell in cells if cell.seed == 0 and cell.column == column]
-        done = {cell.row: cell for cell in firsts if cell.evaluation and is_done(cell.evaluation, out)}
-        if done:
+        first_seed_cells = [cell for cell in cells if cell.seed == 0 and cell.column == column]
+        done_cells = {cell.row: cell for cell in first_seed_cells if cell.evaluation and is_done(cell.evaluation, out)}
+        if done_cells:
             paths.append(out / (f"{name}.png" if len(columns) == 1 else f"{name}-{column}.png"))
-            write_atomic(paths[-1], _picture(name, done, out))
+            write_atomic(paths[-1], _picture(name, done_cells, out))
     return paths
 
 
-def _picture(name: str, done: dict[str, Cell], out: Path) -> bytes:
+def _picture(name: str, cells: dict[str, Cell], out: Path) -> bytes:
     """A figure of one column, of its cells that are done."""
     if name == "fig5":
-        return _side_by_side(done, out)
-    paths = {row: cell.evaluation.product(out) / "stability.json" for row, cell in done.items() if cell.evaluation}
+        return _side_by_side(cells, out)
+    paths = {row: cell.evaluation.product(out) / "stability.json" for row, cell in cells.items() if cell.evaluation}
     studies = {row: json.loads(path.read_text())["studies"][0] for row, path in paths.items()}
     return (compare_stability if name == "fig7" else compare_ends)(studies)
 
 
-def _side_by_side(done: dict[str, Cell], out: Path) -> bytes:
+def _side_by_side(cells: dict[str, Cell], out: Path) -> bytes:
     """The hardest people, a row a person, a column a method."""
-    paths = {row: cell.evaluation.product(out) / POSES for row, cell in done.items() if cell.evaluation}
+    paths = {row: cell.evaluation.product(out) / POSES for row, cell in cells.items() if cell.evaluation}
     predictions = {row: next(iter(read_poses(path).values())) for row, path in paths.items()}
-    places = [{(s, r): k for k, (s, r) in enumerate(zip(p.shard, p.row, strict=True))} for p in predictions.values()]
-    everywhere = sorted(set.intersection(*map(set, places)))
-    tables = zip((p.errors() for p in predictions.values()), places, strict=True)
-    errors = np.array([[table[at[key]] for key in everywhere] for table, at in tables])
+    index_by_key = [
+        {(s, r): k for k, (s, r) in enumerate(zip(p.shard, p.row, strict=True))} for p in predictions.values()
+    ]
+    common_keys = sorted(set.intersection(*map(set, index_by_key)))
+    tables = zip((p.errors() for p in predictions.values()), index_by_key, strict=True)
+    errors = np.array([[table[index[key]] for key in common_keys] for table, index in tables])
     # without labels there is no error
     mean = np.nan_to_num(np.where(np.isnan(errors), 0, errors).sum(-1) / np.maximum((~np.isnan(errors)).sum(-1), 1))
-    hardest = [everywhere[k] for k in np.argsort(-mean.mean(0), kind="stable")[:HARDEST]]
-    target = next(iter(done.values())).target
+    hardest_keys = [common_keys[k] for k in np.argsort(-mean.mean(0), kind="stable")[:HARDEST]]
+    target = next(iter(cells.values())).target
     folder = target.test.product(out) if isinstance(target.test, Step) else target.test
-    clouds = {(p.shard, p.row): p.points for p in open_eval_dataset(folder) if (p.shard, p.row) in set(hardest)}
+    clouds = {(p.shard, p.row): p.points for p in open_eval_dataset(folder) if (p.shard, p.row) in set(hardest_keys)}
     panels = []
-    for key in hardest:
+    for key in hardest_keys:
         for k, (row, p) in enumerate(predictions.items()):
-            at = places[k][key]
-            pose, truth = (Pose(joints=joints[at].astype(float), skeleton=p.skeleton) for joints in (p.pred, p.true))
+            row_index = index_by_key[k][key]
+            pose, truth = (
+                Pose(joints=joints[row_index].astype(float), skeleton=p.skeleton) for joints in (p.pred, p.true)
+            )
             # from the same side in every column, whichever way a method turned the person
             panel = Panel(points=clouds[key], pose=pose, truth=truth, forward=facing(truth))
-            label = f"{row}: {mean[k, everywhere.index(key)]:.0f} mm"
-            panels.append(replace(panel, label=label, distance=float(p.distance[at])))
+            label = f"{row}: {mean[k, common_keys.index(key)]:.0f} mm"
+            panels.append(replace(panel, label=label, distance=float(p.distance[row_index])))
     return draw_people(panels, title=f"{target.title}: the hardest people", per_row=len(predictions))
 
 

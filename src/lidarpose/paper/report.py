@@ -16,7 +16,7 @@ from lidarpose.eval.protocols import DAPT, check_protocol
 from lidarpose.eval.scores import COLUMNS, FILE, Result, read_scores
 from lidarpose.io.files import content_digest, write_atomic
 from lidarpose.models.checkpoint import load_checkpoint, runs_of
-from lidarpose.paper.steps import CELLS, RUNS, Execute, Step, StepFailed, check_out, is_done, last_entry, run_steps
+from lidarpose.paper.steps import CELLS, Execute, Step, StepFailed, begin_out, is_done, last_entry, length_of, run_steps
 from lidarpose.paper.tables import PROTOCOL, Cell, Options, Table, Target, cells, row_key
 from lidarpose.sample import center_of
 
@@ -37,23 +37,21 @@ def run_table(
 ) -> dict[str, Any]:
     """Runs what is not done of a table, cell by cell, and writes it anew after each; returns it. A cell that fails is
     reported and written as failed, and the others go on. A cell whose figures are there is done, wherever it was."""
-    check_out(out)
-    # at once: another process may begin another table in the same folder
-    (out / RUNS).mkdir(parents=True, exist_ok=True)
-    selected = cells(table, options, chosen)
+    begin_out(out)
+    selected_cells = cells(table, options, chosen)
     # before hours of training, not after them
-    for test in {cell.target.test for cell in selected if cell.evaluation is not None}:
+    for test in {cell.target.test for cell in selected_cells if cell.evaluation is not None}:
         if isinstance(test, str):
             check_protocol(PROTOCOL, open_eval_dataset(test))
-    failed: dict[int, str] = {}
-    for k, cell in enumerate(selected):
+    failures: dict[int, str] = {}
+    for k, cell in enumerate(selected_cells):
         if cell.evaluation is not None and not _is_there(table, cell.evaluation, out):
             try:
                 run_steps(cell.evaluation, out, execute, tell)
             except StepFailed as error:
-                failed[k] = str(error)
+                failures[k] = str(error)
                 tell(f"{cell.row}, {cell.column}: failed: {error}")
-        content = write_table(table, selected, options, out, failed)
+        content = write_table(table, selected_cells, options, out, failures)
     return content
 
 
@@ -109,8 +107,9 @@ def _path(evaluation: Step, out: Path) -> Path:
 def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
     """An evaluation's figures, what the training cost, and the mean pose's error on the same people."""
     result = read_scores(evaluation.product(out) / FILE).results[0]
+    lengths = [length_of(step, out) for step in evaluation.all()]
     network, header = load_checkpoint(cell.training[-1].product(out))
-    runs, last = runs_of(header.card), last_entry(cell.training[-1].folder(out))
+    runs, entry = runs_of(header.card), last_entry(cell.training[-1].folder(out))
     row = result.line("mpjpe")
     mean_pose = mean_pose_error(cell.target, result, out)
     return {
@@ -122,13 +121,17 @@ def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
         "protocol": result.setting.summary,
         "people_seen": sum(run.get("people_seen", 0) for run in runs),
         "hours": round(sum(run.get("hours", 0.0) for run in runs), 3),
-        "people_per_second": round(last["people"] / last["seconds"], 1) if last and last["seconds"] else None,
+        "people_per_second": round(entry["people"] / entry["seconds"], 1) if entry and entry["seconds"] else None,
         "size": cell.size,
         "parameters": sum(value.numel() for value in network.parameters()),
         "mean_pose": mean_pose,
         "undertrained": row.value is None or row.value > (1 - _UNDERTRAINED) * mean_pose,
         "scores": str(evaluation.product(out) / FILE),
-    }
+    } | (
+        {"commands": [" ".join([step.line(out), *length_of(step, out)]) for step in evaluation.all()]}
+        if any(lengths)
+        else {}
+    )
 
 
 def _value(result: Result, name: str) -> float | None:
@@ -144,17 +147,21 @@ def mean_pose_error(target: Target, result: Result, out: Path) -> float:
     center that the protocol gives: of labels, or of a person's points."""
     folders = [str(part.product(out)) if isinstance(part, Step) else part for part in (target.train, target.test)]
     # real sets may have been prepared anew
-    card = None if isinstance(target.test, Step) else content_digest(Path(folders[1]) / CARD, expected="a dataset")[:8]
-    name = filter(None, (result.setting.dataset, str(len(result.setting.joints)), card))
+    card_digest = (
+        None if isinstance(target.test, Step) else content_digest(Path(folders[1]) / CARD, expected="a dataset")[:8]
+    )
+    name = filter(None, (result.setting.dataset, str(len(result.setting.joints)), card_digest))
     path = out / CELLS / f"mean-pose-{'-'.join(name)}.json"
     if not path.is_file():
         split = None if isinstance(target.train, Step) else "train"
-        learned = [_offset(person, result) for person in open_eval_dataset(folders[0], split=split, limit=_MEAN_POSE)]
-        scored = [_offset(person, result) for person in open_eval_dataset(folders[1], split=None)]
-        mean = np.nanmean(learned, 0)
-        errors = 1e3 * np.linalg.norm(np.array(scored) - mean, axis=-1)
+        train_offsets = [
+            _offset(person, result) for person in open_eval_dataset(folders[0], split=split, limit=_MEAN_POSE)
+        ]
+        test_offsets = [_offset(person, result) for person in open_eval_dataset(folders[1], split=None)]
+        mean = np.nanmean(train_offsets, 0)
+        errors = 1e3 * np.linalg.norm(np.array(test_offsets) - mean, axis=-1)
         error = aggregate.mean(errors)
-        write_atomic(path, json.dumps({"mpjpe": round(error, 1), "people": len(scored)}) + "\n")
+        write_atomic(path, json.dumps({"mpjpe": round(error, 1), "people": len(test_offsets)}) + "\n")
     return json.loads(path.read_text())["mpjpe"]
 
 
@@ -162,11 +169,11 @@ def _offset(person: EvalSample, result: Result) -> np.ndarray:
     """(J, 3) m: the scored joints from the protocol's center, NaN without a label or points."""
     sample, setting = person.sample, result.setting
     columns = [sample.skeleton.index(joint) for joint in setting.joints]
-    known = (sample.joint_labels[columns] > 0)[:, None]
+    is_labeled = (sample.joint_labels[columns] > 0)[:, None]
     center = center_of(person.points) if len(person.points) else np.full(3, np.nan)
     if setting.protocol == PROTOCOL:
         center = sample.centers.get(DAPT[setting.kind].center, np.full(3, np.nan))
-    return np.where(known, sample.joints[columns] - center, np.nan)
+    return np.where(is_labeled, sample.joints[columns] - center, np.nan)
 
 
 # ---- Markdown
@@ -175,7 +182,10 @@ def _offset(person: EvalSample, result: Result) -> np.ndarray:
 def markdown(content: dict[str, Any]) -> str:
     """A table as a page: the figures, what each cell cost, and the commands."""
     entries = content["cells"]
-    lines = [f"# {content['title']}", "", f"Target: {content['target']}. {_LEGEND}", "", *result_lines(content)]
+    budget = f"Budget: {content['people']:,} people a stage of training"
+    budget += f", {content['hours']:g} hours a row" if content["hours"] else ""
+    lines = [f"# {content['title']}", "", f"Target: {content['target']}. {budget}. {_LEGEND}", ""]
+    lines += result_lines(content)
     lines += ["", "## Cells", "", *cost_lines(entries)]
     return "\n".join([*lines, "", "## Commands", "", *_commands(entries)]) + "\n"
 
@@ -186,8 +196,8 @@ def result_lines(content: dict[str, Any]) -> list[str]:
     columns, rows = (list(dict.fromkeys(entry[name] for entry in entries)) for name in ("column", "row"))
     lines = _grid(["", *columns])
     for row in rows:
-        own = [[e for e in entries if (e["row"], e["column"]) == (row, column)] for column in columns]
-        lines.append(_line([row, *map(_cell_text, own)]))
+        row_entries = [[e for e in entries if (e["row"], e["column"]) == (row, column)] for column in columns]
+        lines.append(_line([row, *map(_cell_text, row_entries)]))
     return lines
 
 
@@ -200,13 +210,15 @@ def cost_lines(entries: list[dict[str, Any]]) -> list[str]:
 def plan(table: Table, selected: Sequence[Cell], out: Path, problem: Any) -> str:
     """The commands of each cell as a page, each in full where it comes first. problem(words): what the parser says
     against a command, "" for nothing."""
-    entries, known = [], set[str]()
+    entries, printed_names = [], set[str]()
     for cell in selected:
         steps = list(cell.evaluation.all()) if cell.evaluation else []
         reason = cell.why or next(filter(None, (problem(step.command(out)) for step in steps)), "")
         entry = {"row": cell.row, "column": cell.column, "seed": cell.seed, "reason": reason}
-        entry["commands"] = [f"{step.name}, as above" if step.name in known else step.line(out) for step in steps]
-        known.update(step.name for step in steps)
+        entry["commands"] = [
+            f"{step.name}, as above" if step.name in printed_names else step.line(out) for step in steps
+        ]
+        printed_names.update(step.name for step in steps)
         entries.append(entry | {"state": "not possible" if reason else "done"})
     rows = ", ".join(dict.fromkeys(row_key(cell.row) for cell in selected))
     return "\n".join([f"# {table.title}", "", f"Rows for --rows: {rows}.", "", *_commands(entries)]) + "\n"
@@ -223,29 +235,33 @@ def _commands(entries: list[dict[str, Any]]) -> list[str]:
 
 
 def _cell_text(entries: list[dict[str, Any]]) -> str:
-    done = [entry for entry in entries if entry["state"] == "done" and entry["mpjpe"] is not None]
-    printed = next((f" (paper {e['published']:.1f})" for e in entries if e["published"] is not None), "")
-    if not done:
-        first = entries[0]
-        return f"{first['state']}: {first['reason']}{printed}" if first["state"] != "not run" else f"not run{printed}"
-    values = [entry["mpjpe"] for entry in done]
-    ends = (done[0]["low"], done[0]["high"]) if len(done) == 1 else (min(values), max(values))
+    done_entries = [entry for entry in entries if entry["state"] == "done" and entry["mpjpe"] is not None]
+    published_text = next((f" (paper {e['published']:.1f})" for e in entries if e["published"] is not None), "")
+    if not done_entries:
+        first_entry = entries[0]
+        return (
+            f"{first_entry['state']}: {first_entry['reason']}{published_text}"
+            if first_entry["state"] != "not run"
+            else f"not run{published_text}"
+        )
+    values = [entry["mpjpe"] for entry in done_entries]
+    ends = (done_entries[0]["low"], done_entries[0]["high"]) if len(done_entries) == 1 else (min(values), max(values))
     interval = "" if ends[0] is None else f" [{ends[0]:.1f}, {ends[1]:.1f}]"
-    seeds = f", {len(done)} of {len(entries)} seeds" if len(entries) > 1 else ""
-    weak = ", *undertrained*" if any(entry["undertrained"] for entry in done) else ""
-    return f"{np.mean(values):.1f}{interval}{seeds}{weak}{printed}"
+    seeds = f", {len(done_entries)} of {len(entries)} seeds" if len(entries) > 1 else ""
+    undertrained_text = ", *undertrained*" if any(entry["undertrained"] for entry in done_entries) else ""
+    return f"{np.mean(values):.1f}{interval}{seeds}{undertrained_text}{published_text}"
 
 
 def _cost(entry: dict[str, Any]) -> list[str]:
-    where = [entry["row"], entry["column"], str(entry["seed"])]
+    cell_words = [entry["row"], entry["column"], str(entry["seed"])]
     if entry["state"] != "done":
-        return [*where, *["-"] * 10, entry["state"]]
+        return [*cell_words, *["-"] * 10, entry["state"]]
     figures = ["-" if entry[name] is None else f"{entry[name]:.1f}" for name in (*COLUMNS, "mean_pose")]
     speed = "-" if entry["people_per_second"] is None else f"{entry['people_per_second']:.1f}"
     # tables of before have no sizes
     cost = [f"{entry['people_seen']:,}", f"{entry['hours']:.2f}", speed, entry.get("size", "-")]
     cost.append(f"{entry['parameters']:,}")
-    return [*where, *figures, *cost, "undertrained" if entry["undertrained"] else "done"]
+    return [*cell_words, *figures, *cost, "undertrained" if entry["undertrained"] else "done"]
 
 
 def _line(words: Sequence[str]) -> str:

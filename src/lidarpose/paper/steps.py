@@ -64,18 +64,18 @@ class Step:
         words = [word.name if isinstance(word, Step) else word for word in self.words]
         if "--workers" in words:
             # changes nothing that is made
-            at = words.index("--workers")
-            words[at : at + 2] = []
+            index = words.index("--workers")
+            words[index : index + 2] = []
         digest = hashlib.sha256(json.dumps([words, self.hours]).encode()).hexdigest()[:8]
-        about = "".join(c if c.isalnum() or c in ".-" else "-" for c in self._about)
-        return "-".join(filter(None, (self.kind, about, digest)))
+        label = "".join(c if c.isalnum() or c in ".-" else "-" for c in self._about)
+        return "-".join(filter(None, (self.kind, label, digest)))
 
     @property
     def _about(self) -> str:
         """Values of the options that tell most, of this step or of those that it needs."""
         pairs = zip(self.words, self.words[1:], strict=False)
-        own = [f"{_TELLING[option]}{value}" for option, value in pairs if option in _TELLING]
-        return "-".join(own) or next((need._about for need in self.needs if need.kind in KINDS), "")
+        option_values = [f"{_TELLING[option]}{value}" for option, value in pairs if option in _TELLING]
+        return "-".join(option_values) or next((need._about for need in self.needs if need.kind in KINDS), "")
 
     @property
     def needs(self) -> tuple["Step", ...]:
@@ -150,8 +150,8 @@ def _run(step: Step, out: Path, execute: Execute) -> None:
         shutil.rmtree(folder, ignore_errors=True)
     words = step.command(out)
     if step.kind in KINDS and (folder / CONFIG).is_file():
-        where = [str(folder)] if step.kind == "pretrain" else ["--out", str(folder)]
-        words = [step.kind, *where, "--resume", *_state(step, out).get("length", ())]
+        folder_words = [str(folder)] if step.kind == "pretrain" else ["--out", str(folder)]
+        words = [step.kind, *folder_words, "--resume", *length_of(step, out)]
     if step.hours is None or step.kind not in KINDS or "length" in _state(step, out):
         _execute(words, execute)
         return
@@ -167,17 +167,17 @@ def _run(step: Step, out: Path, execute: Execute) -> None:
 
 
 def _execute(words: list[str], execute: Execute) -> None:
-    last = _LastLine(sys.stderr)
-    with redirect_stderr(last):
+    last_line = _LastLine(sys.stderr)
+    with redirect_stderr(last_line):
         try:
             status = execute(words)
-        except SystemExit as stopped:
+        except SystemExit as exit_error:
             # a command line that the parser refuses
-            status = stopped.code if isinstance(stopped.code, int) else 2
+            status = exit_error.code if isinstance(exit_error.code, int) else 2
     if status >= 128:
-        raise KeyboardInterrupt(last.line)
+        raise KeyboardInterrupt(last_line.line)
     if status:
-        raise StepFailed(last.line.removeprefix("lidarpose: error: ") or f"ended with status {status}")
+        raise StepFailed(last_line.line.removeprefix("lidarpose: error: ") or f"ended with status {status}")
 
 
 class _LastLine(io.TextIOBase):
@@ -243,16 +243,27 @@ def _people(folder: Path) -> int:
 def _shortened(step: Step, folder: Path, fit: float) -> list[str]:
     """The options that make a run as long as `fit` people, or a little longer than it has become meanwhile."""
     # what was seen cannot be taken back
-    seen = (last_entry(folder) or {}).get("people", 0)
-    share = min(max(fit, _MORE * seen) / _people(folder), 1.0)
+    people_seen = (last_entry(folder) or {}).get("people", 0)
+    share = min(max(fit, _MORE * people_seen) / _people(folder), 1.0)
     recipe = read_config(folder, KINDS[step.kind])[0].to_dict()
     name = next(name for name in LENGTHS if name in recipe)
     length = recipe[name] * share
     return [f"--{name}", str(max(round(length), 1)) if name == "people" else f"{length:.4g}"]
 
 
+def length_of(step: Step, out: Path) -> tuple[str, ...]:
+    """The options that made a training as long as its hours allowed; none of one that was not shortened."""
+    return tuple(_state(step, out).get("length", ()))
+
+
+def begin_out(out: Path) -> None:
+    """Makes the folder at once: another process may begin another table in it. Raises as `check_out`."""
+    check_out(out)
+    (out / RUNS).mkdir(parents=True, exist_ok=True)
+
+
 def check_out(out: Path) -> None:
     """Raises InputError for a folder that holds something else."""
-    known = any((out / name).is_dir() for name in (RUNS, CELLS))
-    if out.is_file() or out.is_dir() and any(out.iterdir()) and not known:
+    is_paper_folder = any((out / name).is_dir() for name in (RUNS, CELLS))
+    if out.is_file() or out.is_dir() and any(out.iterdir()) and not is_paper_folder:
         raise InputError(f"{out}: expected a new or empty folder, or one of lidarpose paper: name another by --out")

@@ -27,6 +27,8 @@ POSES = ("freemotion-poses", "lidarhuman26m-poses")
 SMPL = "smpl"
 # on real sets everybody learns from the crops and about the centers that the protocol scores by
 _RELEASED, _RELEASED_CLIPS = ("--augment", "paper"), ("--options", "trans_center=true")
+# clips of the stand-in are few, and other rows' people are turned there
+_TURNED = ("--augment", "turn")
 # people of the stand-in: to learn from at most, to be scored on at most, and their seeds, which nothing else has
 _TRAIN, _TEST = 10_000, 2_000
 _SEEDS = {"train": 1_000_003, "test": 1_000_033}
@@ -177,16 +179,16 @@ def _cell(row: Row, target: Target, seed: int, score: tuple[str, ...], options: 
         return cell
     stages = 1 + (row.pretrain is not None)
     hours = None if options.hours is None else options.hours / stages
-    run = ("--seed", str(seed), "--workers", str(options.workers))
-    begin: tuple[Step | str, ...] = ("--init", "random")
+    run_words = ("--seed", str(seed), "--workers", str(options.workers))
+    init: tuple[Step | str, ...] = ("--init", "random")
     if row.pretrain is not None:
-        first = Step(("pretrain", *row.pretrain, "--people", str(options.people), *run), hours)
-        begin = ("--init", first)
+        pretraining = Step(("pretrain", *row.pretrain, "--people", str(options.people), *run_words), hours)
+        init = ("--init", pretraining)
     learn = target.learn if row.clips else (*target.learn, *target.thinned)
-    tuned = Step(("finetune", target.train, *row.finetune, *begin, *learn, *run), hours)
+    finetuning = Step(("finetune", target.train, *row.finetune, *init, *learn, *run_words), hours)
     # as the released code decodes heatmaps
-    dark = ("--decode", "dark") if options.real and row.heatmaps else ()
-    words = ("evaluate", tuned, target.test, *target.score, *dark, *score)
+    decoding = ("--decode", "dark") if options.real and row.heatmaps else ()
+    words = ("evaluate", finetuning, target.test, *target.score, *decoding, *score)
     return replace(cell, evaluation=Step(words))
 
 
@@ -215,8 +217,8 @@ def _real(name: str, folder: str) -> Target:
 
 def _stand_in(name: str, title: str, options: Options) -> Target:
     clips = name == "clips"
-    learned = min(options.people, _TRAIN)
-    counts = {"train": learned, "test": min(max(learned // 4, 1), _TEST)}
+    train_count = min(options.people, _TRAIN)
+    counts = {"train": train_count, "test": min(max(train_count // 4, 1), _TEST)}
     poses: tuple[str, ...] = ()
     if options.motion:
         poses = ("--motion", options.motion[0], *(("--subjects", options.held_out) if options.held_out else ()))
@@ -226,7 +228,7 @@ def _stand_in(name: str, title: str, options: Options) -> Target:
         words = ("synth", *(("--clips",) if clips else ()), "-n", str(number), "--scene", "wild")
         words += ("--sensor", _SENSORS, "--seed", str(_SEEDS[part]), "--workers", str(options.workers), *poses)
         steps[part] = Step(words)
-    people = -(-learned // _CLIP) * _CLIP if clips else learned
+    people = -(-train_count // _CLIP) * _CLIP if clips else train_count
     learn = ("--split", "all", "--mix", "0", "--epochs", f"{options.people / people:.6g}")
     return Target(name=name, title=title, train=steps["train"], test=steps["test"], learn=learn, score=(), clips=clips)
 
@@ -234,16 +236,16 @@ def _stand_in(name: str, title: str, options: Options) -> Target:
 # ---- rows
 
 
-def _paper(options: Options, *more: str) -> tuple[str, ...]:
+def _paper(options: Options, *words: str) -> tuple[str, ...]:
     """Options of a training of the paper's network; fine-tuning on synthesized people is centered on the points, as
     everybody's there, where the paper's own is centered on labels."""
-    return ("--recipe", "paper", *(() if options.size == PAPER else _FASTER), *more)
+    return ("--recipe", "paper", *(() if options.size == PAPER else _FASTER), *words)
 
 
-def _pretrained(options: Options, *more: str, motion: tuple[str, ...] | None = None) -> tuple[str, ...]:
+def _pretrained(options: Options, *words: str, motion: tuple[str, ...] | None = None) -> tuple[str, ...]:
     """Options of the paper's pre-training."""
     poses = _motion(options) if motion is None else motion
-    return _paper(options, "--size", options.size, *poses, *more)
+    return _paper(options, "--size", options.size, *poses, *words)
 
 
 def _motion(options: Options) -> tuple[str, ...]:
@@ -269,18 +271,18 @@ def _learned(raw: str) -> str:
     """The subjects of LiDARHuman26M's raw folder that are not of the split test; "" where none is."""
     sequences = sorted(path.name for path in (Path(raw) / POSE_FOLDER).glob("*") if path.is_dir())
     rule = split_rule("lidarhuman26m", Path(raw)) if sequences else None
-    learned = [f"{POSE_FOLDER}/{name}" for name in sequences if rule is not None and rule.of_part(name) != "test"]
-    return ",".join(learned) if len(learned) < len(sequences) else ""
+    subjects = [f"{POSE_FOLDER}/{name}" for name in sequences if rule is not None and rule.of_part(name) != "test"]
+    return ",".join(subjects) if len(subjects) < len(sequences) else ""
 
 
-def _tuned(options: Options, *more: str) -> tuple[str, ...]:
-    """Options of the paper's fine-tuning, by heatmaps unless `more` names what has none."""
-    faster = () if options.size == PAPER or _NO_HEATMAPS & set(more) else _HEATMAP_RATE
-    return _paper(options, *faster, *(() if options.real else ("--augment", "default")), *more)
+def _tuned(options: Options, *words: str) -> tuple[str, ...]:
+    """Options of the paper's fine-tuning, by heatmaps unless `words` names what has none."""
+    heatmap_rate = () if options.size == PAPER or _NO_HEATMAPS & set(words) else _HEATMAP_RATE
+    return _paper(options, *heatmap_rate, *(() if options.real else ("--augment", "default")), *words)
 
 
-def _random(options: Options, *more: str) -> tuple[str, ...]:
-    return _tuned(options, "--size", options.size, *more)
+def _random(options: Options, *words: str) -> tuple[str, ...]:
+    return _tuned(options, "--size", options.size, *words)
 
 
 def _published(*values: float | None) -> dict[str, float]:
@@ -289,31 +291,39 @@ def _published(*values: float | None) -> dict[str, float]:
 
 def _methods(options: Options) -> list[Row]:
     """Table 1."""
-    prn, own = ("--neck", "prn"), "tiny" if options.size == TINY_PAPER else "small"
-    released = _RELEASED if options.real else ()
-    lpformer = _baseline(options, "lpformer", *released)
+    prn, size = ("--neck", "prn"), "tiny" if options.size == TINY_PAPER else "small"
+    released_options = _RELEASED if options.real else ()
+    # the other recipes mix in nobody and hold nobody out
+    equal_people = ("--mix", "0", "--hold-out", "0") if options.real else ()
+    lpformer = _baseline(options, "lpformer", *released_options)
     return [
         _of_clips(options, "LiDARCap", 79.31, 101.89),
         _of_clips(options, "NE", 72.23, 96.80),
         Row(name="LPFormer", finetune=lpformer, published=_published(61.60, 83.69, 95.72, 49.31)),
-        Row(name="PRN as published", finetune=_baseline(options, "prn", *released)),
+        Row(name="PRN as published", finetune=_baseline(options, "prn", *released_options)),
         Row(name="PRN", finetune=_random(options, *prn), published=_published(68.48, 70.56, 80.01, 48.76)),
         _dapt(options, _published(51.59, 59.76, 73.47, 28.01)),
-        Row(name="ours", finetune=released, pretrain=("--size", own, "--scene", "paper", *_motion(options))),
+        Row(
+            name="ours",
+            finetune=(*released_options, *equal_people),
+            pretrain=("--size", size, "--scene", "paper", *_motion(options)),
+        ),
     ]
 
 
-def _baseline(options: Options, model: str, *more: str) -> tuple[str, ...]:
+def _baseline(options: Options, model: str, *words: str) -> tuple[str, ...]:
     """Options of a baseline's training, at the width that goes with the size of the paper's network; the reduced ones
     by the cycle of rates that the paper's network has."""
     cycle = () if options.size == PAPER else _ONE_CYCLE
-    return ("--model", model, "--size", model + options.size.removeprefix(PAPER), *cycle, *more)
+    return ("--model", model, "--size", model + options.size.removeprefix(PAPER), *cycle, *words)
 
 
 def _of_clips(options: Options, name: str, *published: float) -> Row:
-    printed = _published(None, None, *published)
-    released = _RELEASED_CLIPS if options.real else ()
-    return Row(name=name, finetune=_baseline(options, name.lower(), *released), clips=True, published=printed)
+    mpjpe_by_dataset = _published(None, None, *published)
+    clip_options = _RELEASED_CLIPS if options.real else _TURNED
+    return Row(
+        name=name, finetune=_baseline(options, name.lower(), *clip_options), clips=True, published=mpjpe_by_dataset
+    )
 
 
 def _dapt(options: Options, published: dict[str, float], name: str = "DAPT") -> Row:
@@ -322,15 +332,15 @@ def _dapt(options: Options, published: dict[str, float], name: str = "DAPT") -> 
 
 def _corpora(options: Options) -> list[Row]:
     """Table 2. The stand-in has no corpora: poses of each file of motion, and those of the procedural prior."""
-    tuned = _tuned(options)
+    finetune = _tuned(options)
     rows = [Row(name="w/o", finetune=_random(options), published=_published(59.2, None, 76.5))]
     if not options.real:
-        rows.append(Row(name="procedural prior", finetune=tuned, pretrain=_pretrained(options, motion=())))
+        rows.append(Row(name="procedural prior", finetune=finetune, pretrain=_pretrained(options, motion=())))
         for k, source in enumerate(options.motion):
-            own = _pretrained(options, motion=_captured(source, options.subjects if k == 0 else ""))
-            rows.append(Row(name=f"poses of {Path(source).stem}", finetune=tuned, pretrain=own))
+            pretrain = _pretrained(options, motion=_captured(source, options.subjects if k == 0 else ""))
+            rows.append(Row(name=f"poses of {Path(source).stem}", finetune=finetune, pretrain=pretrain))
         return rows
-    for name, title, *printed in (
+    for name, title, *mpjpe in (
         ("lipd", "LIPD", 58.7, None, 75.6),
         ("freemotion", "FreeMotion", 57.9, None, 74.3),
         ("noisemotion", "NoiseMotion", 59.0, None, 76.3),
@@ -338,42 +348,46 @@ def _corpora(options: Options) -> list[Row]:
         ("lidarhuman26m-poses", "LiDARH26M†", 51.6, None, 73.4),
     ):
         folder, has_points = options.data.get(name, ""), name in CORPORA
-        shown = ("--shards", folder) if has_points else _corpus(options, name)
-        own = _pretrained(options, motion=shown)
-        what = "as prepared, with --split train if it has a split" if has_points else "the raw files of its poses"
-        why = "" if folder else f"needs --data {name}=DIR, {what}"
-        rows.append(Row(name=title, finetune=tuned, pretrain=own, why=why, published=_published(*printed)))
+        pose_options = ("--shards", folder) if has_points else _corpus(options, name)
+        pretrain = _pretrained(options, motion=pose_options)
+        requirement = (
+            "as prepared, with --split train if it has a split" if has_points else "the raw files of its poses"
+        )
+        why = "" if folder else f"needs --data {name}=DIR, {requirement}"
+        rows.append(Row(name=title, finetune=finetune, pretrain=pretrain, why=why, published=_published(*mpjpe)))
     return rows
 
 
 def _components(options: Options) -> list[Row]:
     """Table 3."""
-    plain, level = _pretrained(options), _pretrained(options, "--neck", "finest")
-    tuned, coordinates = _tuned(options), _tuned(options, "--head", "coordinates")
+    pretrain, pretrain_finest = _pretrained(options), _pretrained(options, "--neck", "finest")
+    finetune, finetune_coordinates = _tuned(options), _tuned(options, "--head", "coordinates")
     return [
         Row(name="PRN baseline", finetune=_random(options, "--neck", "prn"), published={"waymo": 68.5}),
-        Row(name="anchors", finetune=coordinates, pretrain=level, published={"waymo": 54.3}),
-        Row(name="anchors + MDE", finetune=coordinates, pretrain=plain, published={"waymo": 52.3}),
-        Row(name="anchors + heatmaps", finetune=tuned, pretrain=level, published={"waymo": 53.8}),
+        Row(name="anchors", finetune=finetune_coordinates, pretrain=pretrain_finest, published={"waymo": 54.3}),
+        Row(name="anchors + MDE", finetune=finetune_coordinates, pretrain=pretrain, published={"waymo": 52.3}),
+        Row(name="anchors + heatmaps", finetune=finetune, pretrain=pretrain_finest, published={"waymo": 53.8}),
         _dapt(options, {"waymo": 51.7}, "anchors + MDE + heatmaps"),
     ]
 
 
 def _augmentations(options: Options) -> list[Row]:
     """Table 4a, and Table 4b, whose r_keep of 0.6 is the last row of 4a."""
-    tuned, motion = _tuned(options), _motion(options)
-    recorded, sampled = (_pretrained(options, *way) for way in (("--set", "recorded=1,keep=1"), ("--keep", "1")))
+    finetune, motion = _tuned(options), _motion(options)
+    pretrain_recorded, pretrain_sampled = (
+        _pretrained(options, *words) for words in (("--set", "recorded=1,keep=1"), ("--keep", "1"))
+    )
     why = "" if motion else "places as recorded need captured motion: --motion FILE"
     rows = [
         Row(name="scratch", finetune=_random(options), published={"waymo": 59.2}),
-        Row(name="+ pre-training", finetune=tuned, pretrain=recorded, why=why, published={"waymo": 52.9}),
-        Row(name="+ scene sampling", finetune=tuned, pretrain=sampled, published={"waymo": 52.4}),
+        Row(name="+ pre-training", finetune=finetune, pretrain=pretrain_recorded, why=why, published={"waymo": 52.9}),
+        Row(name="+ scene sampling", finetune=finetune, pretrain=pretrain_sampled, published={"waymo": 52.4}),
         _dapt(options, {"waymo": 51.7}, "+ laser masking"),
     ]
-    for keep, printed in zip(_KEPT, (53.0, 51.7, 51.9, 52.5, 52.4), strict=True):
-        more = () if keep == _RECIPE_KEEP else ("--keep", keep)
-        own = _pretrained(options, *more)
-        rows.append(Row(name=f"r_keep {keep}", finetune=tuned, pretrain=own, published={"waymo": printed}))
+    for keep, mpjpe in zip(_KEPT, (53.0, 51.7, 51.9, 52.5, 52.4), strict=True):
+        keep_options = () if keep == _RECIPE_KEEP else ("--keep", keep)
+        pretrain = _pretrained(options, *keep_options)
+        rows.append(Row(name=f"r_keep {keep}", finetune=finetune, pretrain=pretrain, published={"waymo": mpjpe}))
     return rows
 
 

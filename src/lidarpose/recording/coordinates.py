@@ -38,13 +38,13 @@ def in_world(line: dict[str, Any], up: str = "z") -> dict[str, Any]:
     T = np.array(line["T_world_sensor"])
     people = []
     for person in line["people"]:
-        moved: dict[str, Any] = {}
+        changes: dict[str, Any] = {}
         if person["joints"] is not None:
-            moved["joints"] = moved_points(T, person["joints"])
+            changes["joints"] = moved_points(T, person["joints"])
         if (box := person["box"]) is not None:
             yaw = moved_yaw(box["yaw"], T, rotation_of_boxes(up))
-            moved["box"] = box | {"center": moved_points(T, box["center"]), "yaw": yaw}
-        people.append(person | moved)
+            changes["box"] = box | {"center": moved_points(T, box["center"]), "yaw": yaw}
+        people.append(person | changes)
     return line | {"people": people, "coordinates": "world"}
 
 

@@ -39,8 +39,8 @@ class FrameBoxes:
         if isinstance(given, Mapping):
             self._by_frame = {str(frame): boxes for frame, boxes in given.items()}
         elif not isinstance(given, str | os.PathLike):
-            came = type(given).__name__
-            raise InputError(f"boxes of a recording: expected a folder, a file or a dict by frame, got {came}")
+            kind = type(given).__name__
+            raise InputError(f"boxes of a recording: expected a folder, a file or a dict by frame, got {kind}")
         elif os.path.isdir(given):
             for path in sorted(Path(given).iterdir()):
                 if path.suffix.lower() in _SUFFIXES:
@@ -59,8 +59,8 @@ class FrameBoxes:
         try:
             return self._read(self._by_frame[key])
         except InputError as error:
-            given = self._by_frame[key]
-            raise error if isinstance(given, str | os.PathLike) else file_error(f"frame {key}", error) from None
+            boxes = self._by_frame[key]
+            raise error if isinstance(boxes, str | os.PathLike) else file_error(f"frame {key}", error) from None
 
     def check_used(self, last: str) -> None:
         """Raises InputError where no frame up to the last one's id has boxes, so that they are of something else."""
@@ -85,9 +85,9 @@ def _by_frame(path: str | os.PathLike) -> dict[str, Any]:
     for i, entry in enumerate(entries if isinstance(entries, list) else [entries]):
         frame = entry.get("frame") if isinstance(entry, dict) else None
         if isinstance(frame, bool) or not isinstance(frame, str | int) or "people" not in entry:
-            came = shorten(json.dumps(entry), 60)
+            excerpt = shorten(json.dumps(entry), 60)
             raise file_error(
-                path, f"expected an entry a frame, {_FORM}, got {came} as entry {i}: one box file is one scan"
+                path, f"expected an entry a frame, {_FORM}, got {excerpt} as entry {i}: one box file is one scan"
             )
         if str(frame) in by_frame:
             raise file_error(path, f"expected a frame once, got {frame!r} twice: put its people into one entry")

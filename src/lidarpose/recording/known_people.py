@@ -61,13 +61,15 @@ class KnownPeople:
         boxes, pelvises = [], []
         for state in states:
             if self._is_trusted(state, time):
-                last, size = self._verified[state.id], np.maximum(state.size, 0.1)
+                verification, size = self._verified[state.id], np.maximum(state.size, 0.1)
                 center = transform_points(T_sensor_fixed, state.center)
                 yaw = moved_yaw(state.yaw, T_sensor_fixed, None, self.fixed.R_upright)
-                boxes.append(Box(center=center, size=size, yaw=yaw, score=last.score, mounted=last.mounted))
-                pelvises.append(transform_points(T_sensor_fixed, state.center + last.offset))
-        since = time - self._rejected[:, 3]
-        self._rejected = self._rejected[(since >= 0) & (since < _trusted(np.arange(len(self._rejected))))]
+                boxes.append(
+                    Box(center=center, size=size, yaw=yaw, score=verification.score, mounted=verification.mounted)
+                )
+                pelvises.append(transform_points(T_sensor_fixed, state.center + verification.offset))
+        elapsed = time - self._rejected[:, 3]
+        self._rejected = self._rejected[(elapsed >= 0) & (elapsed < _trusted(np.arange(len(self._rejected))))]
         return KnownPlaces(
             boxes=boxes,
             pelvises=np.reshape(pelvises, (-1, 3)),
@@ -78,8 +80,12 @@ class KnownPeople:
 
     def _is_trusted(self, state: TrackState, time: float) -> bool:
         """Whether somebody needs no verification."""
-        last = self._verified.get(state.id)
-        if last is None or last.score < self._least_score or not 0 <= time - last.time < _trusted(state.id):
+        verification = self._verified.get(state.id)
+        if (
+            verification is None
+            or verification.score < self._least_score
+            or not 0 <= time - verification.time < _trusted(state.id)
+        ):
             return False
         return state.age <= _RECENT and state.position_sd <= _MOST_DEVIATION
 
@@ -96,73 +102,80 @@ class KnownPeople:
             places = transform_points(T_fixed_sensor, scan.rejected)
             self._rejected = np.concatenate([self._rejected, np.insert(places, 3, time, axis=1)])
         # whoever is searched for, or was given, has a box
-        own = [cast(Box, person.box) for person in poses]
+        sensor_boxes = [cast(Box, person.box) for person in poses]
         pelvises = [_pelvis(person.pose) for person in poses]
-        is_verified = np.zeros(len(own), bool) if scan.verified is None else scan.verified
+        is_verified = np.zeros(len(sensor_boxes), bool) if scan.verified is None else scan.verified
         if scan.verified is not None and scan.pelvises is not None:
             # the box of somebody known goes with the pelvis
             for i in np.flatnonzero(~scan.verified).tolist():
                 pelvis = scan.pelvises[i] if pelvises[i] is None else pelvises[i]
-                own[i] = replace(own[i], center=(own[i].center + pelvis - scan.pelvises[i]).round(4))
+                sensor_boxes[i] = replace(
+                    sensor_boxes[i], center=(sensor_boxes[i].center + pelvis - scan.pelvises[i]).round(4)
+                )
         boxes = [
             replace(
                 box,
                 center=transform_points(T_fixed_sensor, box.center),
                 yaw=moved_yaw(box.yaw, T_fixed_sensor, self.fixed.R_upright),
             )
-            for box in own
+            for box in sensor_boxes
         ]
         # the surest are first
-        strong = sum(box.score is None or box.score >= self._least_score for box in boxes)
-        ids = self._tracker.update(time, boxes[:strong], boxes[strong:])
+        num_strong = sum(box.score is None or box.score >= self._least_score for box in boxes)
+        ids = self._tracker.update(time, boxes[:num_strong], boxes[num_strong:])
         for id, box, pelvis, is_new in zip(ids, boxes, pelvises, is_verified, strict=True):
             if is_new and id >= 0 and pelvis is not None and box.score is not None:
                 offset = transform_points(T_fixed_sensor, pelvis) - box.center
                 self._verified[id] = _Verified(time, box.score, box.mounted, offset.tolist())
-        self._verified = {id: last for id, last in self._verified.items() if time - last.time < _FORGOTTEN}
-        people = zip(ids, poses, own, strict=True)
+        self._verified = {
+            id: verification for id, verification in self._verified.items() if time - verification.time < _FORGOTTEN
+        }
+        people = zip(ids, poses, sensor_boxes, strict=True)
         return tuple(replace(person, id=id, box=replace(box, id=id)) for id, person, box in people if id >= 0)
 
     def _steadied(self, time: float, people: tuple[PersonPose, ...], T_fixed_sensor: np.ndarray) -> tuple:
         """Poses by the past of their tracks."""
         T_sensor_fixed = np.linalg.inv(T_fixed_sensor)
         gap = self._tracker.max_gap
-        self._filters = {id: own for id, own in self._filters.items() if 0 <= time - own[0] <= gap}
-        steady = []
+        self._filters = {id: entry for id, entry in self._filters.items() if 0 <= time - entry[0] <= gap}
+        steady_people = []
         for person in people:
             if person.pose is not None and isinstance(person.id, int):
-                _, own = self._filters.get(person.id) or (time, LiveFilter(person.skeleton))
+                _, live_filter = self._filters.get(person.id) or (time, LiveFilter(person.skeleton))
                 joints = transform_points(T_fixed_sensor, person.pose.joints)
-                pose = cast(Pose, own.update(time, replace(person.pose, joints=joints)))
-                self._filters[person.id] = time, own
+                pose = cast(Pose, live_filter.update(time, replace(person.pose, joints=joints)))
+                self._filters[person.id] = time, live_filter
                 person = replace(person, pose=replace(pose, joints=transform_points(T_sensor_fixed, pose.joints)))
-            steady.append(person)
-        return tuple(steady)
+            steady_people.append(person)
+        return tuple(steady_people)
 
     def state(self) -> dict[str, Any]:
         """What the frames so far said, as JSON holds it."""
-        world = self.fixed.T_world_sensor
+        T_world_sensor = self.fixed.T_world_sensor
         return {
             "tracker": self._tracker.state(),
-            "T_world_sensor": None if world is None else world.tolist(),
+            "T_world_sensor": None if T_world_sensor is None else T_world_sensor.tolist(),
             "verified": self._verified,
             "rejected": self._rejected.tolist(),
-            "filters": {id: [time, own.state()] for id, (time, own) in self._filters.items()},
+            "filters": {id: [time, live_filter.state()] for id, (time, live_filter) in self._filters.items()},
         }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Goes on where those whose `state()` this is would."""
         self._tracker = Tracker.from_state(state["tracker"])
         self.fixed.from_sensor(state["T_world_sensor"])
-        self._verified = {int(id): _Verified(*own) for id, own in state["verified"].items()}
+        self._verified = {int(id): _Verified(*values) for id, values in state["verified"].items()}
         self._rejected = np.array(state["rejected"], float).reshape(-1, 4)
-        self._filters = {int(id): (time, LiveFilter.from_state(own)) for id, (time, own) in state["filters"].items()}
+        self._filters = {
+            int(id): (time, LiveFilter.from_state(filter_state))
+            for id, (time, filter_state) in state["filters"].items()
+        }
 
 
 def _trusted(number: Any) -> Any:
     """For how long what was verified holds, s."""
-    first, last = _TRUSTED
-    return first + (last - first) * (number % 5) / 4
+    shortest, longest = _TRUSTED
+    return shortest + (longest - shortest) * (number % 5) / 4
 
 
 def _pelvis(pose: Pose | None) -> np.ndarray | None:

@@ -52,8 +52,8 @@ class PartFile:
     def _read(self) -> int:
         """How many bytes of the part hold finished lines of this command."""
         try:
-            saved = json.loads(self.state_path.read_bytes())
-            command, size = saved["command"], saved["bytes"]
+            content = json.loads(self.state_path.read_bytes())
+            command, size = content["command"], content["bytes"]
             if self.path.stat().st_size < size:
                 return 0
         except (OSError, ValueError, KeyError, TypeError):
@@ -62,7 +62,7 @@ class PartFile:
             names = [*self.command, *command]
             self.other = sorted({name for name in names if command.get(name) != self.command.get(name)})
             return 0
-        self.frames, self.last, self.state = saved["frames"], tuple(saved["last"]), saved["state"]
+        self.frames, self.last, self.state = content["frames"], tuple(content["last"]), content["state"]
         return size
 
     def __enter__(self) -> "PartFile":
@@ -76,7 +76,7 @@ class PartFile:
         self._file.write(json.dumps(frame.to_dict()).encode() + b"\n")
         self._file.flush()
         self.frames, self.last, self.state = self.frames + 1, (frame.index, frame.id), state
-        saved = {
+        content = {
             "command": self.command,
             "bytes": self._file.tell(),
             "frames": self.frames,
@@ -84,7 +84,7 @@ class PartFile:
             "state": state,
         }
         temporary = self.state_path.with_name(self.state_path.name + ".new")
-        temporary.write_text(json.dumps(saved))
+        temporary.write_text(json.dumps(content))
         os.replace(temporary, self.state_path)
 
     def lines(self) -> Iterator[dict[str, Any]]:
@@ -201,8 +201,8 @@ def _add_frames(source: Source, steps: FramePredictor, part: PartFile) -> None:
         frame = next(frames, None)
         if frame is None or (frame.index, frame.id) != (index, id):
             raise file_error(part.path, f"was made of other frames, the last one {id}: remove it to begin anew")
-    with Progress(source.count, unit="frames", done=part.frames) as shown:
-        for done in steps.predict_all(frames):
-            part.append(done, steps.state())
-            shown.update(part.frames)
+    with Progress(source.count, unit="frames", done=part.frames) as bar:
+        for frame_poses in steps.predict_all(frames):
+            part.append(frame_poses, steps.state())
+            bar.update(part.frames)
     steps.check_boxes(part.last)

@@ -55,7 +55,7 @@ class WaysPicture:
 
     def draw(self, source: Source, skeleton: Skeleton, *, title: str) -> bytes:
         """The PNG; the source is read again for the points of some frames."""
-        ways = {id: np.array(places) for id, places in self._ways.items()}
+        paths = {id: np.array(places) for id, places in self._ways.items()}
         points, poses = self._points(source), None
         is_single = len(self._frames) == 1
         if is_single:
@@ -63,40 +63,42 @@ class WaysPicture:
             boxes = [person["box"] for person in self._people if person["box"] is not None]
             joints = [person["joints"] for person in self._people if person["joints"] is not None]
             poses = Pose(joints=np.stack(joints), skeleton=skeleton) if joints else None
-            people = counted(len(self._people), "person", "people")
+            count_text = counted(len(self._people), "person", "people")
         else:
             boxes = [
-                Box(center=way[-1], size=np.array([0.8, 0.8, 1.8]), yaw=self._yaws.get(id, 0.0), id=id)
-                for id, way in ways.items()
+                Box(center=path[-1], size=np.array([0.8, 0.8, 1.8]), yaw=self._yaws.get(id, 0.0), id=id)
+                for id, path in paths.items()
                 if id is not None
             ]
-            people = counted(len(boxes), "track")
-            if not boxes and None in ways:
-                people = counted(len(ways[None]), "person", "people")
+            count_text = counted(len(boxes), "track")
+            if not boxes and None in paths:
+                count_text = counted(len(paths[None]), "person", "people")
         panel = ScanPanel(
             points=points,
             boxes=boxes,
             poses=poses,
-            tracks=[way for id, way in ways.items() if id is not None],
-            places=None if is_single else ways.get(None),
-            label=f"{people} in {counted(len(self._frames), 'frame')}",
+            tracks=[path for id, path in paths.items() if id is not None],
+            places=None if is_single else paths.get(None),
+            label=f"{count_text} in {counted(len(self._frames), 'frame')}",
             sensor=self._to_fixed[-1][:2, 3].tolist() if self._to_fixed else None,
         )
-        above = draw_scans([panel], title=title)
+        scan_picture = draw_scans([panel], title=title)
         cards = list(self._cards(points, skeleton)) if is_single else []
-        return stack_pictures([above, draw_people(cards)]) if cards else above
+        return stack_pictures([scan_picture, draw_people(cards)]) if cards else scan_picture
 
     def _cards(self, points: np.ndarray, skeleton: Skeleton) -> Iterator[Panel]:
         """Everybody in a recording of one frame of points (n, 3) m."""
         for person in self._people:
             joints, box, score = person["joints"], person["box"], person["score"]
-            own = points if box is None else points[box.contains(points)]
+            person_points = points if box is None else points[box.contains(points)]
             pose = None
             if joints is not None:
                 pose = Pose(joints=joints, skeleton=skeleton, confidence=person["confidence"] or None)
             label = f"{person['id']}" if score is None else f"{person['id']} · score {score:.2f}"
-            away = np.linalg.norm(np.median(own, 0) - self._to_fixed[0][:3, 3]) if len(own) else np.nan
-            yield Panel(points=own, pose=pose, label=label, box=box, distance=float(away))
+            distance = (
+                np.linalg.norm(np.median(person_points, 0) - self._to_fixed[0][:3, 3]) if len(person_points) else np.nan
+            )
+            yield Panel(points=person_points, pose=pose, label=label, box=box, distance=float(distance))
 
     def _points(self, source: Source) -> np.ndarray:
         """(n, 3) m of frames from the beginning to the end; of one where the sensor stays."""

@@ -55,9 +55,15 @@ class FramePoses:
         people = []
         for person, entry in zip(self.poses, document.pop("people"), strict=True):
             people.append(entry | {"track": person.id if self.is_tracked else None, "filled": False})
-        world = None if self.T_world_sensor is None else self.T_world_sensor.tolist()
-        own = {"schema": SCHEMA, "frame": self.index, "id": self.id, "time": self.time, "T_world_sensor": world}
-        return document | own | {"people": people, "error": self.error}
+        T_world_sensor = None if self.T_world_sensor is None else self.T_world_sensor.tolist()
+        frame_entry = {
+            "schema": SCHEMA,
+            "frame": self.index,
+            "id": self.id,
+            "time": self.time,
+            "T_world_sensor": T_world_sensor,
+        }
+        return document | frame_entry | {"people": people, "error": self.error}
 
 
 class PosingOptions(TypedDict, total=False):
@@ -107,8 +113,8 @@ def predict_recording(
         InputError: options that contradict each other, or a source that cannot be read at all.
     """
     if isinstance(source, str | os.PathLike | Sequence):
-        chosen: dict[str, Any] = {"topic": topic, "meta": meta, "rate": rate, "start": start, "end": end}
-        source = open_source(source, columns=columns, every=every, **chosen)
+        source_options: dict[str, Any] = {"topic": topic, "meta": meta, "rate": rate, "start": start, "end": end}
+        source = open_source(source, columns=columns, every=every, **source_options)
     return FramePredictor(columns=columns, name=source.name, **posing).predict_all(source.frames())
 
 
@@ -140,8 +146,8 @@ class FramePredictor:
         model: "Predictor | str | os.PathLike | Callable[[], Predictor]" = DEFAULT,
         name: str | None = None,
     ):
-        search = (min_score, max_range, max_people, background)
-        is_searched = find or any(option is not None for option in search)
+        search_arguments = (min_score, max_range, max_people, background)
+        is_searched = find or any(option is not None for option in search_arguments)
         check_choice(boxes, crop, is_searched)
         rotation_from_up(up)
         self.up, self.name, self.skeleton = up_text(up), name, skeleton
@@ -151,14 +157,14 @@ class FramePredictor:
         self._is_crop = True if crop else False if is_searched or boxes is not None else None
         # whether any frame was searched
         self._was_searched = False
-        self._search = search_options(*search, columns)
+        self._search = search_options(*search_arguments, columns)
         self._model = model
         self._loaded: Predictor | None = None
         self.live, self.people = live, None
         if track or live:
             # boxes that are given are all people
-            least = 0.0 if boxes is not None else least_score(self._search)
-            self.people = KnownPeople(up=self.up, least_score=least, live=live)
+            threshold = 0.0 if boxes is not None else least_score(self._search)
+            self.people = KnownPeople(up=self.up, least_score=threshold, live=live)
 
     @property
     def is_tracked(self) -> bool:
@@ -188,10 +194,10 @@ class FramePredictor:
             return None if frame is None else (frame, self._prepared(frame))
 
         with ThreadPoolExecutor(1) as pool:
-            pending = pool.submit(prepare)
-            while (ready := pending.result()) is not None:
-                pending = pool.submit(prepare)
-                yield self._predicted(*ready)
+            future = pool.submit(prepare)
+            while (prepared_frame := future.result()) is not None:
+                future = pool.submit(prepare)
+                yield self._predicted(*prepared_frame)
 
     def predict(self, frame: Frame | DamagedFrame) -> FramePoses:
         """The people of the next frame."""
@@ -207,33 +213,33 @@ class FramePredictor:
         except InputError as error:
             return error
 
-    def _predicted(self, frame: Frame | DamagedFrame, prepared: Scan | Places | InputError) -> FramePoses:
-        nobody = Poses(people=(), skeleton=self.wanted, model=self.predictor.model, source=self.name)
-        of_frame = partial(FramePoses, index=frame.index, id=frame.id, time=frame.time, is_tracked=self.is_tracked)
+    def _predicted(self, frame: Frame | DamagedFrame, prepared_scan: Scan | Places | InputError) -> FramePoses:
+        no_poses = Poses(people=(), skeleton=self.wanted, model=self.predictor.model, source=self.name)
+        frame_poses = partial(FramePoses, index=frame.index, id=frame.id, time=frame.time, is_tracked=self.is_tracked)
         if isinstance(frame, DamagedFrame):
-            return of_frame(poses=nobody, error=frame.error)
-        of_frame.keywords["T_world_sensor"] = frame.T_world_sensor
-        people, known = self.people, None
+            return frame_poses(poses=no_poses, error=frame.error)
+        frame_poses.keywords["T_world_sensor"] = frame.T_world_sensor
+        people, known_places = self.people, None
         T_fixed_sensor = np.eye(4) if people is None else people.fixed.from_sensor(frame.T_world_sensor)
         time = frame.index / DEFAULT_RATE if frame.time is None else frame.time
         try:
-            if isinstance(prepared, InputError):
-                raise prepared
-            search = self._search if isinstance(prepared, Places) else None
+            if isinstance(prepared_scan, InputError):
+                raise prepared_scan
+            search = self._search if isinstance(prepared_scan, Places) else None
             if people is not None and search is not None:
-                known = people.expected(time, T_fixed_sensor)
+                known_places = people.expected(time, T_fixed_sensor)
             scan, poses = predict_scan(
-                prepared, lambda: self.predictor, search=search, known=known, skeleton=self.skeleton
+                prepared_scan, lambda: self.predictor, search=search, known=known_places, skeleton=self.skeleton
             )
         except InputError as error:
-            return of_frame(poses=nobody, error=str(error))
-        if isinstance(prepared, Places) and not self._was_searched:
+            return frame_poses(poses=no_poses, error=str(error))
+        if isinstance(prepared_scan, Places) and not self._was_searched:
             self._was_searched = True
-            if not len(poses) and (hint := other_up_axis(prepared, self._search)):
+            if not len(poses) and (hint := other_up_axis(prepared_scan, self._search)):
                 poses = replace(poses, warnings=(*poses.warnings, hint))
         if people is not None:
             poses = people.update(time, scan, poses, T_fixed_sensor)
-        return of_frame(poses=replace(poses, source=self.name))
+        return frame_poses(poses=replace(poses, source=self.name))
 
     def _scan(self, frame: Frame) -> Scan:
         points, notes = only_returns(frame.points)
@@ -254,8 +260,8 @@ class FramePredictor:
         """What the frames so far said, as JSON holds it."""
         people = None if self.people is None else self.people.state()
         boxes_used = self.boxes is not None and self.boxes.was_used
-        searched = {"is_crop": self._is_crop, "was_searched": self._was_searched}
-        return searched | {"boxes_used": boxes_used, "people": people}
+        search_state = {"is_crop": self._is_crop, "was_searched": self._was_searched}
+        return search_state | {"boxes_used": boxes_used, "people": people}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Goes on where the predictor whose `state()` this is would."""

@@ -62,19 +62,19 @@ def _tables(lines: Iterable[dict[str, Any]]) -> Iterator[Any]:
     import pandas
 
     remaining = iter(lines)
-    for first in chain(islice(remaining, 1), [None]):
+    for first_line in chain(islice(remaining, 1), [None]):
         # the first table, or an empty one
-        some = [] if first is None else [first, *islice(remaining, _ROWS_OF - 1)]
-        while some or first is None:
-            table = pandas.DataFrame([row for line in some for row in _rows(line)], columns=list(_COLUMNS))
+        chunk = [] if first_line is None else [first_line, *islice(remaining, _ROWS_OF - 1)]
+        while chunk or first_line is None:
+            table = pandas.DataFrame([row for line in chunk for row in _rows(line)], columns=list(_COLUMNS))
             table["id"] = table["id"].map(lambda id: None if id is None else str(id)).astype("string")
             for name in ("frame_id", "joint"):
                 table[name] = table[name].astype("string")
             types = {"frame": "int64", "person": "int64", "track": "Int64", "filled": "bool", "in_range": "boolean"}
-            others = set(_COLUMNS) - set(types) - {"id", "frame_id", "joint"}
-            yield table.astype(types | dict.fromkeys(others, "float64"))
-            some = list(islice(remaining, _ROWS_OF))
-            if not some:
+            float_columns = set(_COLUMNS) - set(types) - {"id", "frame_id", "joint"}
+            yield table.astype(types | dict.fromkeys(float_columns, "float64"))
+            chunk = list(islice(remaining, _ROWS_OF))
+            if not chunk:
                 return
 
 
@@ -83,9 +83,9 @@ def _rows(line: dict[str, Any]) -> Iterator[tuple]:
     for number, person in enumerate(line["people"]):
         if person["joints"] is None:
             continue
-        of_person = (number, person["id"], person["track"], person["filled"])
-        known = [person[name] or [None] * len(joints) for name in ("confidence", "spread", "visible")]
-        once = (person["person"], person["second_person"], person["score"])
+        person_cells = (number, person["id"], person["track"], person["filled"])
+        joint_values = [person[name] or [None] * len(joints) for name in ("confidence", "spread", "visible")]
+        person_values = (person["person"], person["second_person"], person["score"])
         for j, name in enumerate(joints):
-            values = (*(value[j] for value in known), name not in person["out_of_range"], *once)
-            yield line["frame"], line["id"], line["time"], *of_person, name, *person["joints"][j], *values
+            values = (*(value[j] for value in joint_values), name not in person["out_of_range"], *person_values)
+            yield line["frame"], line["id"], line["time"], *person_cells, name, *person["joints"][j], *values

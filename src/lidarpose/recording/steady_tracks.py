@@ -37,19 +37,19 @@ def steadied(lines: Callable[[], Iterator[dict[str, Any]]], up: str, skeleton: S
         for person in line["people"]:
             if person["joints"] is not None:
                 joints = transform_points(to_fixed[-1], np.array(person["joints"]))
-                others: dict[str, Any] = {
+                values: dict[str, Any] = {
                     name: np.array(person[name], np.float32) for name in _SMOOTHED if person[name]
                 }
-                pose = Pose(joints=joints, skeleton=skeleton, **others)
+                pose = Pose(joints=joints, skeleton=skeleton, **values)
                 tracks.setdefault(person["track"], {})[row] = pose
-    steady: list[dict[int, tuple[Pose, bool]]] = [{} for _ in times]
+    steady_poses: list[dict[int, tuple[Pose, bool]]] = [{} for _ in times]
     for id in list(tracks):
         for row, pose, is_filled in _steady(tracks.pop(id), np.array(times)):
             if not is_damaged[row]:
-                steady[row][id] = pose, is_filled
-    for line, people, T_fixed_sensor in zip(lines(), steady, to_fixed, strict=True):
+                steady_poses[row][id] = pose, is_filled
+    for line, people, T_fixed_sensor in zip(lines(), steady_poses, to_fixed, strict=True):
         T_sensor_fixed = np.linalg.inv(T_fixed_sensor)
-        entries = {id: _entry(pose, T_sensor_fixed) | {"filled": filled} for id, (pose, filled) in people.items()}
+        entries = {id: _entry(pose, T_sensor_fixed) | {"filled": is_filled} for id, (pose, is_filled) in people.items()}
         people.clear()
         yield line | {"people": list(_with_steady(line["people"], entries))}
 
@@ -58,8 +58,8 @@ def _steady(poses: dict[int, Pose], times: np.ndarray) -> Iterator[tuple[int, Po
     """The smoothed poses of a track by row, first to last, and whether each was filled in. times: s, of all rows."""
     rows = np.arange(min(poses), max(poses) + 1)
     # time that stands still or jumps back cannot be smoothed over: such frames stay as they are
-    highest = np.maximum.accumulate(np.concatenate([[-np.inf], np.nan_to_num(times[rows], nan=-np.inf)]))[:-1]
-    rows = rows[times[rows] > highest]
+    latest_times = np.maximum.accumulate(np.concatenate([[-np.inf], np.nan_to_num(times[rows], nan=-np.inf)]))[:-1]
+    rows = rows[times[rows] > latest_times]
     skeleton = next(iter(poses.values())).skeleton
     track = smooth(TrackPoses.of_poses(times[rows], [poses.get(row) for row in rows.tolist()], skeleton))
     for i, row in enumerate(rows.tolist()):
@@ -69,10 +69,10 @@ def _steady(poses: dict[int, Pose], times: np.ndarray) -> Iterator[tuple[int, Po
 
 def _entry(pose: Pose, T_sensor_fixed: np.ndarray) -> dict[str, Any]:
     """What a line holds of a smoothed pose."""
-    known = {name: (getattr(pose, name), digits) for name, digits in _SMOOTHED.items()}
+    arrays = {name: (getattr(pose, name), digits) for name, digits in _SMOOTHED.items()}
     values = {
         name: value.astype(np.float32).astype(float).round(digits).tolist()
-        for name, (value, digits) in known.items()
+        for name, (value, digits) in arrays.items()
         if value is not None
     }
     return values | {"joints": moved_points(T_sensor_fixed, pose.joints)}
@@ -83,7 +83,13 @@ def _with_steady(people: list[dict[str, Any]], entries: dict[int, dict[str, Any]
     for person in people:
         yield person | entries.pop(person["track"], {})
     for id, entry in sorted(entries.items()):
-        nobody: dict[str, Any] = {"id": id, "num_points": 0}
-        nobody |= dict.fromkeys(("box", "score", "mounted", "person", "second_person", "joints"))
-        empty: dict[str, list] = {"confidence": [], "spread": [], "visible": [], "out_of_range": [], "warnings": []}
-        yield nobody | empty | {"track": id} | entry
+        person_entry: dict[str, Any] = {"id": id, "num_points": 0}
+        person_entry |= dict.fromkeys(("box", "score", "mounted", "person", "second_person", "joints"))
+        empty_values: dict[str, list] = {
+            "confidence": [],
+            "spread": [],
+            "visible": [],
+            "out_of_range": [],
+            "warnings": [],
+        }
+        yield person_entry | empty_values | {"track": id} | entry

@@ -52,32 +52,32 @@ MOST_FRAMES = _FRAMES[1]
 
 def draw_acquisition(config: SceneConfig, draws: np.ndarray) -> Acquisition:
     """The acquisition that `draws` (ACQUISITION_DRAWS,), uniform in [0, 1), decide on; merged ones have one frame."""
-    merged, accumulated, integration, inverted, sparse, crowded, several, drives, speed, *devices = draws.tolist()
+    merged, accumulated, integration, inverted, sparse, crowded, number, variant, speed, *devices = draws.tolist()
     hard = float(config.hard)
-    names, distance, frames, moving, conditions = config.sensors, None, 1, 0.0, []
+    names, distance, frames, sensor_speed, conditions = config.sensors, None, 1, 0.0, []
     if sparse < config.sparse * hard:
         names, distance = _SPARSE, (config.distance[0], min(config.distance[1], _SPARSE_FAR))
         conditions.append("sparse")
-    drawn = [names[int(device * len(names))] for device in devices]
-    sensors = drawn[:1]
+    candidates = [names[int(device * len(names))] for device in devices]
+    sensors = candidates[:1]
     if merged < config.merged * hard:
-        count = _between(_MERGED, several)
-        sensors = sensors * count if drives < _ONE_MODEL else drawn[:count]
+        count = _between(_MERGED, number)
+        sensors = sensors * count if variant < _ONE_MODEL else candidates[:count]
         distance = _MERGED_AWAY
         conditions.append("merged")
     elif accumulated < config.accumulated * hard:
-        frames, moving = _between(_FRAMES, several), speed * _FASTEST if drives < 0.5 else 0.0
+        frames, sensor_speed = _between(_FRAMES, number), speed * _FASTEST if variant < 0.5 else 0.0
         conditions.append("accumulated")
     elif integration < config.integration * hard and getattr(sensor(sensors[0]), "duration", 0):
-        frames = _INTEGRATED[int(several * len(_INTEGRATED))]
+        frames = _INTEGRATED[int(number * len(_INTEGRATED))]
         conditions += ["integrated"] * (frames > 1)
-    conditions += ["inverted"] * (hangs := inverted < config.inverted * hard)
-    conditions += ["crowded"] * (two := crowded < config.crowded * hard)
+    conditions += ["inverted"] * (is_inverted := inverted < config.inverted * hard)
+    conditions += ["crowded"] * (is_crowded := crowded < config.crowded * hard)
     if not conditions:
         return SINGLE_SCAN
     return Acquisition(
-        sensors=tuple(sensors), frames=frames, speed=moving, inverted=hangs, crowded=two, distance=distance,
-        conditions=tuple(conditions),
+        sensors=tuple(sensors), frames=frames, speed=sensor_speed, inverted=is_inverted, crowded=is_crowded,
+        distance=distance, conditions=tuple(conditions),
     )  # fmt: skip
 
 

@@ -100,10 +100,10 @@ class PoseBank:
             speed, windows = 1.0, self.clips.windows(frames)
         if not len(windows):
             return None
-        cut = self.clips.cut(windows[rng.integers(len(windows))]).resampled(CLIP_HZ / speed)
-        rotations, place = facing_x(cut.rotations[None, :frames], cut.translation[None, :frames])
-        rotations, (place,) = _vary(rotations, rng, place)
-        return rotations[0], place[0]
+        clip = self.clips.cut(windows[rng.integers(len(windows))]).resampled(CLIP_HZ / speed)
+        rotations, translation = facing_x(clip.rotations[None, :frames], clip.translation[None, :frames])
+        rotations, (translation,) = _vary(rotations, rng, translation)
+        return rotations[0], translation[0]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,12 +139,12 @@ class Bodies:
     def between(self, row: int, share: float) -> tuple[np.ndarray, np.ndarray]:
         """Vertices (V, 3) and joints (26, 3) m of a body after a `share` of `FRAME_TIME`, moving evenly; below 0:
         before, above 1: after."""
-        moved = self.moved(row)
+        end_state = self.moved(row)
         if share == 1:
-            return moved
+            return end_state
         vertices, joints = (
-            now + np.float32(share) * (later - now)
-            for now, later in zip((self.vertices[row], self.joints[row]), moved, strict=True)
+            start_array + np.float32(share) * (end_array - start_array)
+            for start_array, end_array in zip((self.vertices[row], self.joints[row]), end_state, strict=True)
         )
         return vertices, joints
 
@@ -175,27 +175,31 @@ def draw_bodies(
     poses, step, kinds = np.stack([prior.rotations, prior.moved], 1), prior.step, np.array(KINDS)[prior.kind]
     places = None
     if bank is not None:
-        picked = rng.integers(len(bank.rotations), size=count)
-        both, (way,) = _vary(np.stack([bank.rotations[picked], bank.moved[picked]], 1), rng, bank.step[picked, None])
-        chosen = rng.random(count) < captured
-        poses = np.where(chosen[:, None, None, None, None], both if moving else both[:, :1], poses)
-        step = np.where(chosen[:, None], way[:, 0] if moving else 0, step)
-        kinds = np.where(chosen, "captured", kinds)
-        places = np.where(chosen[:, None], bank.places[picked], np.nan)
-    rest, worn = rig.draw_people(rng, count), clothing(rng, count, rig) * np.float32(clothes)
-    vertices, joints, low, high = _dressed(rig, rest, worn, poses[:, 0], np.zeros((count, 3), np.float32))
+        bank_rows = rng.integers(len(bank.rotations), size=count)
+        bank_poses, (bank_step,) = _vary(
+            np.stack([bank.rotations[bank_rows], bank.moved[bank_rows]], 1), rng, bank.step[bank_rows, None]
+        )
+        is_captured = rng.random(count) < captured
+        poses = np.where(is_captured[:, None, None, None, None], bank_poses if moving else bank_poses[:, :1], poses)
+        step = np.where(is_captured[:, None], bank_step[:, 0] if moving else 0, step)
+        kinds = np.where(is_captured, "captured", kinds)
+        places = np.where(is_captured[:, None], bank.places[bank_rows], np.nan)
+    rest_bodies, cloth_offsets = rig.draw_people(rng, count), clothing(rng, count, rig) * np.float32(clothes)
+    vertices, joints, low, high = _dressed(
+        rig, rest_bodies, cloth_offsets, poses[:, 0], np.zeros((count, 3), np.float32)
+    )
     lift = low[:, 2].copy()
     for heights in (vertices[..., 2], joints[..., 2]):
         heights -= lift[:, None]
     low[:, 2], high[:, 2] = 0, high[:, 2] - lift
-    step = step * _stride_ratio(rest, kinds)
+    step = step * _stride_ratio(rest_bodies, kinds)
 
     def moved(row: int) -> tuple[np.ndarray, np.ndarray]:
         rows = slice(row, row + 1)
-        person = RestBody(vertices=rest.vertices[rows], joints=rest.joints[rows])
-        vertices, joints, _, _ = _dressed(rig, person, worn[rows], poses[rows, 1], step[rows])
-        down = np.array([0, 0, lift[row]], np.float32)
-        return vertices[0] - down, joints[0] - down
+        person = RestBody(vertices=rest_bodies.vertices[rows], joints=rest_bodies.joints[rows])
+        vertices, joints, _, _ = _dressed(rig, person, cloth_offsets[rows], poses[rows, 1], step[rows])
+        lift_vector = np.array([0, 0, lift[row]], np.float32)
+        return vertices[0] - lift_vector, joints[0] - lift_vector
 
     return Bodies(
         vertices=vertices,
@@ -240,26 +244,32 @@ def draw_moving_bodies(
     ]
     motion: list[tuple[np.ndarray, np.ndarray, str, np.ndarray | None]]
     motion = [(*clip, "captured", None) for clip in clips if clip is not None]
-    if drawn_count := clips.count(None):
-        drawn = sample_clips(rng, drawn_count, frames=frames + 1, hz=CLIP_HZ, mix=mix)
-        flat = drawn.translation * np.array([1, 1, 0], np.float32)
-        motion += zip(drawn.rotations, flat, [KINDS[kind] for kind in drawn.kind], drawn.clearance, strict=True)
+    if prior_count := clips.count(None):
+        prior_clips = sample_clips(rng, prior_count, frames=frames + 1, hz=CLIP_HZ, mix=mix)
+        flat_translation = prior_clips.translation * np.array([1, 1, 0], np.float32)
+        motion += zip(
+            prior_clips.rotations,
+            flat_translation,
+            [KINDS[kind] for kind in prior_clips.kind],
+            prior_clips.clearance,
+            strict=True,
+        )
     people = rig.draw_people(rng, count)
-    worn = clothing(rng, count, rig) * np.float32(clothes)
+    cloth_offsets = clothing(rng, count, rig) * np.float32(clothes)
     return [
         _moving_body(
             rig,
             RestBody(vertices=people.vertices[k : k + 1], joints=people.joints[k : k + 1]),
-            worn[k : k + 1],
-            *moves,
+            cloth_offsets[k : k + 1],
+            *clip_motion,
             to_last=to_last,
         )
-        for k, moves in enumerate(motion)
+        for k, clip_motion in enumerate(motion)
     ]
 
 
 def _moving_body(
-    rig: Rig, person: RestBody, worn: np.ndarray, rotations: np.ndarray, translation: np.ndarray, kind: str,
+    rig: Rig, person: RestBody, cloth_offsets: np.ndarray, rotations: np.ndarray, translation: np.ndarray, kind: str,
     clearance: np.ndarray | None, *, to_last: bool,
 ) -> Bodies:  # fmt: skip
     """One person's F frames, of one more: rotations (F + 1, 24, 3, 3), translation (F + 1, 3) m; clearance (F + 1,) m,
@@ -268,40 +278,42 @@ def _moving_body(
     # where the pelvis's x axis points
     yaw = np.arctan2(rotations[:, 0, 1, 0], rotations[:, 0, 0, 0])
     if to_last:
-        turn = rotation_about("z", -yaw[frames - 1]).astype(np.float32)
-        rotations = np.concatenate([(turn @ rotations[:, 0])[:, None], rotations[:, 1:]], 1)
-        translation = (translation - translation[frames - 1] * [1, 1, 0]) @ turn.T
+        rotation = rotation_about("z", -yaw[frames - 1]).astype(np.float32)
+        rotations = np.concatenate([(rotation @ rotations[:, 0])[:, None], rotations[:, 1:]], 1)
+        translation = (translation - translation[frames - 1] * [1, 1, 0]) @ rotation.T
         yaw = yaw - yaw[frames - 1]
     translation = translation * [*_stride_ratio(person, [kind]).repeat(2), 1]
-    rest = RestBody(vertices=np.repeat(person.vertices, frames + 1, 0), joints=np.repeat(person.joints, frames + 1, 0))
-    worn = np.repeat(worn, frames + 1, 0)
-    vertices, joints, low, _ = _dressed(rig, rest, worn, rotations, translation)
-    lowest = low[:, 2]
+    rest_bodies = RestBody(
+        vertices=np.repeat(person.vertices, frames + 1, 0), joints=np.repeat(person.joints, frames + 1, 0)
+    )
+    cloth_offsets = np.repeat(cloth_offsets, frames + 1, 0)
+    vertices, joints, low, _ = _dressed(rig, rest_bodies, cloth_offsets, rotations, translation)
+    lowest_z = low[:, 2]
     if clearance is None:
         # the body is not as tall as who was captured: what is little above the lowest frame stands on the ground
-        clearance = np.maximum(lowest - lowest.min() - _JUMP, 0)
-    rise = (clearance - lowest)[:, None, None] * np.array([0, 0, 1], np.float32)
+        clearance = np.maximum(lowest_z - lowest_z.min() - _JUMP, 0)
+    rise = (clearance - lowest_z)[:, None, None] * np.array([0, 0, 1], np.float32)
     vertices, joints = vertices + rise, joints + rise
-    turned = vertices[:frames] @ rotation_about("z", yaw[:frames]).astype(np.float32)
+    aligned_vertices = vertices[:frames] @ rotation_about("z", yaw[:frames]).astype(np.float32)
     return Bodies(
         vertices=vertices[:frames],
         joints=joints[:frames],
         rotations=rotations[:frames],
         kinds=(kind,) * frames,
         heading=tuple(yaw[:frames].tolist()),
-        extent=_extents(turned.min(1), turned.max(1)),
+        extent=_extents(aligned_vertices.min(1), aligned_vertices.max(1)),
         faces=rig.faces,
         face_part=rig.face_part,
         moved=lambda frame: (vertices[frame + 1], joints[frame + 1]),
     )
 
 
-def _stride_ratio(rest: RestBody, kinds: Sequence[str]) -> np.ndarray:
+def _stride_ratio(rest_bodies: RestBody, kinds: Sequence[str]) -> np.ndarray:
     """(n, 1) float32: length of people's steps relative to the mean adult's, whose way all motion has: as their
     legs, or feet would slide. Cyclists' are as long."""
-    mean = _leg_length(mean_adult_joints()[None])
-    rolls = np.array([kind == "cycle" for kind in kinds])
-    return np.where(rolls, 1.0, _leg_length(rest.joints) / mean)[:, None].astype(np.float32)
+    mean_length = _leg_length(mean_adult_joints()[None])
+    is_cycling = np.array([kind == "cycle" for kind in kinds])
+    return np.where(is_cycling, 1.0, _leg_length(rest_bodies.joints) / mean_length)[:, None].astype(np.float32)
 
 
 def _leg_length(joints: np.ndarray) -> np.ndarray:
@@ -311,11 +323,11 @@ def _leg_length(joints: np.ndarray) -> np.ndarray:
 
 
 def _dressed(
-    rig: Rig, rest: RestBody, clothes: np.ndarray, rotations: np.ndarray, translation: np.ndarray
+    rig: Rig, rest_bodies: RestBody, clothes: np.ndarray, rotations: np.ndarray, translation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Vertices (n, V, 3) and joints (n, 26, 3) m of posed bodies whose clothes stand off (n, V) m; the vertices' least
     and greatest x, y, z (n, 3)."""
-    vertices, joints = pose_bodies(rig, rest, rotations, translation)
+    vertices, joints = pose_bodies(rig, rest_bodies, rotations, translation)
     low, high = np.empty((len(vertices), 3), np.float32), np.empty((len(vertices), 3), np.float32)
     dress_people(rig.faces, vertices, clothes, low, high)
     return vertices, joints, low, high
@@ -326,12 +338,19 @@ def _extents(low: np.ndarray, high: np.ndarray) -> tuple[tuple[list[float], list
 
 
 def _vary(
-    rotations: np.ndarray, rng: np.random.Generator, *ways: np.ndarray
+    rotations: np.ndarray, rng: np.random.Generator, *translations: np.ndarray
 ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-    """Captured rotations (n, F, 24, 3, 3) and ways (n, F, 3): each bone of a person turned a little at random, the same
-    in all F frames, and half of the people mirrored."""
-    turned = rotations @ axis_angle_to_matrix(rng.normal(0, _VARIATION, (len(rotations), 1, len(SMPL24), 3)))
-    across = _MIRROR @ turned[:, :, list(SMPL24.flip)] @ _MIRROR
-    flipped = rng.random(len(rotations)) < 0.5
-    varied = np.where(flipped[:, None, None, None, None], across, turned).astype(np.float32)
-    return varied, tuple(np.where(flipped[:, None, None], way @ _MIRROR, way).astype(np.float32) for way in ways)
+    """Captured rotations (n, F, 24, 3, 3) and translations (n, F, 3): each bone of a person turned a little at random,
+    the same in all F frames, and half of the people mirrored."""
+    perturbed_rotations = rotations @ axis_angle_to_matrix(
+        rng.normal(0, _VARIATION, (len(rotations), 1, len(SMPL24), 3))
+    )
+    mirrored_rotations = _MIRROR @ perturbed_rotations[:, :, list(SMPL24.flip)] @ _MIRROR
+    is_mirrored = rng.random(len(rotations)) < 0.5
+    varied_rotations = np.where(is_mirrored[:, None, None, None, None], mirrored_rotations, perturbed_rotations).astype(
+        np.float32
+    )
+    return varied_rotations, tuple(
+        np.where(is_mirrored[:, None, None], translation @ _MIRROR, translation).astype(np.float32)
+        for translation in translations
+    )

@@ -52,25 +52,28 @@ class PlacedPerson:
         if duration:
             vertices, joints = self.bodies.moved(self.row)
             # strides do not go on for longer than the bodies' time: only the way does
-            way = (joints[0] - poses[0][1][0]) * [1, 1, 0] * (duration / FRAME_TIME - 1)
-            poses.append((vertices, joints, way.astype(np.float32)))
+            displacement = (joints[0] - poses[0][1][0]) * [1, 1, 0] * (duration / FRAME_TIME - 1)
+            poses.append((vertices, joints, displacement.astype(np.float32)))
         return poses
 
     def label(self, duration: float) -> tuple[np.ndarray, np.ndarray]:
         """Vertices (k V, 3) m of the body at all times of a frame, and joints (26, 3) m in the middle of it."""
         place, poses = self._lifted(), self._poses(duration)
-        vertices = np.concatenate([place.of_body(vertices + way) for vertices, _, way in poses])
-        return vertices, np.mean([place.of_body(joints + way) for _, joints, way in poses], axis=0)
+        vertices = np.concatenate([place.of_body(vertices + displacement) for vertices, _, displacement in poses])
+        return vertices, np.mean([place.of_body(joints + displacement) for _, joints, displacement in poses], axis=0)
 
     def meshes(self, duration: float) -> list[tuple[str | None, Mesh]]:
         """Kinds, None for the body and clothes, and meshes; with where they are when the frame ends."""
         place, poses = self._lifted(), self._poses(duration)
-        body = [place.of_body(vertices + way) for vertices, _, way in poses]
+        body = [place.of_body(vertices + displacement) for vertices, _, displacement in poses]
         meshes: list[tuple[str | None, Mesh]] = [(None, Mesh(body[0], self.bodies.faces, None, *body[1:]))]
         for prop in self.props:
             name = None if prop.face_part is not None else _PROP_KINDS.get(prop.name, "belongings")
-            moved = [place.of_body((prop.place(joints).vertices + way).astype(np.float32)) for _, joints, way in poses]
-            meshes.append((name, Mesh(moved[0], prop.mesh.faces, None, *moved[1:])))
+            prop_vertices = [
+                place.of_body((prop.place(joints).vertices + displacement).astype(np.float32))
+                for _, joints, displacement in poses
+            ]
+            meshes.append((name, Mesh(prop_vertices[0], prop.mesh.faces, None, *prop_vertices[1:])))
         return meshes
 
 
@@ -89,32 +92,36 @@ def draw_people(site: Site, is_smeared: bool, is_training: bool, rng: np.random.
     for size in sizes:
         distance = 2 + (site.reach - 2) * rng.random() ** 1.7
         if rng.random() < 0.25:
-            middle = site.beside(rng, HALF_WIDTH + 0.4 * rng.random())
+            group_center = site.beside(rng, HALF_WIDTH + 0.4 * rng.random())
         else:
-            middle = site.spot(distance, HALF_WIDTH, rng, seen=rng.random() < 0.85)
+            group_center = site.spot(distance, HALF_WIDTH, rng, seen=rng.random() < 0.85)
         style, course = rng.random(), rng.choice([0.0, pi / 2, pi, -pi / 2]) + rng.normal(0, 0.25)
         members: list[np.ndarray] = []
         for _ in range(size):
             kind = bodies.kinds[row]
-            more = _MORE if kind in ("cycle", "push") else _MORE / 2 if is_training and kind in _LOW else 0.0
+            extra_room = _MORE if kind in ("cycle", "push") else _MORE / 2 if is_training and kind in _LOW else 0.0
             for _attempt in range(8):
-                place = middle
+                position = group_center
                 if members:
-                    angle, far = rng.uniform(-pi, pi), _APART + more + 0.9 * rng.random() ** 1.5
-                    near = members[rng.integers(len(members))]
-                    place = near + far * np.array([np.cos(angle), np.sin(angle)])
-                apart = [np.hypot(*(person.place.feet[:2] - place)) for person in people]
-                room = 0.9 * HALF_WIDTH + 0.5 * more
-                if min(apart, default=9) >= _APART + more and site.is_free(place, room) and np.hypot(*place) > 1.0:
-                    to_middle = float(np.arctan2(*(middle - place)[::-1]))
+                    angle, offset = rng.uniform(-pi, pi), _APART + extra_room + 0.9 * rng.random() ** 1.5
+                    neighbor = members[rng.integers(len(members))]
+                    position = neighbor + offset * np.array([np.cos(angle), np.sin(angle)])
+                distances = [np.hypot(*(person.place.feet[:2] - position)) for person in people]
+                room = 0.9 * HALF_WIDTH + 0.5 * extra_room
+                if (
+                    min(distances, default=9) >= _APART + extra_room
+                    and site.is_free(position, room)
+                    and np.hypot(*position) > 1.0
+                ):
+                    to_middle = float(np.arctan2(*(group_center - position)[::-1]))
                     yaw = course if style < 0.4 else to_middle if style < 0.7 and members else rng.uniform(-pi, pi)
-                    feet = np.array([*place, site.level(place)])
-                    spot = Place(feet=feet, yaw=float(yaw), distance=float(np.hypot(*place)))
+                    feet = np.array([*position, site.level(position)])
+                    place = Place(feet=feet, yaw=float(yaw), distance=float(np.hypot(*position)))
                     props = _draw_belongings(bodies, row, indoors, rng)
                     if is_training and kind == "sit" and rng.random() < _AT_TABLES:
                         props.append(_draw_table(rng))
-                    people.append(PlacedPerson(bodies=bodies, row=row, place=spot, props=props))
-                    members.append(place)
+                    people.append(PlacedPerson(bodies=bodies, row=row, place=place, props=props))
+                    members.append(position)
                     break
             row += 1
     return people
@@ -132,11 +139,11 @@ def _draw_belongings(bodies: Bodies, row: int, indoors: bool, rng: np.random.Gen
 
 def _draw_table(rng: np.random.Generator) -> Prop:
     """Before somebody who sits: it hides the legs or the lap."""
-    deep, far = rng.uniform(0.4, 0.9), rng.uniform(0.25, 0.5)
-    mesh = shape("table", deep, rng.uniform(0.6, 1.8), rng.uniform(0.65, 0.78))
+    depth, distance = rng.uniform(0.4, 0.9), rng.uniform(0.25, 0.5)
+    mesh = shape("table", depth, rng.uniform(0.6, 1.8), rng.uniform(0.65, 0.78))
 
     def frame(points: list) -> tuple[list, list]:
         rows, pelvis = upright(points), points[PELVIS]
-        return rows, [pelvis[axis] + (far + deep / 2) * rows[0][axis] for axis in (0, 1)] + [0.0]
+        return rows, [pelvis[axis] + (distance + depth / 2) * rows[0][axis] for axis in (0, 1)] + [0.0]
 
     return rigid_prop("table", mesh, frame)

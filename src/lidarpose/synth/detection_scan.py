@@ -66,46 +66,48 @@ def draw_sensor(indoors: bool, is_training: bool, rng: np.random.Generator) -> S
 @cache
 def _integrated(name: str, frames: int) -> RayPattern:
     """A rosette that collects `frames` of its frames into one."""
-    single = named_sensor(name)
-    assert isinstance(single, RayPattern)
+    base_pattern = named_sensor(name)
+    assert isinstance(base_pattern, RayPattern)
 
     def rays(number: int) -> tuple[np.ndarray, ...]:
-        parts = [single.rays(number * frames + k) for k in range(frames)]
+        parts = [base_pattern.rays(number * frames + k) for k in range(frames)]
         azimuth, elevation, time, line = (np.concatenate(values) for values in zip(*parts, strict=True))
-        late = np.repeat(np.arange(frames), [len(part[0]) for part in parts])
-        return azimuth, elevation, (time + late) / frames, line
+        frame_number = np.repeat(np.arange(frames), [len(part[0]) for part in parts])
+        return azimuth, elevation, (time + frame_number) / frames, line
 
-    return replace(single, rays=rays, frames=4, duration=single.duration * frames)  # type: ignore[arg-type]
+    return replace(base_pattern, rays=rays, frames=4, duration=base_pattern.duration * frames)  # type: ignore[arg-type]
 
 
 def draw_mount(device: Sensor | RayPattern, layout: Layout, rng: np.random.Generator) -> Mount:
     """On a robot, a tripod, a car, a mast or under a ceiling; what is high looks down."""
-    where, up, turn = rng.random(3)
+    mount_draw, height_draw, direction_draw = rng.random(3)
     if layout.indoors:
-        height = 0.3 + 1.5 * up if where < 0.7 else layout.ceiling - 0.15 - 0.8 * up
+        height = 0.3 + 1.5 * height_draw if mount_draw < 0.7 else layout.ceiling - 0.15 - 0.8 * height_draw
         height = min(height, layout.ceiling - 0.15, 5.0)
-    elif layout.by_car and where < 0.7:
-        height = 1.5 + 0.9 * up
+    elif layout.by_car and mount_draw < 0.7:
+        height = 1.5 + 0.9 * height_draw
     else:
-        height = 0.3 + 1.9 * up if where < 0.85 else 2.2 + 3.8 * up
+        height = 0.3 + 1.9 * height_draw if mount_draw < 0.85 else 2.2 + 3.8 * height_draw
     pitch, roll = np.radians(rng.normal(0, 1.2, 2))
-    if height > 2.2 and not (layout.by_car and where < 0.7):
+    if height > 2.2 and not (layout.by_car and mount_draw < 0.7):
         pitch += np.radians(rng.uniform(2, 30))
     elif rng.random() < 0.15:
-        pitch, roll = np.radians(rng.uniform(4, 30)) * np.array([np.cos(2 * pi * turn), np.sin(2 * pi * turn)])
+        pitch, roll = np.radians(rng.uniform(4, 30)) * np.array(
+            [np.cos(2 * pi * direction_draw), np.sin(2 * pi * direction_draw)]
+        )
     if device.name == "livox-mid360" and (height > 2.0 or rng.random() < 0.2):
         # it sees little below itself: hung upside down
         roll += pi
-    narrow = isinstance(device, RayPattern) and device.azimuths[1] - device.azimuths[0] < 2 * pi - 1e-3
-    half = (device.azimuths[1] - device.azimuths[0]) / 2 if isinstance(device, RayPattern) else pi
+    is_narrow = isinstance(device, RayPattern) and device.azimuths[1] - device.azimuths[0] < 2 * pi - 1e-3
+    half_width = (device.azimuths[1] - device.azimuths[0]) / 2 if isinstance(device, RayPattern) else pi
     yaw = rng.uniform(-pi, pi)
-    if narrow:
+    if is_narrow:
         yaw = -float(rng.choice(layout.ahead)) + rng.uniform(-0.5, 0.5)
     return Mount(
         height=float(height),
         R_sensor_level=rotation_about("x", roll) @ rotation_about("y", -pitch),
         turn=yaw,
-        view=(-yaw, half if narrow or pitch < np.radians(12) else 1.2),
+        view=(-yaw, half_width if is_narrow or pitch < np.radians(12) else 1.2),
     )
 
 
@@ -117,8 +119,8 @@ def scan_scene(
     vertices = mesh.vertices @ R.T
     hits: Hits
     if isinstance(device, RayPattern):
-        moved = None if mesh.later is None else mesh.later @ R.T
-        hits = scan_pattern(vertices, mesh.faces, device, int(rng.integers(device.frames)), moved=moved)
+        later_vertices = None if mesh.later is None else mesh.later @ R.T
+        hits = scan_pattern(vertices, mesh.faces, device, int(rng.integers(device.frames)), moved=later_vertices)
     else:
         hits = scan(vertices, mesh.faces, device)
     conditions = ScanConditions(
@@ -130,44 +132,46 @@ def scan_scene(
     face = hits.face[returned]
     if isinstance(device, Sensor) and rng.random() < 0.15:
         # the lowest rings are missing
-        left = hits.ring[returned] >= rng.uniform(0.05, 0.5) * device.rows
-        points, face = points[left], face[left]
+        ring_mask = hits.ring[returned] >= rng.uniform(0.05, 0.5) * device.rows
+        points, face = points[ring_mask], face[ring_mask]
     return points @ R, face
 
 
 def scatter_leaves(points: np.ndarray, leaves: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Points (n, 3) m, those on leaves (n,) a little behind the few large ones of a mesh."""
     rows = np.flatnonzero(leaves)
-    deep = rng.uniform(0.02, 0.2) * rng.standard_exponential(len(rows))
-    moved = points.copy()
-    moved[rows] *= (1 + deep / np.maximum(np.linalg.norm(points[rows], axis=1), 0.3))[:, None].astype(np.float32)
-    return moved
+    depth = rng.uniform(0.02, 0.2) * rng.standard_exponential(len(rows))
+    moved_points = points.copy()
+    moved_points[rows] *= (1 + depth / np.maximum(np.linalg.norm(points[rows], axis=1), 0.3))[:, None].astype(
+        np.float32
+    )
+    return moved_points
 
 
 def add_strays(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Some returns come from between: mixed pixels, dust, rain. Points and the indices (k,) of strays."""
     share = rng.choice([0.0, 0.0005, 0.004], p=[0.4, 0.4, 0.2])
-    stray = np.flatnonzero(rng.random(len(points)) < share)
-    moved = points.copy()
-    moved[stray] *= rng.uniform(0.1, 1.0, (len(stray), 1)).astype(np.float32)
-    return moved, stray
+    stray_rows = np.flatnonzero(rng.random(len(points)) < share)
+    moved_points = points.copy()
+    moved_points[stray_rows] *= rng.uniform(0.1, 1.0, (len(stray_rows), 1)).astype(np.float32)
+    return moved_points, stray_rows
 
 
 def cut_scan(points: np.ndarray, thing: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, bool]:
     """(n,) bool: points that a user's file holds: all, without what is near the sensor, without the ground, or a piece
     of the place; and whether it is a piece."""
-    kept, draw = np.ones(len(points), bool), rng.random(3)
-    if draw[0] < 0.1:
-        kept &= np.hypot(points[:, 0], points[:, 1]) > rng.uniform(1, 3)
-    if draw[1] < 0.03:
-        kept &= (thing != KINDS.index("ground")) | (rng.random(len(points)) < 0.02)
-    if draw[2] < 0.1:
-        size, turn = rng.uniform(6, 20, 2), rng.uniform(-pi, pi)
-        middle = rng.uniform(3, 14) * np.array([np.cos(turn), np.sin(turn)])
-        inside = (np.abs(points[:, :2] - middle) < size / 2).all(1)
-        if inside.sum() > _LEAST_PIECE:
-            return kept & inside, True
-    return kept, False
+    keep_mask, draws = np.ones(len(points), bool), rng.random(3)
+    if draws[0] < 0.1:
+        keep_mask &= np.hypot(points[:, 0], points[:, 1]) > rng.uniform(1, 3)
+    if draws[1] < 0.03:
+        keep_mask &= (thing != KINDS.index("ground")) | (rng.random(len(points)) < 0.02)
+    if draws[2] < 0.1:
+        size, angle = rng.uniform(6, 20, 2), rng.uniform(-pi, pi)
+        center = rng.uniform(3, 14) * np.array([np.cos(angle), np.sin(angle)])
+        is_inside = (np.abs(points[:, :2] - center) < size / 2).all(1)
+        if is_inside.sum() > _LEAST_PIECE:
+            return keep_mask & is_inside, True
+    return keep_mask, False
 
 
 @dataclass(frozen=True)

@@ -133,25 +133,25 @@ def detection_scene(seed: int, index: int, *, family: str = "train") -> Detectio
     person_of, thing_of = (np.repeat(np.array(values, np.int16), counts)[face] for values in (owners, kinds))
     if scene.part is not None:
         points = scatter_leaves(points, scene.part[face] == LEAVES, rng)
-    points, stray = add_strays(points, rng)
-    person_of[stray], thing_of[stray] = -1, -1
-    kept, is_piece = cut_scan(points, thing_of, rng)
+    points, stray_rows = add_strays(points, rng)
+    person_of[stray_rows], thing_of[stray_rows] = -1, -1
+    keep_mask, is_piece = cut_scan(points, thing_of, rng)
     frame = SceneFrame.draw(mount, rng, most=30.0 if is_training else 15.0)
-    labels = [[frame.of(places @ turn) for places in person.label(duration)] for person in people]
+    labels = [[frame.of(level_points @ turn) for level_points in person.label(duration)] for person in people]
     return DetectionScene(
-        points=frame.of(points[kept]).astype(np.float32),
+        points=frame.of(points[keep_mask]).astype(np.float32),
         origin=frame.origin,
         boxes=tuple(
             label_box(vertices, frame.yaw(person.place.yaw + mount.turn), number)
             for number, (person, (vertices, _)) in enumerate(zip(people, labels, strict=True))
         ),
-        person=person_of[kept],
+        person=person_of[keep_mask],
         joints=np.array([joints for _, joints in labels], np.float32).reshape(-1, len(BODY26), 3),
         mounted=np.array([person.mounted for person in people], bool),
         sensor=device.name,
         kind="fragment" if is_piece else place,
         negatives=sorted({KINDS[kind] for kind in kinds if kind >= 0}),
-        thing=thing_of[kept],
+        thing=thing_of[keep_mask],
         up=frame.R[:, 2].copy(),
         height=mount.height,
         activities=tuple(person.bodies.kinds[person.row] for person in people),
@@ -160,13 +160,13 @@ def detection_scene(seed: int, index: int, *, family: str = "train") -> Detectio
 
 def _lift(site: Site, people: list[PlacedPerson], relief: Relief, height: float) -> None:
     """Sets all on the ground's slope and waves, the sensor to z = 0, so high above its flat ground."""
-    down = np.array([0, 0, -height])
+    offset = np.array([0, 0, -height])
     for person in people:
-        person.place = replace(person.place, feet=person.place.feet + [0, 0, relief.at(person.place.feet)] + down)
+        person.place = replace(person.place, feet=person.place.feet + [0, 0, relief.at(person.place.feet)] + offset)
     for row, (name, mesh) in enumerate(site.items):
         vertices = mesh.vertices.copy()
         vertices[:, 2] += relief.at(vertices.T)
-        site.items[row] = name, Mesh((vertices + down).astype(np.float32), mesh.faces, mesh.part)
+        site.items[row] = name, Mesh((vertices + offset).astype(np.float32), mesh.faces, mesh.part)
 
 
 def _turned(mesh: Mesh, turn: np.ndarray) -> Mesh:

@@ -85,10 +85,12 @@ class Generator:
             raise InputError(f"Generator.captured must be a share in [0, 1], got {self.captured}")
         if self.config.recorded and not self.captured:
             raise InputError("recorded=1 keeps the places of captured motion: name its file by --motion")
-        several = [name for name in ("accumulated", "integration") if getattr(self.config, name)]
-        if self.config.recorded and several:
-            wanted = " and ".join(f"{name}=0" for name in several)
-            raise InputError(f"recorded=1 keeps the places of single frames, several together have none: set {wanted}")
+        multi_frame_fields = [name for name in ("accumulated", "integration") if getattr(self.config, name)]
+        if self.config.recorded and multi_frame_fields:
+            settings = " and ".join(f"{name}=0" for name in multi_frame_fields)
+            raise InputError(
+                f"recorded=1 keeps the places of single frames, several together have none: set {settings}"
+            )
         # at once: an unknown sensor is an error here
         self._bodies  # noqa: B018
 
@@ -125,8 +127,8 @@ class Generator:
         def draw(seed: int, block: int) -> tuple[np.ndarray, dict[int, Bodies]]:
             draws = np.random.default_rng([seed, RandomStream.ACQUISITION, block]).random((BLOCK, ACQUISITION_DRAWS))
             # whoever has several frames at some difficulty has them here
-            full = replace(self.config, hard=1.0, merged=0.0, sparse=0.0)
-            rows = [row for row in range(BLOCK) if draw_acquisition(full, draws[row]).frames > 1]
+            hard_config = replace(self.config, hard=1.0, merged=0.0, sparse=0.0)
+            rows = [row for row in range(BLOCK) if draw_acquisition(hard_config, draws[row]).frames > 1]
             rng = np.random.default_rng([seed, RandomStream.MOTION, block])
             moving = draw_moving_bodies(
                 self.bank, self.captured, len(rows), MOST_FRAMES, rng, clothes=self.config.clothes,
@@ -141,13 +143,13 @@ class Generator:
         seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
         rng = np.random.default_rng([seed, RandomStream.PERSON, index])
         block, row = self._bodies(seed, index // BLOCK), index % BLOCK
-        bodies, shown, acquisition = block, row, SINGLE_SCAN
+        bodies, body_row, acquisition = block, row, SINGLE_SCAN
         if self.config.varied:
             draws, moving = self._acquisitions(seed, index // BLOCK)
             acquisition = draw_acquisition(self.config if hard is None else self.config.eased(hard), draws[row])
             if acquisition.frames > 1:
-                bodies, shown = moving[row], MOST_FRAMES - 1
-        return self._observe(bodies, [shown], block, row, rng, hard, acquisition=acquisition)[0]
+                bodies, body_row = moving[row], MOST_FRAMES - 1
+        return self._observe(bodies, [body_row], block, row, rng, hard, acquisition=acquisition)[0]
 
     def clip(
         self, seed: int, index: int, *, frames: int = CLIP_FRAMES, hard: float | None = None
@@ -183,25 +185,25 @@ class Generator:
         easier each time; after the last try the best one counts, if it has any points at all. A second person is
         anybody of `block` but `row`."""
         config = self.config if hard is None else self.config.eased(hard)
-        best, most_points = None, 0.0
+        best_draw, most_points = None, 0.0
         draw = _draw_clip_frame if in_clip else _draw_sample
         for attempt in range(_TRIES if self.redraw else 1):
-            eased = config.eased(config.hard * (1 - attempt / (_TRIES - 1))) if attempt else config
-            scene = _draw_scene(eased, bodies, rows[0], block, row, 0.8**attempt, rng, acquisition)
+            eased_config = config.eased(config.hard * (1 - attempt / (_TRIES - 1))) if attempt else config
+            scene = _draw_scene(eased_config, bodies, rows[0], block, row, 0.8**attempt, rng, acquisition)
             samples = [draw(scene, bodies, k, frame, rng) for frame, k in enumerate(rows)]
             # of the middle frame: half of a clip's frames have more
             points = float(np.median([np.count_nonzero(_truth(sample)[0]) for sample in samples]))
             if points > most_points or not self.redraw:
-                best, most_points = (scene, samples), points
+                best_draw, most_points = (scene, samples), points
             if points >= LEAST_POINTS:
                 break
-        if best is None:
+        if best_draw is None:
             raise InputError(
                 f"scene {config.name}: no draw of {_TRIES} left a point on a person, with sensors such as "
                 f"{scene.sensor.name}: does its range hold people at {config.distance[0]:g} to "
                 f"{config.distance[1]:g} m?"
             )
-        scene, samples = best
+        scene, samples = best_draw
         return [
             SyntheticPerson(sample=sample, facts=_measure(sample, scene, bodies, k, frame) if self.measure else None)
             for frame, (k, sample) in enumerate(zip(rows, samples, strict=True))
@@ -209,27 +211,27 @@ class Generator:
 
 
 def _draw_scene(
-    config: SceneConfig, bodies: Bodies, first: int, block: Bodies, row: int, nearer: float, rng: np.random.Generator,
-    acquisition: Acquisition = SINGLE_SCAN,
+    config: SceneConfig, bodies: Bodies, first_row: int, block: Bodies, row: int, nearer: float,
+    rng: np.random.Generator, acquisition: Acquisition = SINGLE_SCAN,
 ) -> Scene:  # fmt: skip
     """Paper: section "Scene sampling". A person too far to be seen comes nearer with every attempt."""
     sensors = acquisition.sensors[:1] or (config.sensors[rng.integers(len(config.sensors))],)
     device = sensor(sensors[0])
-    low, high = bodies.extent[first]
+    low, high = bodies.extent[first_row]
     height, reach = high[2], max(-low[0], -low[1], high[0], high[1])
-    placing = acquisition.placing(config)
-    place = draw_place(placing, device, height, reach, nearer, rng, acquisition.inverted)
-    if config.recorded and bodies.places is not None and np.isfinite(bodies.places[first]).all():
-        place = recorded_place(place, bodies.places[first])
+    place_config = acquisition.placing(config)
+    place = draw_place(place_config, device, height, reach, nearer, rng, acquisition.inverted)
+    if config.recorded and bodies.places is not None and np.isfinite(bodies.places[first_row]).all():
+        place = recorded_place(place, bodies.places[first_row])
     background = [ground(config, place.feet, rng), *surroundings(config, place.feet, reach, rng)]
-    if (front := occluder(config, place.feet, height, rng)) is not None:
-        background.append(front)
-    still = len(background)
+    if (occluder_mesh := occluder(config, place.feet, height, rng)) is not None:
+        background.append(occluder_mesh)
+    still_count = len(background)
     if (rng.random() < config.company * config.hard) or acquisition.crowded:
         background.append(_second_person(block, row, place, rng, close=acquisition.crowded))
     props = []
     if rng.random() < config.carry * config.hard:
-        props = draw_props(rng, kind=bodies.kinds[first], joints=bodies.joints[first])
+        props = draw_props(rng, kind=bodies.kinds[first_row], joints=bodies.joints[first_row])
     conditions = draw_conditions(config, device, rng)
     scene = Scene(
         config=config,
@@ -238,10 +240,10 @@ def _draw_scene(
         conditions=conditions,
         background=background,
         props=props,
-        still=still,
+        still=still_count,
         acquisition=acquisition,
     )
-    return with_views(scene, placing, height, reach, nearer, rng)
+    return with_views(scene, place_config, height, reach, nearer, rng)
 
 
 # part of a second person's points until they are counted
@@ -255,19 +257,21 @@ _CLOSE = (0.35, 0.8)
 
 def _second_person(block: Bodies, row: int, place: Place, rng: np.random.Generator, *, close: bool) -> Mesh:
     """Another body of the block, an arm's length away or between the sensor and the person; `close`: always beside."""
-    other = (row + rng.integers(1, len(block.vertices))) % len(block.vertices)
-    before, gap, angle, aside, yaw = rng.random(5)
-    ahead = place.feet[:2] / max(np.hypot(*place.feet[:2]), 1e-6)
-    if before < _BEFORE and not close:
+    other_row = (row + rng.integers(1, len(block.vertices))) % len(block.vertices)
+    before_draw, gap, angle, lateral_share, yaw = rng.random(5)
+    direction = place.feet[:2] / max(np.hypot(*place.feet[:2]), 1e-6)
+    if before_draw < _BEFORE and not close:
         # not nearer to the sensor than a third of the way
-        near = min(_NEARER[0] + gap * (_NEARER[1] - _NEARER[0]), 0.67 * place.distance)
-        shift = -near * ahead + (aside - 0.5) * np.array([-ahead[1], ahead[0]])
+        distance = min(_NEARER[0] + gap * (_NEARER[1] - _NEARER[0]), 0.67 * place.distance)
+        shift = -distance * direction + (lateral_share - 0.5) * np.array([-direction[1], direction[0]])
     else:
-        least, most = _CLOSE if close else _BESIDE
-        reach = least + gap * (most - least)
-        shift = reach * np.array([np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)])
-    there = Place(feet=place.feet + [*shift, 0], yaw=2 * np.pi * yaw, distance=place.distance)
-    return Mesh(there.of_body(block.vertices[other]), block.faces, np.full(len(block.faces), _OTHER, np.uint8))
+        least_distance, most_distance = _CLOSE if close else _BESIDE
+        distance = least_distance + gap * (most_distance - least_distance)
+        shift = distance * np.array([np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)])
+    other_place = Place(feet=place.feet + [*shift, 0], yaw=2 * np.pi * yaw, distance=place.distance)
+    return Mesh(
+        other_place.of_body(block.vertices[other_row]), block.faces, np.full(len(block.faces), _OTHER, np.uint8)
+    )
 
 
 def _draw_sample(scene: Scene, bodies: Bodies, row: int, frame: int, rng: np.random.Generator) -> Sample:
@@ -279,20 +283,20 @@ def _draw_clip_frame(scene: Scene, bodies: Bodies, row: int, frame: int, rng: np
     meshes = scene.meshes(bodies, row)
     scan = simulate_scan(scene, meshes, rng, frame=frame)
     sample = _crop(scene, bodies, row, scan, rng)
-    others = scan.points[~cast("Box", sample.box).contains(scan.points)]
+    other_points = scan.points[~cast("Box", sample.box).contains(scan.points)]
     return replace(
         sample,
         rotations=_smpl_pose(scene.body_place, bodies, row),
         translation=cast("Pose", sample.pose).joints[0],
         background=window_points(scan_background(scene, meshes[0], frame), sample.points),
-        neighbors=window_points(others, sample.points),
+        neighbors=window_points(other_points, sample.points),
     )
 
 
 def _smpl_pose(place: Place, bodies: Bodies, row: int) -> np.ndarray:
     """(24, 3) float32 rad, as in `Sample`."""
-    turned = smpl_axis_angles(bodies.rotations[row, None], rotation_about("z", place.yaw))
-    return turned[0].astype(np.float32)
+    axis_angles = smpl_axis_angles(bodies.rotations[row, None], rotation_about("z", place.yaw))
+    return axis_angles[0].astype(np.float32)
 
 
 def _crop(scene: Scene, bodies: Bodies, row: int, scan: Scan, rng: np.random.Generator) -> Sample:
@@ -300,26 +304,26 @@ def _crop(scene: Scene, bodies: Bodies, row: int, scan: Scan, rng: np.random.Gen
     config, place, acquisition = scene.config, scene.body_place, scene.acquisition
     box = noise.draw_box(config.crop, config.hard, _extent(scene, bodies, row, rng), place, rng, bodies.heading[row])
     if acquisition.crowded:
-        body = place.of_body(bodies.vertices[row])
-        box = noise.box_of_two(box, body, scene.background[-1].vertices, rng)
+        body_vertices = place.of_body(bodies.vertices[row])
+        box = noise.box_of_two(box, body_vertices, scene.background[-1].vertices, rng)
     points, ring, part = scan.points, scan.ring, scan.part
-    clutter, missing_part = rng.random(2)
-    if clutter < config.noise.clutter * config.hard:
+    clutter_draw, part_draw = rng.random(2)
+    if clutter_draw < config.noise.clutter * config.hard:
         if config.noise.dapt_compat:
             clusters = noise.dapt_clusters(box.center, rng=rng)
         else:
-            most = min(config.noise.most_clutter, 20 + len(points) // 2)
-            clusters = noise.noise_clusters(box.center, most=most, rng=rng)
+            most_points = min(config.noise.most_clutter, 20 + len(points) // 2)
+            clusters = noise.noise_clusters(box.center, most=most_points, rng=rng)
         points = np.concatenate([points, clusters.astype(np.float32)])
         ring = np.concatenate([ring, np.zeros(len(clusters), ring.dtype)])
         part = np.concatenate([part, np.zeros(len(clusters), np.uint8)])
-    inside = box.contains(points)
-    points, ring, part = points[inside], ring[inside], part[inside]
-    others = int(np.count_nonzero(part == _OTHER))
+    is_inside = box.contains(points)
+    points, ring, part = points[is_inside], ring[is_inside], part[is_inside]
+    other_count = int(np.count_nonzero(part == _OTHER))
     part = np.where(part == _OTHER, np.uint8(0), part)
-    if missing_part < config.noise.missing_part * config.hard:
-        left = noise.part_removal(part, rng=rng)
-        points, ring, part = points[left], ring[left], part[left]
+    if part_draw < config.noise.missing_part * config.hard:
+        keep_mask = noise.part_removal(part, rng=rng)
+        points, ring, part = points[keep_mask], ring[keep_mask], part[keep_mask]
     return Sample(
         points=points,
         # of two people the box says who is meant
@@ -328,7 +332,7 @@ def _crop(scene: Scene, bodies: Bodies, row: int, scan: Scan, rng: np.random.Gen
         ring=ring,
         pose=Pose(joints=place.of_body(bodies.joints[row]), skeleton=BODY26, frame="sensor"),
         box=box,
-        second_person_points=others,
+        second_person_points=other_count,
         source="/".join(("synth", config.name, scene.sensor.name, *filter(None, ["+".join(acquisition.conditions)]))),
     )
 
@@ -354,17 +358,17 @@ def _truth(sample: Sample) -> tuple[np.ndarray, Pose]:
 def _measure(sample: Sample, scene: Scene, bodies: Bodies, row: int, frame: int) -> PersonInfo:
     """What is known of a sample: see `PersonInfo`."""
     low, high = bodies.extent[row]
-    visible_alone = sum(count_alone(seen, meshes[0], k) for seen, meshes, k, _ in scene.scans(bodies, row, frame))
+    alone_count = sum(count_alone(view, meshes[0], k) for view, meshes, k, _ in scene.scans(bodies, row, frame))
     part, pose = _truth(sample)
-    seen = sample.points[part > 0]
-    clutter = (part == 0) & (sample.points[:, 2] > float(scene.place.feet[2]) + _GROUND)
+    body_points = sample.points[part > 0]
+    is_clutter = (part == 0) & (sample.points[:, 2] > float(scene.place.feet[2]) + _GROUND)
     return PersonInfo(
         sensor=scene.sensor.name,
         kind=bodies.kinds[row],
         distance=float(np.hypot(*pose.joints[0, :2])),
-        visible=min(len(seen) / max(visible_alone, 1), 1.0),
-        height_seen=float(np.ptp(seen[:, 2])) / max(high[2] - low[2], 1e-6) if len(seen) else 0.0,
-        clutter=float(clutter.mean()) if len(clutter) else 0.0,
+        visible=min(len(body_points) / max(alone_count, 1), 1.0),
+        height_seen=float(np.ptp(body_points[:, 2])) / max(high[2] - low[2], 1e-6) if len(body_points) else 0.0,
+        clutter=float(is_clutter.mean()) if len(is_clutter) else 0.0,
         upright=_is_upright(pose.joints),
     )
 

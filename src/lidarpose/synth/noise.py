@@ -29,9 +29,9 @@ def laser_mask(columns: int, rows: int, *, keep: float, rng: np.random.Generator
     a share 1 - keep of all patches is masked.
     """
     patch = max(min(columns, rows) // _PATCHES, 1)
-    across, down = -(-columns // patch), -(-rows // patch)
-    mask = _kept_patches(across * down, keep, rng)
-    return mask.reshape(across, down).repeat(patch, 0).repeat(patch, 1)[:columns, :rows]
+    patches_across, patches_down = -(-columns // patch), -(-rows // patch)
+    mask = _kept_patches(patches_across * patches_down, keep, rng)
+    return mask.reshape(patches_across, patches_down).repeat(patch, 0).repeat(patch, 1)[:columns, :rows]
 
 
 def direction_mask(directions: np.ndarray, *, keep: float, rng: np.random.Generator) -> np.ndarray:
@@ -52,12 +52,12 @@ def direction_mask(directions: np.ndarray, *, keep: float, rng: np.random.Genera
     elevation = np.arctan2(z, np.sqrt(x * x + y * y))
     azimuth -= azimuth.min()
     elevation -= elevation.min()
-    wide, tall = float(azimuth.max()), float(elevation.max())
+    width, height = float(azimuth.max()), float(elevation.max())
     # a window that is a line has no shorter side
-    patch = max(min(wide, tall) / _PATCHES, max(wide, tall) / _LONGEST, 1e-6)
-    across, up = int(wide / patch) + 1, int(tall / patch) + 1
-    cell = (azimuth / np.float32(patch)).astype(np.int32) * up + (elevation / np.float32(patch)).astype(np.int32)
-    return _kept_patches(across * up, keep, rng)[np.minimum(cell, across * up - 1)]
+    patch = max(min(width, height) / _PATCHES, max(width, height) / _LONGEST, 1e-6)
+    columns, rows = int(width / patch) + 1, int(height / patch) + 1
+    cell = (azimuth / np.float32(patch)).astype(np.int32) * rows + (elevation / np.float32(patch)).astype(np.int32)
+    return _kept_patches(columns * rows, keep, rng)[np.minimum(cell, columns * rows - 1)]
 
 
 def _kept_patches(patches: int, keep: float, rng: np.random.Generator) -> np.ndarray:
@@ -86,20 +86,22 @@ def noise_clusters(center: np.ndarray, *, most: int, rng: np.random.Generator) -
 
 def noise_cluster(center: np.ndarray, *, count: int, rng: np.random.Generator) -> np.ndarray:
     """(count, 3) m: points within 0.3 m of a place up to 0.4 m (0.8 m in height) from `center`."""
-    place = center + rng.uniform(-1, 1, 3) * _CLUSTER_REACH
+    cluster_center = center + rng.uniform(-1, 1, 3) * _CLUSTER_REACH
     direction = rng.normal(size=(count, 3))
     direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
-    return place + direction * rng.uniform(0, _CLUSTER_RADIUS, (count, 1))
+    return cluster_center + direction * rng.uniform(0, _CLUSTER_RADIUS, (count, 1))
 
 
 def dapt_clusters(center: np.ndarray, *, rng: np.random.Generator) -> np.ndarray:
     """(k, 3) m: the released code's law. Two areas, each of 0 to 149 points about a place within +-0.4 m (+-0.8 m in
     height) of `center`; spherical coordinates uniform: radius to 0.3 m, polar angle, azimuth (denser at the poles)."""
-    places = center + rng.uniform(-1, 1, (2, 3)) * _CLUSTER_REACH
-    place = np.repeat(places, rng.integers(0, _CLUSTER_POINTS, 2), axis=0)
-    radius, polar, azimuth = rng.random((3, len(place))) * [[_CLUSTER_RADIUS], [np.pi], [2 * np.pi]]
-    flat = radius * np.sin(polar)
-    return place + np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), radius * np.cos(polar)], 1)
+    cluster_centers = center + rng.uniform(-1, 1, (2, 3)) * _CLUSTER_REACH
+    point_centers = np.repeat(cluster_centers, rng.integers(0, _CLUSTER_POINTS, 2), axis=0)
+    radius, polar, azimuth = rng.random((3, len(point_centers))) * [[_CLUSTER_RADIUS], [np.pi], [2 * np.pi]]
+    horizontal_radius = radius * np.sin(polar)
+    return point_centers + np.stack(
+        [horizontal_radius * np.cos(azimuth), horizontal_radius * np.sin(azimuth), radius * np.cos(polar)], 1
+    )
 
 
 # --- loss and jitter of points
@@ -115,8 +117,8 @@ def part_removal(part: np.ndarray, *, rng: np.random.Generator) -> np.ndarray:
 
     Give the parts of the points inside the crop: a part outside cannot go missing.
     """
-    present = np.flatnonzero(np.bincount(part)[1:]) + 1 if len(part) else part
-    return np.ones(len(part), bool) if len(present) == 0 else part != present[rng.integers(len(present))]
+    parts = np.flatnonzero(np.bincount(part)[1:]) + 1 if len(part) else part
+    return np.ones(len(part), bool) if len(parts) == 0 else part != parts[rng.integers(len(parts))]
 
 
 def half_space_keep(points: np.ndarray, *, most: float, rng: np.random.Generator) -> np.ndarray:
@@ -128,9 +130,9 @@ def half_space_keep(points: np.ndarray, *, most: float, rng: np.random.Generator
     if len(points) == 0:
         return np.ones(0, bool)
     normal = rng.normal(size=3) * [1, 1, 0.5]
-    along = points @ (normal / np.linalg.norm(normal))
-    low, high = along.min(), along.max()
-    return along >= low + (high - low) * most * rng.random()
+    projection = points @ (normal / np.linalg.norm(normal))
+    low, high = projection.min(), projection.max()
+    return projection >= low + (high - low) * most * rng.random()
 
 
 def jitter(points: np.ndarray, *, sigma: float, clip: float, rng: np.random.Generator) -> np.ndarray:
@@ -174,27 +176,27 @@ def draw_box(
         place: of the body.
     """
     low, high = np.array(extent)
-    yaw, cut = place.yaw + heading, 1.0
+    yaw, cut_draw = place.yaw + heading, 1.0
     if not errors.jitter:
         low, high = low - _ALL, high + _ALL
     else:
-        *room, loose, how_loose, bottom, deep, cut = rng.random(8).tolist()
-        *shift, turn = (errors.jitter * rng.standard_normal(4)).tolist()
-        more = _LOOSE[0] + how_loose * (_LOOSE[1] - _LOOSE[0]) if loose < errors.loose else 0.0
-        if bottom < _RAISED:
-            low[2] += _RAISED_BY[0] + deep * (_RAISED_BY[1] - _RAISED_BY[0])
-        elif bottom < _RAISED + _SUNK:
-            low[2] -= _SUNK_BY[0] + deep * (_SUNK_BY[1] - _SUNK_BY[0])
-        margin = (_ROOM + _MORE * np.array(room) + more) / 2
+        *room_draws, loose_draw, loose_share, bottom_draw, depth_share, cut_draw = rng.random(8).tolist()
+        *shift, yaw_error = (errors.jitter * rng.standard_normal(4)).tolist()
+        extra_size = _LOOSE[0] + loose_share * (_LOOSE[1] - _LOOSE[0]) if loose_draw < errors.loose else 0.0
+        if bottom_draw < _RAISED:
+            low[2] += _RAISED_BY[0] + depth_share * (_RAISED_BY[1] - _RAISED_BY[0])
+        elif bottom_draw < _RAISED + _SUNK:
+            low[2] -= _SUNK_BY[0] + depth_share * (_SUNK_BY[1] - _SUNK_BY[0])
+        margin = (_ROOM + _MORE * np.array(room_draws) + extra_size) / 2
         # heights are estimated better than places
         shift = np.array(shift) / [1, 1, 2]
-        low, high, yaw = low - margin + shift, high + margin + shift, yaw + turn
+        low, high, yaw = low - margin + shift, high + margin + shift, yaw + yaw_error
     # the extent's middle, along the true heading
     c, s = cos(place.yaw + heading), sin(place.yaw + heading)
     x, y, z = ((low + high) / 2).tolist()
     center = place.feet + np.array([c * x - s * y, s * x + c * y, z])
     box = Box(center=center, size=np.maximum(high - low, _LEAST_SIZE), yaw=yaw)
-    return cut_box(box, rng=rng) if cut < errors.cut * difficulty else box
+    return cut_box(box, rng=rng) if cut_draw < errors.cut * difficulty else box
 
 
 def box_of_two(box: Box, body: np.ndarray, other: np.ndarray, rng: np.random.Generator) -> Box:
@@ -205,33 +207,33 @@ def box_of_two(box: Box, body: np.ndarray, other: np.ndarray, rng: np.random.Gen
         body, other: (V, 3) m, vertices; who is nearer is a matter of the middles of their extents from above.
     """
     middles = [(vertices[:, :2].min(0) + vertices[:, :2].max(0)) / 2 for vertices in (body, other)]
-    way = middles[1] - middles[0]
+    offset = middles[1] - middles[0]
     # the share of the way to the other's middle at which the center lies: the box's own errors, and a shift
-    apart = float(way @ way)
-    own = float((box.center[:2] - middles[0]) @ way) / max(apart, 1e-9)
+    squared_distance = float(offset @ offset)
+    center_share = float((box.center[:2] - middles[0]) @ offset) / max(squared_distance, 1e-9)
     center = box.center.copy()
-    center[:2] += (min(own + _TOWARDS * rng.random(), _TOWARDS) - own) * way
+    center[:2] += (min(center_share + _TOWARDS * rng.random(), _TOWARDS) - center_share) * offset
     R_level_box = rotation_about("z", box.yaw)
     local = np.concatenate([body, other]) @ R_level_box - center @ R_level_box
     low, high = local.min(0), local.max(0)
     # heights are not shared about the middle
-    half = np.maximum(np.maximum(-low, high), box.size / 2)
+    half_size = np.maximum(np.maximum(-low, high), box.size / 2)
     shift = (min(low[2], -box.size[2] / 2) + max(high[2], box.size[2] / 2)) / 2
-    half[2] = max(high[2], box.size[2] / 2) - shift
-    return replace(box, center=center + [0, 0, shift], size=2 * half + _ROOM)
+    half_size[2] = max(high[2], box.size[2] / 2) - shift
+    return replace(box, center=center + [0, 0, shift], size=2 * half_size + _ROOM)
 
 
 def cut_box(box: Box, *, most: float = 0.3, rng: np.random.Generator) -> Box:
     """A box that loses up to a share `most` of its height (the feet twice as often as the head) or of one side, as
     detectors that stop at a bonnet or a table edge do."""
-    end, amount = rng.random(2)
-    lost = most * amount
+    side_draw, amount = rng.random(2)
+    lost_share = most * amount
     # axis and the side of it that goes
-    axis, side = ((2, -1), (2, -1), (2, 1), (1, -1), (1, 1), (0, 1))[int(end * 6)]
+    axis, side = ((2, -1), (2, -1), (2, 1), (1, -1), (1, 1), (0, 1))[int(side_draw * 6)]
     shift = np.zeros(3)
-    shift[axis] = -side * lost * box.size[axis] / 2
+    shift[axis] = -side * lost_share * box.size[axis] / 2
     size = box.size.copy()
-    size[axis] *= 1 - lost
+    size[axis] *= 1 - lost_share
     c, s = np.cos(box.yaw), np.sin(box.yaw)
-    turned = np.array([c * shift[0] - s * shift[1], s * shift[0] + c * shift[1], shift[2]])
-    return replace(box, center=box.center + turned, size=size)
+    level_shift = np.array([c * shift[0] - s * shift[1], s * shift[0] + c * shift[1], shift[2]])
+    return replace(box, center=box.center + level_shift, size=size)

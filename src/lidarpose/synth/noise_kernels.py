@@ -26,15 +26,15 @@ def lose_returns(points, face, vertices, faces, keep, error, chance, dropout, in
     differ in reflectivity, which makes the step soft: 1 / (1 + power^2) is lost, power 1 there. What a face without
     area returns is weak.
     """
-    returned = np.empty(len(points), np.int64)
-    moved = np.empty((len(points), 3), np.float32)
+    return_index = np.empty(len(points), np.int64)
+    moved_points = np.empty((len(points), 3), np.float32)
     n = 0
     for i in range(len(points)):
         if not keep[i]:
             continue
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        squared = x * x + y * y + z * z
-        lost = dropout
+        squared_range = x * x + y * y + z * z
+        loss_probability = dropout
         if intensity_dropout > 0:
             a, b, c = faces[face[i], 0], faces[face[i], 1], faces[face[i], 2]
             ux = np.float64(vertices[b, 0]) - vertices[a, 0]
@@ -45,15 +45,15 @@ def lose_returns(points, face, vertices, faces, keep, error, chance, dropout, in
             vz = np.float64(vertices[c, 2]) - vertices[a, 2]
             nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
             # 1 / (1 + power^2) with power = |n . p| reach^2 / (|n| |p|^3), without its roots
-            dark = max(nx * nx + ny * ny + nz * nz, 1e-30) * max(squared, 1e-6) ** 3
+            dark = max(nx * nx + ny * ny + nz * nz, 1e-30) * max(squared_range, 1e-6) ** 3
             lit = (nx * x + ny * y + nz * z) ** 2 * reach**4
-            lost = 1 - (1 - dropout) * (1 - intensity_dropout * dark / (dark + lit))
-        if chance[i] < lost:
+            loss_probability = 1 - (1 - dropout) * (1 - intensity_dropout * dark / (dark + lit))
+        if chance[i] < loss_probability:
             continue
-        scale = 1 + error[i] / max(np.sqrt(squared), 1e-3)
-        moved[n, 0] = x * scale
-        moved[n, 1] = y * scale
-        moved[n, 2] = z * scale
-        returned[n] = i
+        scale = 1 + error[i] / max(np.sqrt(squared_range), 1e-3)
+        moved_points[n, 0] = x * scale
+        moved_points[n, 1] = y * scale
+        moved_points[n, 2] = z * scale
+        return_index[n] = i
         n += 1
-    return moved[:n], returned[:n]
+    return moved_points[:n], return_index[:n]

@@ -55,13 +55,13 @@ def draw_object(
     acquisition = SINGLE_SCAN
     if config.varied:
         draws = np.random.default_rng([seed, RandomStream.OBJECT_ACQUISITION, index]).random(ACQUISITION_DRAWS)
-        eased = config if hard is None else config.eased(hard)
-        acquisition = draw_acquisition(replace(eased, crowded=0.0), draws)
+        eased_config = config if hard is None else config.eased(hard)
+        acquisition = draw_acquisition(replace(eased_config, crowded=0.0), draws)
     weights = {name: thing.outdoors + thing.indoors for name, thing in THINGS.items() if thing.left_out is left_out}
-    share = np.array(list(weights.values())) / sum(weights.values())
+    probability = np.array(list(weights.values())) / sum(weights.values())
     for attempt in range(_TRIES):
-        alone = rng.random() < _CLUTTER and not attempt
-        name = "clutter" if alone else str(rng.choice(list(weights), p=share))
+        is_clutter = rng.random() < _CLUTTER and not attempt
+        name = "clutter" if is_clutter else str(rng.choice(list(weights), p=probability))
         sample = _draw_sample(config, name, acquisition, 0.85**attempt, rng)
         if len(sample.points) >= LEAST_POINTS:
             return sample, name
@@ -75,33 +75,33 @@ def _draw_sample(
     config: SceneConfig, name: str, acquisition: Acquisition, nearer: float, rng: np.random.Generator
 ) -> Sample:
     """A crop about a thing, perhaps without points."""
-    (first,) = acquisition.sensors[:1] or (config.sensors[rng.integers(len(config.sensors))],)
-    device, placing = sensor(first), acquisition.placing(config)
+    (sensor_name,) = acquisition.sensors[:1] or (config.sensors[rng.integers(len(config.sensors))],)
+    device, place_config = sensor(sensor_name), acquisition.placing(config)
     thing = draw_thing(name, rng) if name in THINGS else Mesh(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.int32))
     low, high = thing.vertices.min(0), thing.vertices.max(0)
     reach = float(min(max(-low[0], -low[1], high[0], high[1], 0.2), _REACH))
     height = float(np.clip(high[2], 0.5, 2.0))
-    place = draw_place(placing, device, height, reach, nearer, rng, acquisition.inverted)
-    own = Mesh(place.of_body(thing.vertices), thing.faces, np.ones(len(thing.faces), np.uint8))
+    place = draw_place(place_config, device, height, reach, nearer, rng, acquisition.inverted)
+    thing_mesh = Mesh(place.of_body(thing.vertices), thing.faces, np.ones(len(thing.faces), np.uint8))
     background = [ground(config, place.feet, rng), *surroundings(config, place.feet, reach, rng)]
     scene = Scene(
         config=config, sensor=device, place=place, conditions=draw_conditions(config, device, rng),
         background=background, props=[], acquisition=acquisition,
     )  # fmt: skip
-    scan = simulate_still(with_views(scene, placing, height, reach, nearer, rng), own, rng)
+    scan = simulate_still(with_views(scene, place_config, height, reach, nearer, rng), thing_mesh, rng)
     points, ring = scan.points, scan.ring
-    middle = place.feet + [0, 0, 1.0]
-    returned = scan.points[scan.part > 0]
-    if not len(returned) and name in THINGS:
+    center = place.feet + [0, 0, 1.0]
+    thing_points = scan.points[scan.part > 0]
+    if not len(thing_points) and name in THINGS:
         points, ring = points[:0], ring[:0]
     elif name not in THINGS or rng.random() < config.noise.clutter:
-        clusters = noise.noise_clusters(middle, most=_MOST_CLUTTER, rng=rng).astype(np.float32)
+        clusters = noise.noise_clusters(center, most=_MOST_CLUTTER, rng=rng).astype(np.float32)
         points, ring = np.concatenate([points, clusters]), np.concatenate([ring, np.zeros(len(clusters), ring.dtype)])
-    if len(returned):
-        middle = returned[rng.integers(len(returned))].astype(float)
-    box = _draw_box(middle, float(place.feet[2]), rng)
-    inside = box.contains(points)
-    points, ring = points[inside], ring[inside]
+    if len(thing_points):
+        center = thing_points[rng.integers(len(thing_points))].astype(float)
+    box = _draw_box(center, float(place.feet[2]), rng)
+    is_inside = box.contains(points)
+    points, ring = points[is_inside], ring[is_inside]
     return Sample(
         points=points,
         center=center_of(points) if len(points) else box.center,
@@ -116,7 +116,7 @@ def _draw_box(middle: np.ndarray, floor: float, rng: np.random.Generator) -> Box
     """A box of a person's size about `middle` (3,) m, as a detector that is wrong draws it; floor: z of the ground."""
     size = np.array([*rng.uniform(*_WIDE, 2), rng.uniform(*_TALL)])
     center = middle + [*(_OFF * rng.standard_normal(2)), 0]
-    raised, below = rng.random(2)
-    bottom = middle[2] - below * size[2] if raised < _RAISED else floor + 0.05 * rng.standard_normal()
+    raised_draw, below_share = rng.random(2)
+    bottom = middle[2] - below_share * size[2] if raised_draw < _RAISED else floor + 0.05 * rng.standard_normal()
     center[2] = bottom + size[2] / 2
     return Box(center=center, size=size, yaw=float(rng.uniform(-np.pi, np.pi)))

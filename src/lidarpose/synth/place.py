@@ -67,24 +67,24 @@ def draw_place(
     upside down.
     """
     distance = max(draw_distance(config, device, rng) * nearer, config.distance[0])
-    ahead, yaw, escape = rng.random(3).tolist()
-    azimuth = _azimuth(device, atan2(wide, distance), ahead, escape < _CUT or not config.mount)
+    azimuth_share, yaw, cut_draw = rng.random(3).tolist()
+    azimuth = _azimuth(device, atan2(wide, distance), azimuth_share, cut_draw < _CUT or not config.mount)
     pitch, roll = 0.0 if inverted else device.tilt, 0.0
     if config.mount:
         pitch, roll = pitch + _MOUNT_TILT * rng.standard_normal(), _MOUNT_TILT * rng.standard_normal()
-    mount = rotation_about("x", roll) @ rotation_about("y", -pitch) if pitch or roll else None
+    R_sensor_level = rotation_about("x", roll) @ rotation_about("y", -pitch) if pitch or roll else None
     height = device.height
     if inverted:
         height = float(rng.uniform(*_HANGS))
-        level = np.eye(3) if mount is None else mount
-        mount = rotation_about("x", pi) @ level @ _aim_inverted(device, distance, tall, height, azimuth)
+        R_tilt = np.eye(3) if R_sensor_level is None else R_sensor_level
+        R_sensor_level = rotation_about("x", pi) @ R_tilt @ _aim_inverted(device, distance, tall, height, azimuth)
     elif config.mount:
         height = draw_height(device, distance, tall, config.mount, pitch, azimuth, rng)
     return Place(
         feet=np.array([distance * cos(azimuth), distance * sin(azimuth), -height]),
         yaw=float(2 * np.pi * yaw - np.pi),
         distance=float(distance),
-        R_sensor_level=mount,
+        R_sensor_level=R_sensor_level,
     )
 
 
@@ -94,12 +94,12 @@ def recorded_place(place: Place, recorded: np.ndarray) -> Place:
     return replace(place, feet=np.array([x, y, place.feet[2]]), yaw=float(yaw), distance=float(np.hypot(x, y)))
 
 
-def _azimuth(device: Sensor | RayPattern, half_width: float, share: float, cut: bool) -> float:
-    """Uniform over the sensor's field of view, with the whole person inside it unless it may `cut` them."""
+def _azimuth(device: Sensor | RayPattern, half_width: float, share: float, may_cut: bool) -> float:
+    """Uniform over the sensor's field of view, with the whole person inside it unless it `may_cut` them."""
     low, high = (-np.pi, np.pi) if isinstance(device, Sensor) else device.azimuths
     if abs(device.tilt) > _TILTED:
         low, high = max(low, -_AHEAD), min(high, _AHEAD)
-    if high - low < 2 * np.pi - 1e-6 and not cut:
+    if high - low < 2 * np.pi - 1e-6 and not may_cut:
         half_width = min(half_width, (high - low) / 2)
         low, high = low + half_width, high - half_width
     return float(low + share * (high - low))
@@ -134,16 +134,16 @@ def _beam(device: Sensor | RayPattern) -> float:
 
 
 def _aim_inverted(
-    device: Sensor | RayPattern, distance: float, tall: float, height: float, azimuth: float
+    device: Sensor | RayPattern, distance: float, person_height: float, height: float, azimuth: float
 ) -> np.ndarray:
     """(3, 3) turn of a sensor before it is mounted upside down, `height` m above the ground: none where its fan, which
     is mirrored, holds the whole person; else its middle is tilted to theirs."""
     low, high = -device.elevations[-1], -device.elevations[0]
-    feet, head = atan2(-height, distance), atan2(tall - height, distance)
+    feet, head = atan2(-height, distance), atan2(person_height - height, distance)
     if low <= feet and head <= high:
         return np.eye(3)
-    down = (low + high - feet - head) / 2
-    return rotation_about("z", azimuth) @ rotation_about("y", -down) @ rotation_about("z", -azimuth)
+    pitch = (low + high - feet - head) / 2
+    return rotation_about("z", azimuth) @ rotation_about("y", -pitch) @ rotation_about("z", -azimuth)
 
 
 def draw_height(
@@ -156,10 +156,10 @@ def draw_height(
     moved until they fit, but for a share `cut` of people. `spread` m is the height's standard
     deviation, `pitch` rad tilts the fan down at azimuth 0, `azimuth` rad is the person's.
     """
-    mount, slope = rng.standard_normal(2).tolist()
-    height = device.height + spread * mount + 0.02 * slope * distance
-    down = pitch * cos(azimuth)
-    edges = [min(max(device.elevations[end] - down, -_STEEPEST), _STEEPEST) for end in (0, -1)]
+    mount_normal, slope_normal = rng.standard_normal(2).tolist()
+    height = device.height + spread * mount_normal + 0.02 * slope_normal * distance
+    pitch_at_azimuth = pitch * cos(azimuth)
+    edges = [min(max(device.elevations[end] - pitch_at_azimuth, -_STEEPEST), _STEEPEST) for end in (0, -1)]
     low, high = distance * tan(edges[0]), distance * tan(edges[1])
     if rng.random() < cut:
         return float(height)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.errors import InputError, check_name
+from lidarpose.lidar.presets import sensor
 
 
 class RandomStream(IntEnum):
@@ -162,7 +163,8 @@ class SceneConfig:
     def changed(self, settings: Sequence[str]) -> "SceneConfig":
         """The same scenes but for some fields, each given as "name=value": of the scene, its noise or its crops; two
         ends as "distance=4:12"; the noise's clutter is "noise.clutter". "keep=R" is the paper's r_keep: every sample is
-        masked and keeps a share R. Raises InputError for what is no field or no value of it.
+        masked and keeps a share R; several sensors are "sensors=NAME:NAME". Raises InputError for what is no field or
+        no value of it.
         """
         scene = self
         for setting in settings:
@@ -181,26 +183,32 @@ _SHARES = frozenset(
 def _changed(scene: SceneConfig, name: str, text: str) -> SceneConfig:
     """The scene with one field changed, see `SceneConfig.changed`."""
     groups: dict[str, Any] = {"": scene, "noise": scene.noise, "crop": scene.crop}
-    known: dict[str, tuple[str, str]] = {"keep": ("noise", "mask_keep")}
+    targets: dict[str, tuple[str, str]] = {"keep": ("noise", "mask_keep")}
     for group, config in groups.items():
         for field in fields(config):
             if isinstance(getattr(config, field.name), int | float | tuple) and field.name != "sensors":
                 # two have a field clutter
-                known[f"{group}.{field.name}" if field.name in known else field.name] = (group, field.name)
-    check_name("setting of the scene", name, known)
-    group, field_name = known[name]
-    before = getattr(groups[group], field_name)
+                targets[f"{group}.{field.name}" if field.name in targets else field.name] = (group, field.name)
+    if name == "sensors":
+        for sensor_name in text.split(":"):
+            sensor(sensor_name)
+        return replace(scene, sensors=tuple(text.split(":")))
+    check_name("setting of the scene", name, targets)
+    group, field_name = targets[name]
+    old_value = getattr(groups[group], field_name)
     try:
         numbers = [float(part) for part in text.split(":")]
-        fits = len(numbers) in ((1, 2) if isinstance(before, tuple) else (1,)) and all(0 <= n < inf for n in numbers)
-        if not fits or numbers[0] > numbers[-1]:
+        is_valid = len(numbers) in ((1, 2) if isinstance(old_value, tuple) else (1,)) and all(
+            0 <= n < inf for n in numbers
+        )
+        if not is_valid or numbers[0] > numbers[-1]:
             raise ValueError
     except ValueError:
-        expected = "a number or two, LOW:HIGH" if isinstance(before, tuple) else "a number"
+        expected = "a number or two, LOW:HIGH" if isinstance(old_value, tuple) else "a number"
         raise InputError(f"expected {name}={expected}, at least 0, got {name}={text}") from None
     if field_name in _SHARES and numbers[-1] > 1:
         raise InputError(f"{name} must be between 0 and 1, got {text}")
-    value = (numbers[0], numbers[-1]) if isinstance(before, tuple) else type(before)(numbers[0])
+    value = (numbers[0], numbers[-1]) if isinstance(old_value, tuple) else type(old_value)(numbers[0])
     changes: dict[str, Any] = {field_name: value} | ({"mask": 1.0} if name == "keep" else {})
     if not group:
         return replace(scene, **changes)

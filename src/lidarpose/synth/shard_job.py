@@ -138,28 +138,28 @@ def write_dataset(
     """
     check_int("--workers", workers, least=1)
     folder, card = Path(folder), job.card()
-    missing = open_folder(folder, card, _ROWS.get(job.what))
-    left = sum(card.size(shard) for shard in missing)
-    done = card.count - left
+    missing_shards = open_folder(folder, card, _ROWS.get(job.what))
+    remaining = sum(card.size(shard) for shard in missing_shards)
+    done_count = card.count - remaining
     # before anything is written, so that motion that cannot be read leaves no folder
-    make = Maker(job=job, card=card, folder=folder, generator=job.generator()) if missing else None
+    maker = Maker(job=job, card=card, folder=folder, generator=job.generator()) if missing_shards else None
     with lock_dataset(folder):
         has_card = (folder / CARD).is_file()
         if not has_card:
             write_card(folder, card)
         if progress is not None:
-            progress(done, card.count)
+            progress(done_count, card.count)
         try:
-            for _, count in make_shards(make, missing, workers=workers) if make is not None else ():
-                done += count
+            for _, count in make_shards(maker, missing_shards, workers=workers) if maker is not None else ():
+                done_count += count
                 if progress is not None:
-                    progress(done, card.count)
+                    progress(done_count, card.count)
         except InputError:
             # the card of settings that made nothing would keep others from following
             if not has_card and not any(folder.glob("*.parquet")):
                 (folder / CARD).unlink()
             raise
-    return left
+    return remaining
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,18 +174,18 @@ class Maker:
 
     def __call__(self, shard: int) -> Counts:
         rows_of = self._street_rows if self.job.what == "streets" else self._people_rows
-        first, size = shard * self.card.per_shard, self.card.size(shard)
+        first_index, size = shard * self.card.per_shard, self.card.size(shard)
         with ExitStack() as stack:
-            add = {
+            row_writers = {
                 table: stack.enter_context(shard_writer(shard_path(self.folder, table, shard), table))
                 for table in self.card.tables
             }
-            for index in range(first, first + size):
-                if index > first:
+            for index in range(first_index, first_index + size):
+                if index > first_index:
                     yield 1
                 for table, rows in rows_of(index).items():
                     for row in rows:
-                        add[table](row)
+                        row_writers[table](row)
         yield 1
 
     def _people_rows(self, index: int) -> dict[str, list]:

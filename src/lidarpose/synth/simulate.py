@@ -98,13 +98,13 @@ class Scene:
         place, vertices, joints = self.body_place, bodies.vertices[row], bodies.joints[row]
         if lag:
             vertices, joints = bodies.between(row, lag)
-        moved = bodies.between(row, 1 + lag) if self.is_smeared else None
-        later = None if moved is None else place.of_body(moved[0])
-        meshes = [Mesh(place.of_body(vertices), bodies.faces, bodies.face_part, later)]
+        later_body = bodies.between(row, 1 + lag) if self.is_smeared else None
+        later_vertices = None if later_body is None else place.of_body(later_body[0])
+        meshes = [Mesh(place.of_body(vertices), bodies.faces, bodies.face_part, later_vertices)]
         for prop in self.props:
-            later = None if moved is None else place.of_body(prop.place(moved[1]).vertices)
+            later_vertices = None if later_body is None else place.of_body(prop.place(later_body[1]).vertices)
             mesh = prop.place(joints)
-            meshes.append(Mesh(place.of_body(mesh.vertices), mesh.faces, prop.face_part, later))
+            meshes.append(Mesh(place.of_body(mesh.vertices), mesh.faces, prop.face_part, later_vertices))
         return meshes + self.background
 
     def seen_from(self, at: np.ndarray, **changes: Any) -> "Scene":
@@ -151,8 +151,8 @@ class Scan:
 
 def label_box(vertices: np.ndarray, yaw: float, id: int) -> Box:
     """The label of a body: the box around its vertices (V, 3) m along a heading of `yaw` rad, `_BOX_ROOM` added."""
-    local = vertices.astype(float) @ rotation_about("z", yaw)
-    low, high = local.min(0), local.max(0)
+    aligned_vertices = vertices.astype(float) @ rotation_about("z", yaw)
+    low, high = aligned_vertices.min(0), aligned_vertices.max(0)
     center = rotation_about("z", yaw) @ ((low + high) / 2)
     return Box(center=center, size=high - low + _BOX_ROOM, yaw=float((yaw + pi) % (2 * pi) - pi), id=id)
 
@@ -160,14 +160,14 @@ def label_box(vertices: np.ndarray, yaw: float, id: int) -> Box:
 def draw_conditions(config: SceneConfig, sensor: Sensor | RayPattern, rng: np.random.Generator) -> ScanConditions:
     """Conditions of a scene; of them the mask alone is as frequent as the scene is difficult."""
     noise = config.noise
-    sigma, bias, dropout, wide, divergence, mask, keep, phase = rng.random(8).tolist()
+    sigma, bias, dropout, wide_draw, divergence, mask_draw, keep, phase = rng.random(8).tolist()
     return ScanConditions(
         sigma=0.0 if noise.dapt_compat else sensor.range_sigma * _between(noise.sigma, sigma),
         bias=_between(noise.ring_bias, bias),
         intensity_dropout=noise.intensity_dropout * dropout,
-        divergence=_between(_DIVERGENCE, divergence) if wide < noise.beam_divergence else 0.0,
+        divergence=_between(_DIVERGENCE, divergence) if wide_draw < noise.beam_divergence else 0.0,
         one_sided=_DAPT_NOISE if noise.dapt_compat else 0.0,
-        keep=_between(noise.mask_keep, keep) if mask < noise.mask * config.hard else 1.0,
+        keep=_between(noise.mask_keep, keep) if mask_draw < noise.mask * config.hard else 1.0,
         phase=int(1e6 * phase),
     )
 
@@ -183,21 +183,24 @@ def simulate(scene: Scene, bodies: Bodies, row: int, rng: np.random.Generator, *
 
 def simulate_still(scene: Scene, thing: Mesh, rng: np.random.Generator) -> Scan:
     """The same of a thing that does not move."""
-    others = ((view.scene, thing.moved(-view.at), -view.earlier, view.at) for view in scene.views)
-    scans = [(scene, thing, 0, np.zeros(3)), *others]
-    return _added_up(((seen, [mesh, *seen.background], number, at) for seen, mesh, number, at in scans), rng)
+    view_scans = ((view.scene, thing.moved(-view.at), -view.earlier, view.at) for view in scene.views)
+    scans = [(scene, thing, 0, np.zeros(3)), *view_scans]
+    return _added_up(
+        ((view_scene, [mesh, *view_scene.background], frame, position) for view_scene, mesh, frame, position in scans),
+        rng,
+    )
 
 
-def _added_up(seen_from: Iterable[tuple[Scene, list[Mesh], int, np.ndarray]], rng: np.random.Generator) -> Scan:
+def _added_up(view_scans: Iterable[tuple[Scene, list[Mesh], int, np.ndarray]], rng: np.random.Generator) -> Scan:
     """Scans as in `Scene.scans` in the frame of the first one."""
     scans: list[Scan] = []
-    for seen, meshes, number, at in seen_from:
-        scan = simulate_scan(seen, meshes, rng, frame=number)
-        scans.append(replace(scan, points=scan.points + at.astype(np.float32)) if scans else scan)
+    for view_scene, meshes, frame, position in view_scans:
+        scan = simulate_scan(view_scene, meshes, rng, frame=frame)
+        scans.append(replace(scan, points=scan.points + position.astype(np.float32)) if scans else scan)
     if len(scans) == 1:
         return scans[0]
-    joined = {name: np.concatenate([getattr(scan, name) for scan in scans]) for name in ("points", "ring", "part")}
-    return Scan(**joined)
+    arrays = {name: np.concatenate([getattr(scan, name) for scan in scans]) for name in ("points", "ring", "part")}
+    return Scan(**arrays)
 
 
 def simulate_scan(scene: Scene, meshes: list[Mesh], rng: np.random.Generator, *, frame: int = 0) -> Scan:
@@ -214,8 +217,8 @@ def simulate_scan(scene: Scene, meshes: list[Mesh], rng: np.random.Generator, *,
     # a union has parts
     ring, part = hits.ring[returned], cast("np.ndarray", mesh.part)[hits.face[returned]]
     if scene.config.noise.dapt_compat and isinstance(sensor, Sensor):
-        seam = np.flatnonzero((hits.column[returned] + hits.column0) % sensor.columns == 0)
-        points, ring, part = (np.concatenate([a, a[seam]]) for a in (points, ring, part))
+        seam_rows = np.flatnonzero((hits.column[returned] + hits.column0) % sensor.columns == 0)
+        points, ring, part = (np.concatenate([a, a[seam_rows]]) for a in (points, ring, part))
     return Scan(points=scene.place.to_level(points), ring=ring, part=part)
 
 
@@ -227,8 +230,8 @@ def count_alone(scene: Scene, body: Mesh, frame: int) -> int:
 def scan_background(scene: Scene, body: Mesh, frame: int) -> np.ndarray:
     """Points (n, 3) float32 m in the level frame of what stands still about a body, what the body hides too: a map has
     them without noise."""
-    away = replace(body, faces=body.faces[:0], part=None)
-    hits, _ = _cast(scene, [away, *scene.background[: scene.still]], frame, margin=MARGIN)
+    empty_body = replace(body, faces=body.faces[:0], part=None)
+    hits, _ = _cast(scene, [empty_body, *scene.background[: scene.still]], frame, margin=MARGIN)
     return scene.place.to_level(hits.points)
 
 
@@ -237,9 +240,9 @@ def _cast(scene: Scene, meshes: list[Mesh], frame: int, *, margin: float = 0.0) 
     place, sensor = scene.place, scene.sensor
     # the ground is the first thing of the background; what the window is about comes first
     ground = scene.background[:1] if scene.config.ground_window else []
-    framed = {id(mesh) for mesh in (meshes[0], *ground)}
-    meshes = sorted(meshes, key=lambda mesh: id(mesh) not in framed)
-    body_vertices = sum(len(mesh.vertices) for mesh in meshes if id(mesh) in framed)
+    window_mesh_ids = {id(mesh) for mesh in (meshes[0], *ground)}
+    meshes = sorted(meshes, key=lambda mesh: id(mesh) not in window_mesh_ids)
+    body_vertices = sum(len(mesh.vertices) for mesh in meshes if id(mesh) in window_mesh_ids)
     mesh = union(meshes)
     mesh = replace(mesh, vertices=place.to_sensor(mesh.vertices))
     margin += scene.config.margin + np.arctan2(scene.config.around, place.distance)
@@ -292,8 +295,8 @@ def add_sensor_noise(
     if ring_normals is None:
         ring_normals = rng.standard_normal(int(hits.ring.max(initial=-1)) + 1, np.float32)
     chance = rng.random(count, np.float32)
-    shared = ring_normals.astype(float)[hits.ring]
-    error = (conditions.sigma * normals.astype(float) + conditions.bias * shared).astype(np.float32)
+    point_ring_normals = ring_normals.astype(float)[hits.ring]
+    error = (conditions.sigma * normals.astype(float) + conditions.bias * point_ring_normals).astype(np.float32)
     if conditions.one_sided:
         error += conditions.one_sided * rng.random(count, np.float32)
     return lose_returns(

@@ -81,10 +81,10 @@ def street(
     device = named_sensor(sensor)
     rng = np.random.default_rng([seed, RandomStream.STREET, index])
     plan = _draw_plan(device, rng)
-    still = union(_scenery(plan, rng)).moved((0, 0, 0), plan.turn)
+    scenery = union(_scenery(plan, rng)).moved((0, 0, 0), plan.turn)
     walkers = _draw_walkers(plan, int(rng.integers(least, most + 1)), frames, rng)
     ring_normals = rng.standard_normal(max(_RINGS, device.rows if isinstance(device, Sensor) else 0), np.float32)
-    turns = tuple(_scan_turn(device, still, walkers, frame, ring_normals, rng) for frame in range(frames))
+    turns = tuple(_scan_turn(device, scenery, walkers, frame, ring_normals, rng) for frame in range(frames))
     return Street(frames=turns, sensor=device.name, height=plan.height)
 
 
@@ -127,10 +127,10 @@ def _scenery(plan: StreetPlan, rng: np.random.Generator) -> list[Mesh]:
         meshes += _house_fronts(plan, side, rng)
         meshes += _kerb_row(plan, side, rng)
     shift = np.array([0, -plan.sensor_y, -plan.height])
-    moved = [mesh.moved(shift) for mesh in meshes]
+    moved_meshes = [mesh.moved(shift) for mesh in meshes]
     # the sensor is not in a car
-    clear = [m for m in moved[1:] if np.hypot(*m.vertices[:, :2].T).min() > 1.2 and not _around(m)]
-    return moved[:1] + clear
+    clear_meshes = [m for m in moved_meshes[1:] if np.hypot(*m.vertices[:, :2].T).min() > 1.2 and not _around(m)]
+    return moved_meshes[:1] + clear_meshes
 
 
 def _around(mesh: Mesh) -> bool:
@@ -158,61 +158,61 @@ def _house_fronts(plan: StreetPlan, side: int, rng: np.random.Generator) -> list
     meshes, x = [], -_LENGTH
     while x < _LENGTH:
         a, b, c, d = rng.random(4).tolist()
-        long = 4.0 + 6.0 * a
+        length = 4.0 + 6.0 * a
         y = side * (plan.front + 0.2 + (1.5 * b if c > 0.6 else 0.1 * b))
-        middle = (x + long / 2, y, plan.kerb)
+        middle = (x + length / 2, y, plan.kerb)
         if c < 0.6:
-            bays = max(1, int(long / 2.5))
-            wide = long / bays
+            bays = max(1, int(length / 2.5))
+            bay_width = length / bays
             for bay in range(bays):
                 sill, top = (0.0, 2.1) if (bay + int(10 * d)) % 3 == 0 else (0.9, 2.2)
-                opening = (-0.25 * wide, 0.25 * wide, sill, top)
-                front = shapes.wall(wide, 3.5 + 3 * d, thick=0.3, opening=opening)
-                meshes.append(front.moved((x + (bay + 0.5) * wide, y, plan.kerb), pi / 2))
+                opening = (-0.25 * bay_width, 0.25 * bay_width, sill, top)
+                front = shapes.wall(bay_width, 3.5 + 3 * d, thick=0.3, opening=opening)
+                meshes.append(front.moved((x + (bay + 0.5) * bay_width, y, plan.kerb), pi / 2))
             # rooms end somewhere
-            meshes.append(shapes.box((long, 0.1, 3.5)).moved((middle[0], y + side * (1.5 + 3 * d), plan.kerb)))
+            meshes.append(shapes.box((length, 0.1, 3.5)).moved((middle[0], y + side * (1.5 + 3 * d), plan.kerb)))
         elif c < 0.75:
-            for k in range(int(long)):
+            for k in range(int(length)):
                 bush = shapes.foliage((1.3, 0.9, 0.9 + d), 120, 0.11, rng)
                 meshes.append(bush.moved((x + k + 0.5, y, plan.kerb)))
         elif c < 0.9:
-            fence = shapes.rail_fence(long, 1.0, 3) if d < 0.4 else shapes.lattice_fence(long, 0.8 + d, 0.14, 0.04)
+            fence = shapes.rail_fence(length, 1.0, 3) if d < 0.4 else shapes.lattice_fence(length, 0.8 + d, 0.14, 0.04)
             meshes.append(fence.moved(middle, pi / 2))
-        x += long + (0 if c < 0.6 else 0.5 + d)
+        x += length + (0 if c < 0.6 else 0.5 + d)
     return meshes
 
 
 def _kerb_row(plan: StreetPlan, side: int, rng: np.random.Generator) -> list[Mesh]:
     """Parked cars at the kerb and furniture on the pavement beside it."""
     meshes, x = [], -_LENGTH + 4 * rng.random()
-    parked = rng.random() < 0.8
-    while parked and x < _LENGTH - 6:
+    has_parked_cars = rng.random() < 0.8
+    while has_parked_cars and x < _LENGTH - 6:
         a, b, c, d = rng.random(4).tolist()
-        long = 3.7 + 1.2 * a
+        length = 3.7 + 1.2 * a
         if b < 0.6:
-            ahead = 0.0 if side < 0 else pi
-            car = shape("car", long, 1.8, 1.45 + 0.2 * c) if c < 0.8 else shape("van", long + 1, 2.0, 2.0 + 0.4 * d)
-            meshes.append(car.moved((x + long / 2, side * (plan.road - 1.05), 0.0), ahead + 0.04 * (d - 0.5)))
-        x += long + 1.6 + 1.5 * d
+            heading = 0.0 if side < 0 else pi
+            car = shape("car", length, 1.8, 1.45 + 0.2 * c) if c < 0.8 else shape("van", length + 1, 2.0, 2.0 + 0.4 * d)
+            meshes.append(car.moved((x + length / 2, side * (plan.road - 1.05), 0.0), heading + 0.04 * (d - 0.5)))
+        x += length + 1.6 + 1.5 * d
     x = -_LENGTH + 6 * rng.random()
     while x < _LENGTH:
         a, b, c, d = rng.random(4).tolist()
-        place, inwards = (x, side * (plan.road + _RAIL), plan.kerb), -side * pi / 2
+        position, inward_yaw = (x, side * (plan.road + _RAIL), plan.kerb), -side * pi / 2
         if a < 0.25:
-            meshes.append(shape("pole", 0.05 + 0.06 * b, 0.05 + 0.06 * b, 5.0).moved(place))
+            meshes.append(shape("pole", 0.05 + 0.06 * b, 0.05 + 0.06 * b, 5.0).moved(position))
         elif a < 0.5:
             # a tree: trunk and crown
             crown = shapes.foliage((2.2 + b, 2.2 + b, 2.0), 120, 0.28, rng)
-            meshes.append(shape("pole", 0.10 + 0.10 * c, 0.10 + 0.10 * c, 2.6).moved(place))
-            meshes.append(crown.moved((x, place[1], plan.kerb + 2.2)))
+            meshes.append(shape("pole", 0.10 + 0.10 * c, 0.10 + 0.10 * c, 2.6).moved(position))
+            meshes.append(crown.moved((x, position[1], plan.kerb + 2.2)))
         elif a < 0.62:
-            meshes.append(shapes.sign(2.0 + 0.6 * b, 0.5).moved(place, inwards))
+            meshes.append(shapes.sign(2.0 + 0.6 * b, 0.5).moved(position, inward_yaw))
         elif a < 0.75:
-            meshes.append(shape("wheeled bin", 0.5 + 0.2 * b, 0.5 + 0.2 * b, 1.0 + 0.1 * c).moved(place, 2 * pi * d))
+            meshes.append(shape("wheeled bin", 0.5 + 0.2 * b, 0.5 + 0.2 * b, 1.0 + 0.1 * c).moved(position, 2 * pi * d))
         elif a < 0.82:
-            meshes.append(shape("bench", 1.0, 1.6).moved(place, inwards))
+            meshes.append(shape("bench", 1.0, 1.6).moved(position, inward_yaw))
         elif a < 0.9:
-            meshes.append(shapes.foliage((0.8, 0.8, 0.7 + b), 100, 0.1, rng).moved(place))
+            meshes.append(shapes.foliage((0.8, 0.8, 0.7 + b), 100, 0.1, rng).moved(position))
         else:
             meshes.append(shape("traffic cone", 0.6, 0.6, 0.6).moved((x, side * (plan.road - 0.3), 0.0)))
         x += 3.0 + 7.0 * d
@@ -240,12 +240,12 @@ def _draw_walkers(plan: StreetPlan, count: int, frames: int, rng: np.random.Gene
     for _ in range(count):
         bodies = _draw_pedestrian(frames, rng)
         for attempt in range(_PLACE_TRIES):
-            place, stays = _draw_start(plan, bodies, rng)
+            place, is_on_surface = _draw_start(plan, bodies, rng)
             path = _path((bodies, place))
             if np.linalg.norm(path, axis=1).min() < _NEAREST - 1:
                 continue
-            apart = [np.linalg.norm(path - other, axis=1).min() for other in paths]
-            if (stays or 2 * attempt > _PLACE_TRIES) and min(apart, default=np.inf) > _APART:
+            distances = [np.linalg.norm(path - other_path, axis=1).min() for other_path in paths]
+            if (is_on_surface or 2 * attempt > _PLACE_TRIES) and min(distances, default=np.inf) > _APART:
                 walkers.append((bodies, place))
                 paths.append(path)
                 break
@@ -263,25 +263,27 @@ def _draw_pedestrian(frames: int, rng: np.random.Generator) -> Bodies:
 
 def _draw_start(plan: StreetPlan, bodies: Bodies, rng: np.random.Generator) -> tuple[Place, bool]:
     """Where somebody starts, and whether they stay on one surface and out of the rows at the kerbs."""
-    where, far, across, way, lean = rng.random(5)
+    surface_draw, distance_draw, lateral_share, direction_draw, yaw_draw = rng.random(5)
     turn = rotation_about("z", plan.turn)
-    x = (1 if far < 0.5 or plan.ahead else -1) * (_NEAREST - 1 + (_FARTHEST - _NEAREST) * abs(2 * far - 1) ** 1.5)
-    if where < 0.8:
+    x = (1 if distance_draw < 0.5 or plan.ahead else -1) * (
+        _NEAREST - 1 + (_FARTHEST - _NEAREST) * abs(2 * distance_draw - 1) ** 1.5
+    )
+    if surface_draw < 0.8:
         # along a pavement, between the furniture and the fronts
-        side = 1 if where < 0.4 else -1
+        side = 1 if surface_draw < 0.4 else -1
         low, high = plan.road + _RAIL + 0.5, plan.front - 0.3
-        y, z = side * (low + across * (high - low)), plan.kerb
-        yaw = (0.0 if way < 0.5 else pi) + 0.3 * (lean - 0.5)
+        y, z = side * (low + lateral_share * (high - low)), plan.kerb
+        yaw = (0.0 if direction_draw < 0.5 else pi) + 0.3 * (yaw_draw - 0.5)
         bounds = sorted((side * low, side * high))
     else:
         # across the road, beyond the parked cars
         bounds, z = [-(plan.road - 2.2), plan.road - 2.2], 0.0
-        y = bounds[0] + across * (bounds[1] - bounds[0])
-        yaw = (pi / 2 if way < 0.5 else -pi / 2) + 1.2 * (lean - 0.5)
+        y = bounds[0] + lateral_share * (bounds[1] - bounds[0])
+        yaw = (pi / 2 if direction_draw < 0.5 else -pi / 2) + 1.2 * (yaw_draw - 0.5)
     start = turn @ np.array([x, y - plan.sensor_y, z - plan.height])
     place = Place(feet=start, yaw=float(yaw + plan.turn), distance=float(np.hypot(*start[:2])))
-    across_street = (_path((bodies, place)) @ turn[:2, :2])[:, 1] + plan.sensor_y
-    return place, bool(((across_street > bounds[0] - 0.1) & (across_street < bounds[1] + 0.1)).all())
+    path_y = (_path((bodies, place)) @ turn[:2, :2])[:, 1] + plan.sensor_y
+    return place, bool(((path_y > bounds[0] - 0.1) & (path_y < bounds[1] + 0.1)).all())
 
 
 def _label(walker: Walker, frame: int, track: int) -> Box:
@@ -295,7 +297,7 @@ def _label(walker: Walker, frame: int, track: int) -> Box:
 
 def _scan_turn(
     device: Sensor | RayPattern,
-    still: Mesh,
+    scenery: Mesh,
     walkers: list[Walker],
     frame: int,
     ring_normals: np.ndarray,
@@ -304,26 +306,26 @@ def _scan_turn(
     is_pattern = isinstance(device, RayPattern)
     people = []
     for bodies, place in walkers:
-        later = place.of_body(bodies.moved(frame)[0].astype(np.float32)) if is_pattern else None
-        people.append(Mesh(place.of_body(bodies.vertices[frame]), bodies.faces, bodies.face_part, later))
-    scene = union([*people, still])
+        later_vertices = place.of_body(bodies.moved(frame)[0].astype(np.float32)) if is_pattern else None
+        people.append(Mesh(place.of_body(bodies.vertices[frame]), bodies.faces, bodies.face_part, later_vertices))
+    scene = union([*people, scenery])
     R_sensor_level = rotation_about("y", -device.tilt).astype(np.float32)
     mesh = Mesh(scene.vertices @ R_sensor_level.T, scene.faces)
     if isinstance(device, RayPattern):
-        moved = (scene.vertices if scene.later is None else scene.later) @ R_sensor_level.T
-        hits = scan_pattern(mesh.vertices, mesh.faces, device, frame % device.frames, moved=moved)
+        end_vertices = (scene.vertices if scene.later is None else scene.later) @ R_sensor_level.T
+        hits = scan_pattern(mesh.vertices, mesh.faces, device, frame % device.frames, moved=end_vertices)
     else:
         hits = scan(mesh.vertices, mesh.faces, device)
     conditions = ScanConditions(sigma=device.range_sigma, bias=_RING_BIAS, intensity_dropout=_INTENSITY_DROPOUT)
     points, returned = add_sensor_noise(hits, mesh, device, conditions, rng, ring_normals=ring_normals)
     face, joints = hits.face[returned], [place.of_body(bodies.joints[frame]) for bodies, place in walkers]
     # the people's faces come first, one person after the other
-    owner = np.repeat(np.arange(len(people) + 1), [len(m.faces) for m in (*people, still)]).astype(np.int16)
-    owner[owner == len(people)] = -1
+    face_person = np.repeat(np.arange(len(people) + 1), [len(m.faces) for m in (*people, scenery)]).astype(np.int16)
+    face_person[face_person == len(people)] = -1
     return StreetFrame(
         points=points @ R_sensor_level,
         ring=hits.ring[returned],
-        person=owner[face],
+        person=face_person[face],
         part=np.zeros(len(face), np.uint8) if scene.part is None else scene.part[face],
         boxes=tuple(_label(walker, frame, track) for track, walker in enumerate(walkers)),
         joints=np.array(joints, np.float32).reshape(-1, len(BODY26), 3),
@@ -341,20 +343,20 @@ def samples(scene: Street, rng: np.random.Generator, *, least: int = 15) -> list
     pairs = []
     for number, frame in enumerate(scene.frames):
         for track, label in enumerate(frame.boxes):
-            shift, room, turn = rng.normal(0, _OFF, 3), rng.uniform(*_GROWN, 3), rng.normal(0, _TURNED)
+            shift, extra_size, yaw_error = rng.normal(0, _OFF, 3), rng.uniform(*_GROWN, 3), rng.normal(0, _TURNED)
             center = label.center + shift * [1, 1, 0.5]
-            box = Box(center=center, size=label.size + room, yaw=label.yaw + turn, id=label.id)
-            inside = box.contains(frame.points)
-            own = inside & (frame.person == track)
-            if np.count_nonzero(own) < least:
+            box = Box(center=center, size=label.size + extra_size, yaw=label.yaw + yaw_error, id=label.id)
+            is_inside = box.contains(frame.points)
+            is_person = is_inside & (frame.person == track)
+            if np.count_nonzero(is_person) < least:
                 continue
-            points = frame.points[inside]
+            points = frame.points[is_inside]
             sample = Sample(
                 points=points,
                 center=center_of(points),
                 # another person in the crop is not this body
-                part=np.where(own, frame.part, 0)[inside].astype(np.uint8),
-                ring=frame.ring[inside],
+                part=np.where(is_person, frame.part, 0)[is_inside].astype(np.uint8),
+                ring=frame.ring[is_inside],
                 pose=Pose(joints=frame.joints[track], skeleton=BODY26, frame="sensor"),
                 box=box,
                 source=f"synth/street/{scene.sensor}",

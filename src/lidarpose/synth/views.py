@@ -28,32 +28,32 @@ def with_views(
 
 
 def _merged_views(
-    scene: Scene, placing: SceneConfig, height: float, reach: float, nearer: float, rng: np.random.Generator
+    scene: Scene, place_config: SceneConfig, height: float, reach: float, nearer: float, rng: np.random.Generator
 ) -> tuple[View, ...]:
     """The other sensors around a person, each turned, mounted and disturbed on its own, up to a tenth of a second
     before or after the first one, some at twice its rate. Arguments: as of `draw_place`."""
     names, feet, views = scene.acquisition.sensors, scene.place.feet, []
     for k, name in enumerate(names[1:], 1):
         device = sensor(name)
-        own = draw_place(placing, device, height, reach, nearer, rng, scene.acquisition.inverted)
+        sensor_place = draw_place(place_config, device, height, reach, nearer, rng, scene.acquisition.inverted)
         angle, lag = rng.uniform(-1, 1, 2).tolist()
         # from there the person is seen in this direction of the first sensor's frame
         heading = np.arctan2(feet[1], feet[0]) + 2 * np.pi * k / len(names) + _OFF_ANGLE * angle
-        turn = rotation_about("z", heading - np.arctan2(own.feet[1], own.feet[0]))
-        at = feet - turn @ own.feet
+        turn = rotation_about("z", heading - np.arctan2(sensor_place.feet[1], sensor_place.feet[0]))
+        position = feet - turn @ sensor_place.feet
         rate, lags = scene.config.double_rate, [lag]
         # a table of an odd number of columns has no half
         if isinstance(device, Sensor) and device.columns % 2 == 0 and rate > 0 and rng.random() < rate:
             device = replace(device, azimuth_step=2 * device.azimuth_step)
             lags.append(lag - 0.5 if lag > 0 else lag + 0.5)
-        mount = turn.T if own.R_sensor_level is None else own.R_sensor_level @ turn.T
-        seen = scene.seen_from(
-            at,
+        mount = turn.T if sensor_place.R_sensor_level is None else sensor_place.R_sensor_level @ turn.T
+        view_scene = scene.seen_from(
+            position,
             place=replace(scene.place, R_sensor_level=mount),
             sensor=device,
             conditions=draw_conditions(scene.config, device, rng),
         )
-        views += [View(scene=seen, at=at, lag=own_lag) for own_lag in lags]
+        views += [View(scene=view_scene, at=position, lag=view_lag) for view_lag in lags]
     return tuple(views)
 
 
@@ -63,6 +63,6 @@ def _earlier_views(scene: Scene) -> tuple[View, ...]:
     # it does not drive through the person
     forward = -1 if feet[0] < 0 and abs(feet[1]) < _BESIDE_LANE else 1
     for earlier in range(1, scene.acquisition.frames):
-        at = np.array([-forward * scene.acquisition.speed * earlier / CLIP_HZ, 0, 0])
-        views.append(View(scene=scene.seen_from(at), at=at, earlier=earlier))
+        position = np.array([-forward * scene.acquisition.speed * earlier / CLIP_HZ, 0, 0])
+        views.append(View(scene=scene.seen_from(position), at=position, earlier=earlier))
     return tuple(views)

@@ -11,10 +11,10 @@ def assign(costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     costs (N, B): inf for what cannot be a pair. Returns rows (k,) ascending and their columns (k,).
     """
-    worth = np.minimum(np.asarray(costs, float), 0.0)
-    rows, columns = _solver()(worth)
-    pays = worth[rows, columns] < 0
-    return rows[pays], columns[pays]
+    clipped_costs = np.minimum(np.asarray(costs, float), 0.0)
+    rows, columns = _solver()(clipped_costs)
+    is_pair = clipped_costs[rows, columns] < 0
+    return rows[is_pair], columns[is_pair]
 
 
 @cache
@@ -41,22 +41,22 @@ def assign_plain(costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     row_of = np.full(width, -1)
     for start in range(count):
         # Dijkstra over columns: distance so far, the column before, and whether it is settled
-        distance, before, settled = np.full(width, np.inf), np.full(width, -1), np.zeros(width, bool)
-        row, column, reached = start, -1, 0.0
+        distance, predecessor, is_settled = np.full(width, np.inf), np.full(width, -1), np.zeros(width, bool)
+        row, column, min_distance = start, -1, 0.0
         while row >= 0:
-            through = reached + costs[row] - row_price[row] - column_price
-            shorter = ~settled & (through < distance)
-            distance[shorter], before[shorter] = through[shorter], column
-            column = int(np.where(settled, np.inf, distance).argmin())
-            reached = distance[column]
-            settled[column] = True
+            path_cost = min_distance + costs[row] - row_price[row] - column_price
+            is_shorter = ~is_settled & (path_cost < distance)
+            distance[is_shorter], predecessor[is_shorter] = path_cost[is_shorter], column
+            column = int(np.where(is_settled, np.inf, distance).argmin())
+            min_distance = distance[column]
+            is_settled[column] = True
             row = int(row_of[column])
-        known = np.flatnonzero(settled & (row_of >= 0))
-        row_price[start] += reached
-        row_price[row_of[known]] += reached - distance[known]
-        column_price[settled] -= reached - distance[settled]
+        assigned_columns = np.flatnonzero(is_settled & (row_of >= 0))
+        row_price[start] += min_distance
+        row_price[row_of[assigned_columns]] += min_distance - distance[assigned_columns]
+        column_price[is_settled] -= min_distance - distance[is_settled]
         while column >= 0:
-            previous = before[column]
+            previous = predecessor[column]
             row_of[column] = start if previous < 0 else row_of[previous]
             column = int(previous)
     columns = np.flatnonzero(row_of >= 0)

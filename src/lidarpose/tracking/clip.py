@@ -54,10 +54,10 @@ class TrackPoses:
     @classmethod
     def of_poses(cls, times: np.ndarray, poses: list[Pose | None], skeleton: Skeleton) -> "TrackPoses":
         """From a pose a frame, None where the person was not seen."""
-        seen = [pose for pose in poses if pose is not None]
+        seen_poses = [pose for pose in poses if pose is not None]
         values: dict[str, Any] = {}
         for name in ("joints", *_PER_JOINT):
-            if name != "joints" and (not seen or any(getattr(pose, name) is None for pose in seen)):
+            if name != "joints" and (not seen_poses or any(getattr(pose, name) is None for pose in seen_poses)):
                 continue
             values[name] = np.full((len(poses), len(skeleton)) + (3,) * (name == "joints"), np.nan)
             for row, pose in enumerate(poses):
@@ -70,8 +70,8 @@ class TrackPoses:
         if not np.isfinite(self.joints[row]).all():
             return None
         values = {name: getattr(self, name) for name in _PER_JOINT}
-        of_frame: dict[str, Any] = {name: None if value is None else value[row] for name, value in values.items()}
-        return Pose(joints=self.joints[row], skeleton=self.skeleton, **of_frame)
+        frame_values: dict[str, Any] = {name: None if value is None else value[row] for name, value in values.items()}
+        return Pose(joints=self.joints[row], skeleton=self.skeleton, **frame_values)
 
     def poses(self) -> list[Pose | None]:
         """The pose of each frame."""

@@ -30,30 +30,30 @@ def exchanged(
     times (T,) s; joints (T, J, 3) m, all seen; variance (T, J) m^2; confidence (T, J) or None.
     """
     flip = np.array(skeleton.flip)
-    sure = np.full(len(times), _CONFIDENCE) if confidence is None else confidence.mean(1)
-    odds = _SURE * sure + _forward_odds(times, joints, skeleton)
+    frame_confidence = np.full(len(times), _CONFIDENCE) if confidence is None else confidence.mean(1)
+    odds = _SURE * frame_confidence + _forward_odds(times, joints, skeleton)
     # joints in the middle are their own mirror: nothing is across
-    alike = _alike(joints - joints[:, flip], variance + variance[:, flip])
-    costs, came = np.array([0.0, odds[0]]), np.zeros((len(times), 2), int)
+    similarity = _alike(joints - joints[:, flip], variance + variance[:, flip])
+    costs, backpointers = np.array([0.0, odds[0]]), np.zeros((len(times), 2), int)
     for row in range(1, len(times)):
         # [before, now]
-        total = costs[:, None] + _TURN * alike[row - 1] * (1 - np.eye(2))
-        came[row] = total.argmin(0)
+        total = costs[:, None] + _TURN * similarity[row - 1] * (1 - np.eye(2))
+        backpointers[row] = total.argmin(0)
         costs = total.min(0) + [0, odds[row]]
-    chosen = np.zeros(len(times), bool)
+    is_exchanged = np.zeros(len(times), bool)
     state = int(costs.argmin())
     for row in range(len(times))[::-1]:
-        chosen[row] = state
-        state = came[row, state]
-    return chosen
+        is_exchanged[row] = state
+        state = backpointers[row, state]
+    return is_exchanged
 
 
-def _alike(across: np.ndarray, variance: np.ndarray) -> np.ndarray:
+def _alike(offsets: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """(T - 1,) in [-1, 1]: how far the ways from right to left joints (T, J, 3) m are those of the frame before."""
     weight = 1 / np.sqrt(variance[1:] * variance[:-1])
-    product = (weight * (across[1:] * across[:-1]).sum(-1)).sum(-1)
-    before, now = ((weight * (part**2).sum(-1)).sum(-1) for part in (across[:-1], across[1:]))
-    return product / np.maximum(np.sqrt(before * now), 1e-12)
+    product = (weight * (offsets[1:] * offsets[:-1]).sum(-1)).sum(-1)
+    previous_square, current_square = ((weight * (part**2).sum(-1)).sum(-1) for part in (offsets[:-1], offsets[1:]))
+    return product / np.maximum(np.sqrt(previous_square * current_square), 1e-12)
 
 
 def _forward_odds(times: np.ndarray, joints: np.ndarray, skeleton: Skeleton) -> np.ndarray:

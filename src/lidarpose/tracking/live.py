@@ -62,12 +62,12 @@ class LiveFilter:
                 return None
             self._belief = self._belief.predicted(step, SCALES[:, None] * self._usual)
             joints, spread = self._estimate()
-            unseen: dict[str, Any] = {"confidence": likely_hit(spread), "visible": np.zeros(len(spread))}
-            return Pose(joints=joints, skeleton=self.skeleton, spread=spread, **unseen)
+            values: dict[str, Any] = {"confidence": likely_hit(spread), "visible": np.zeros(len(spread))}
+            return Pose(joints=joints, skeleton=self.skeleton, spread=spread, **values)
         if self._seen is None:
             self._arrays["origin"] = pose.joints.mean(0)
-        given = None if pose.spread is None else pose.spread[None]
-        spread = known_spread(given, np.ones(1, bool), len(self._usual))[0]
+        frame_spread = None if pose.spread is None else pose.spread[None]
+        spread = known_spread(frame_spread, np.ones(1, bool), len(self._usual))[0]
         self._add(step, pose.joints - self._arrays["origin"], spread)
         self._seen = time
         joints, spread = self._estimate()
@@ -111,14 +111,14 @@ class LiveFilter:
     @classmethod
     def from_state(cls, state: dict[str, Any], skeleton: Skeleton | None = None) -> "LiveFilter":
         """The filter of a `state`; skeleton: only where it is none of lidarpose's own."""
-        live = cls(skeleton_of(state["skeleton"]) if skeleton is None else skeleton)
-        live._time, live._seen, live._frames = state["time"], state["seen"], state["frames"]
-        live._arrays = {name: np.array(value) for name, value in state["arrays"].items()}
-        live._belief = Belief(**{name: np.array(value) for name, value in state["belief"].items()})
-        return live
+        live_filter = cls(skeleton_of(state["skeleton"]) if skeleton is None else skeleton)
+        live_filter._time, live_filter._seen, live_filter._frames = state["time"], state["seen"], state["frames"]
+        live_filter._arrays = {name: np.array(value) for name, value in state["arrays"].items()}
+        live_filter._belief = Belief(**{name: np.array(value) for name, value in state["belief"].items()})
+        return live_filter
 
 
 def follow(track: TrackPoses) -> list[Pose | None]:
     """The steady pose of each frame of a track, from that frame and those before."""
-    live = LiveFilter(track.skeleton)
-    return [live.update(float(time), pose) for time, pose in zip(track.times, track.poses(), strict=True)]
+    live_filter = LiveFilter(track.skeleton)
+    return [live_filter.update(float(time), pose) for time, pose in zip(track.times, track.poses(), strict=True)]

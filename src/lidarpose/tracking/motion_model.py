@@ -89,9 +89,9 @@ def smooth_joints(
     belief = Belief.unknown(joints.shape[1:2])
     steps = np.diff(times, prepend=times[0])
     beliefs, forecasts = [], []
-    for step, at, weight, drift in zip(steps, joints, precision, strength, strict=True):
+    for step, frame_joints, weight, drift in zip(steps, joints, precision, strength, strict=True):
         forecast = belief.predicted(step, drift)
-        belief, _ = forecast.updated(at, weight)
+        belief, _ = forecast.updated(frame_joints, weight)
         beliefs.append(belief)
         forecasts.append(forecast)
     positions, variances = np.empty(joints.shape), np.empty(joints.shape[:2])
@@ -102,7 +102,7 @@ def smooth_joints(
     return positions, variances
 
 
-def _backward(belief: Belief, forecast: Belief, later: Belief, step: float) -> Belief:
+def _backward(belief: Belief, forecast: Belief, next_belief: Belief, step: float) -> Belief:
     """What is believed of a frame, once the frame after it, forecast from it, is known."""
     determinant = forecast.variance * forecast.velocity_variance - forecast.covariance**2
     # the rows of (covariance with the next frame) (forecast's covariance)^-1
@@ -118,16 +118,25 @@ def _backward(belief: Belief, forecast: Belief, later: Belief, step: float) -> B
             )
         )
     (a, b), (c, d) = gains
-    moved, faster = later.position - forecast.position, later.velocity - forecast.velocity
-    less = later.variance - forecast.variance
-    less_covariance = later.covariance - forecast.covariance
-    less_velocity = later.velocity_variance - forecast.velocity_variance
+    position_change, velocity_change = (
+        next_belief.position - forecast.position,
+        next_belief.velocity - forecast.velocity,
+    )
+    variance_change = next_belief.variance - forecast.variance
+    covariance_change = next_belief.covariance - forecast.covariance
+    velocity_variance_change = next_belief.velocity_variance - forecast.velocity_variance
     return Belief(
-        belief.position + a[..., None] * moved + b[..., None] * faster,
-        belief.velocity + c[..., None] * moved + d[..., None] * faster,
-        belief.variance + a * a * less + 2 * a * b * less_covariance + b * b * less_velocity,
-        belief.covariance + a * c * less + (a * d + b * c) * less_covariance + b * d * less_velocity,
-        belief.velocity_variance + c * c * less + 2 * c * d * less_covariance + d * d * less_velocity,
+        belief.position + a[..., None] * position_change + b[..., None] * velocity_change,
+        belief.velocity + c[..., None] * position_change + d[..., None] * velocity_change,
+        belief.variance + a * a * variance_change + 2 * a * b * covariance_change + b * b * velocity_variance_change,
+        belief.covariance
+        + a * c * variance_change
+        + (a * d + b * c) * covariance_change
+        + b * d * velocity_variance_change,
+        belief.velocity_variance
+        + c * c * variance_change
+        + 2 * c * d * covariance_change
+        + d * d * velocity_variance_change,
     )
 
 
@@ -166,8 +175,8 @@ def odds_after(odds: np.ndarray, step: float, evidence: np.ndarray) -> np.ndarra
 
 def _mixed(odds: np.ndarray, step: float) -> np.ndarray:
     """Any scale may follow after a while."""
-    stays = np.exp(-step / _SCALE_TIME)
-    return stays * odds + (1 - stays) * odds.mean(0)
+    stay_probability = np.exp(-step / _SCALE_TIME)
+    return stay_probability * odds + (1 - stay_probability) * odds.mean(0)
 
 
 def _normalized(odds: np.ndarray, axis: int = 0) -> np.ndarray:

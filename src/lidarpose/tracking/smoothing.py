@@ -33,28 +33,28 @@ def smooth(track: TrackPoses) -> TrackPoses:
     Frames that were not seen are filled in within gaps of up to `MAX_GAP` s, and within half a second of a frame that
     was, with a spread that says so, `visible` 0 and `filled` true.
     """
-    seen = track.seen
-    if not seen.any():
+    is_seen = track.seen
+    if not is_seen.any():
         return track
     track = settled(track)
-    times, usual = track.times, strengths(track.skeleton)
-    spread = known_spread(track.spread, seen, len(usual))
+    times, usual_strength = track.times, strengths(track.skeleton)
+    spread = known_spread(track.spread, is_seen, len(usual_strength))
     precision = precisions(spread)
     # numbers stay small about the first place
-    origin = track.joints[seen][0].mean(0)
-    joints = np.where(seen[:, None, None], track.joints - origin, 0.0)
+    origin = track.joints[is_seen][0].mean(0)
+    joints = np.where(is_seen[:, None, None], track.joints - origin, 0.0)
     weight = np.ones((len(times), 1))
-    strength = np.broadcast_to(_FIRST_SCALE * usual, precision.shape)
+    strength = np.broadcast_to(_FIRST_SCALE * usual_strength, precision.shape)
     for k in range(_ROUNDS):
         if k >= _ROUNDS - _LEARNED:
-            strength = learn_strength(times, joints, precision * weight, usual)
+            strength = learn_strength(times, joints, precision * weight, usual_strength)
         path, variance = smooth_joints(times, joints, precision * weight, strength)
         weight = frame_weights(path - joints, precision)
     bones = rigid_bones(track.skeleton)
-    if seen.sum() >= LEAST_FRAMES and len(bones):
-        lengths = lengths_of(measured(joints[seen], spread[seen] ** 2, bones).sum(0), bones, track.skeleton.flip)
+    if is_seen.sum() >= LEAST_FRAMES and len(bones):
+        lengths = lengths_of(measured(joints[is_seen], spread[is_seen] ** 2, bones).sum(0), bones, track.skeleton.flip)
         path = keep_lengths(path, variance, bones, lengths)
-    return filled_in(track, path + origin, steady_spread(variance, (spread**-2).sum(0) / seen.sum()))
+    return filled_in(track, path + origin, steady_spread(variance, (spread**-2).sum(0) / is_seen.sum()))
 
 
 def known_spread(spread: np.ndarray | None, seen: np.ndarray, count: int) -> np.ndarray:
@@ -82,20 +82,20 @@ def settled(track: TrackPoses) -> TrackPoses:
     rows = np.flatnonzero(track.seen)
     variance = known_spread(track.spread, track.seen, len(track.skeleton))[rows] ** 2
     confidence = None if track.confidence is None else track.confidence[rows]
-    turned = rows[exchanged(track.times[rows], track.joints[rows], variance, confidence, track.skeleton)]
+    flipped_rows = rows[exchanged(track.times[rows], track.joints[rows], variance, confidence, track.skeleton)]
     flip = np.array(track.skeleton.flip)
     values = {name: getattr(track, name) for name in ("joints", "spread", "visible", "confidence")}
     for name, value in values.items():
         if value is not None:
             values[name] = value.copy()
-            values[name][turned] = value[turned][:, flip]
+            values[name][flipped_rows] = value[flipped_rows][:, flip]
     return replace(track, **values)
 
 
 def frame_weights(offset: np.ndarray, precision: np.ndarray, freedom: float = _FREEDOM) -> np.ndarray:
     """(..., 1): how far a frame is trusted whose joints are off by (..., J, 3) m with precision (..., J) 1/m^2."""
-    off = ((offset**2).sum(-1) * precision).mean(-1, keepdims=True)
-    return (freedom + 3) / (freedom + off)
+    squared_error = ((offset**2).sum(-1) * precision).mean(-1, keepdims=True)
+    return (freedom + 3) / (freedom + squared_error)
 
 
 def likely_hit(spread: np.ndarray) -> np.ndarray:
@@ -105,18 +105,18 @@ def likely_hit(spread: np.ndarray) -> np.ndarray:
 
 def filled_in(given: TrackPoses, joints: np.ndarray, spread: np.ndarray) -> TrackPoses:
     """A track with smoothed joints (T, J, 3) m and spread (T, J) m where it was seen or may be filled in."""
-    seen, times = given.seen, given.times
-    rows = np.flatnonzero(seen)
-    after = np.searchsorted(rows, np.arange(len(seen)))
-    before = np.searchsorted(rows, np.arange(len(seen)), side="right") - 1
-    since = np.where(before >= 0, times - times[rows[before.clip(0)]], np.inf)
-    until = np.where(after < len(rows), times[rows[after.clip(0, len(rows) - 1)]] - times, np.inf)
-    known = seen | (since + until <= MAX_GAP) | (np.minimum(since, until) <= _MAX_BEYOND)
-    filled = known & ~seen
-    spread = np.where(known[:, None], spread, np.nan)
-    visible = None if given.visible is None else np.where(filled[:, None], 0.0, given.visible)
+    is_seen, times = given.seen, given.times
+    rows = np.flatnonzero(is_seen)
+    next_index = np.searchsorted(rows, np.arange(len(is_seen)))
+    previous_index = np.searchsorted(rows, np.arange(len(is_seen)), side="right") - 1
+    time_since = np.where(previous_index >= 0, times - times[rows[previous_index.clip(0)]], np.inf)
+    time_until = np.where(next_index < len(rows), times[rows[next_index.clip(0, len(rows) - 1)]] - times, np.inf)
+    is_known = is_seen | (time_since + time_until <= MAX_GAP) | (np.minimum(time_since, time_until) <= _MAX_BEYOND)
+    is_filled = is_known & ~is_seen
+    spread = np.where(is_known[:, None], spread, np.nan)
+    visible = None if given.visible is None else np.where(is_filled[:, None], 0.0, given.visible)
     confidence = None
     if given.confidence is not None:
-        confidence = np.where(filled[:, None], likely_hit(spread), given.confidence)
-    joints = np.where(known[:, None, None], joints, np.nan)
-    return replace(given, joints=joints, spread=spread, visible=visible, confidence=confidence, filled=filled)
+        confidence = np.where(is_filled[:, None], likely_hit(spread), given.confidence)
+    joints = np.where(is_known[:, None, None], joints, np.nan)
+    return replace(given, joints=joints, spread=spread, visible=visible, confidence=confidence, filled=is_filled)

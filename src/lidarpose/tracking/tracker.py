@@ -80,14 +80,14 @@ class _Tracks:
 
     def after(self, seconds: float) -> "_Tracks":
         """Where everybody is expected later: constant velocity, changed by white noise."""
-        move = np.array([[1.0, seconds], [0.0, 1.0]])
+        transition = np.array([[1.0, seconds], [0.0, 1.0]])
         # integrals of white noise of acceleration
         noise = np.array([[seconds**3 / 3, seconds**2 / 2], [seconds**2 / 2, seconds]])
-        moved = self.take(np.arange(len(self)))
-        moved.state = self.state @ move.T
-        moved.covariance = move @ self.covariance @ move.T + noise * SPEED_CHANGE[:, None, None] ** 2
-        moved.age = self.age + seconds
-        return moved
+        later_tracks = self.take(np.arange(len(self)))
+        later_tracks.state = self.state @ transition.T
+        later_tracks.covariance = transition @ self.covariance @ transition.T + noise * SPEED_CHANGE[:, None, None] ** 2
+        later_tracks.age = self.age + seconds
+        return later_tracks
 
 
 class Tracker:
@@ -131,20 +131,20 @@ class Tracker:
         detections = _of_boxes([*boxes, *weak_boxes])
         is_weak = np.arange(len(detections)) >= len(boxes)
         ids = np.full(len(detections), -1)
-        others = np.flatnonzero(~_repeats(detections, is_weak))
-        detections, is_weak = detections.take(others), is_weak[others]
+        kept_rows = np.flatnonzero(~_repeats(detections, is_weak))
+        detections, is_weak = detections.take(kept_rows), is_weak[kept_rows]
         rows, columns = assign(_costs(tracks, detections))
         _correct(tracks, rows, detections, columns)
-        begins = np.setdiff1d(np.arange(len(detections)), columns)
-        track = np.empty(len(detections), int)
-        track[columns], track[begins] = rows, len(tracks) + np.arange(len(begins))
-        tracks = tracks.joined(detections.take(begins))
+        new_rows = np.setdiff1d(np.arange(len(detections)), columns)
+        track_rows = np.empty(len(detections), int)
+        track_rows[columns], track_rows[new_rows] = rows, len(tracks) + np.arange(len(new_rows))
+        tracks = tracks.joined(detections.take(new_rows))
         # whom only weak boxes showed so far is nobody yet, but keeps them from going to others
-        numbered = track[~is_weak & (tracks.id[track] < 0)]
-        tracks.id[numbered] = self._next_id + np.arange(len(numbered))
-        self._next_id += len(numbered)
+        new_tracks = track_rows[~is_weak & (tracks.id[track_rows] < 0)]
+        tracks.id[new_tracks] = self._next_id + np.arange(len(new_tracks))
+        self._next_id += len(new_tracks)
         self._tracks = tracks
-        ids[others] = tracks.id[track]
+        ids[kept_rows] = tracks.id[track_rows]
         return ids.tolist()
 
     def predicted(self, time: float) -> list[TrackState]:
@@ -172,18 +172,20 @@ class Tracker:
         """All that the tracker knows, as JSON holds it."""
         tracks = {field.name: getattr(self._tracks, field.name).tolist() for field in fields(_Tracks)}
         names = ("max_gap", "jumps_back")
-        own = {name: getattr(self, name) for name in names}
-        return own | {"time": self._time, "next_id": self._next_id, "tracks": tracks}
+        settings = {name: getattr(self, name) for name in names}
+        return settings | {"time": self._time, "next_id": self._next_id, "tracks": tracks}
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> "Tracker":
         """The tracker whose `state()` this is: it goes on as that one would."""
         tracker = cls(max_gap=state["max_gap"])
         tracker.jumps_back, tracker._time, tracker._next_id = state["jumps_back"], state["time"], state["next_id"]
-        empty = tracker._tracks
+        empty_tracks = tracker._tracks
         tracker._tracks = _Tracks(
             **{
-                name: np.array(values, getattr(empty, name).dtype).reshape(-1, *getattr(empty, name).shape[1:])
+                name: np.array(values, getattr(empty_tracks, name).dtype).reshape(
+                    -1, *getattr(empty_tracks, name).shape[1:]
+                )
                 for name, values in state["tracks"].items()
             }
         )
@@ -230,15 +232,15 @@ def _of_boxes(boxes: Sequence[Box]) -> _Tracks:
 def _repeats(detections: _Tracks, is_weak: np.ndarray) -> np.ndarray:
     """(B,) bool: weak boxes beside one that is not: the same person again."""
     places = detections.state[:, :2, 0]
-    apart = np.linalg.norm(places[:, None] - places[~is_weak], axis=-1)
-    return is_weak & (apart < _REPEATED).any(1)
+    distances = np.linalg.norm(places[:, None] - places[~is_weak], axis=-1)
+    return is_weak & (distances < _REPEATED).any(1)
 
 
 def _costs(tracks: _Tracks, detections: _Tracks) -> np.ndarray:
     """(N, B): what it costs that a track has a box, below 0 where that is better than neither; inf where it cannot."""
-    off = detections.state[None, :, :, 0] - tracks.state[:, None, :, 0]
+    offset = detections.state[None, :, :, 0] - tracks.state[:, None, :, 0]
     variance = tracks.covariance[:, None, :, 0, 0] + detections.covariance[None, :, :, 0, 0]
-    distance = (off**2 / variance).sum(-1)
+    distance = (offset**2 / variance).sum(-1)
     cost = distance + np.log(variance).sum(-1) - _LEAST_LIKELY
     return np.where((distance < _GATE) & (cost < 0), cost, np.inf)
 
@@ -248,8 +250,8 @@ def _correct(tracks: _Tracks, rows: np.ndarray, detections: _Tracks, columns: np
     covariance = tracks.covariance[rows]
     variance = covariance[..., 0, 0] + detections.covariance[columns][..., 0, 0]
     gain = covariance[..., 0] / variance[..., None]
-    off = detections.state[columns, :, 0] - tracks.state[rows, :, 0]
-    tracks.state[rows] += gain * off[..., None]
+    offset = detections.state[columns, :, 0] - tracks.state[rows, :, 0]
+    tracks.state[rows] += gain * offset[..., None]
     tracks.covariance[rows] -= gain[..., :, None] * gain[..., None, :] * variance[..., None, None]
     # after a few sightings their plain mean, then the newest weigh most
     weight = np.maximum(1 - np.exp(-tracks.age[rows] / _SMOOTHING), 1 / (tracks.sightings[rows] + 1))[:, None]

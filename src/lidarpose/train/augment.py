@@ -11,7 +11,7 @@ import numpy as np
 
 from lidarpose.errors import check_name
 from lidarpose.eval.protocols import jittered, released_view
-from lidarpose.geometry import rotation_about
+from lidarpose.geometry import axis_angle_to_matrix, rotation_about, rotation_vector
 from lidarpose.models.voxelize import view_features
 from lidarpose.sample import FEWEST_OF_SECOND, LabeledSample, Pose, Sample, center_of
 from lidarpose.skeleton import BODY26, SMPL24
@@ -121,6 +121,7 @@ class Augmentation:
 
 AUGMENTATIONS = {
     "none": Augmentation(),
+    "turn": Augmentation(turn=1.0),
     # Paper: none are named; those of the released fine-tuning. Its box of HumanM3 knows the joints
     "paper": Augmentation(released=True, turn=0.5, scale=0.1, flip=0.3, jitter=0.005, drop=0.5),
     # LiDAR-HMR's, of PRN and LPFormer
@@ -130,7 +131,7 @@ AUGMENTATIONS = {
 
 
 def augmentation(name: str) -> Augmentation:
-    """A named augmentation: none, paper, lidarhmr or default."""
+    """A named augmentation: one of `AUGMENTATIONS`."""
     check_name("augmentation", name, AUGMENTATIONS)
     return AUGMENTATIONS[name]
 
@@ -158,8 +159,8 @@ def people_in(sample: Sample) -> np.ndarray:
 
 def second_person_label(others: int, count: int) -> float:
     """Whether a crop of so many points shows a second person, on whom `others` of them are: 0, 1 or NaN for unclear."""
-    known = not 0 < others < max(FEWEST_OF_SECOND, 0.1 * count)
-    return float(others > 0) if known else np.nan
+    is_clear = not 0 < others < max(FEWEST_OF_SECOND, 0.1 * count)
+    return float(others > 0) if is_clear else np.nan
 
 
 def object_example(sample: Sample, rng: np.random.Generator, *, refined: float = REFINED) -> Example:
@@ -189,16 +190,16 @@ def augmented(sample: LabeledSample, kind: Augmentation, rng: np.random.Generato
     points, joints = sample.points - center, sample.joints - center
     yaw = rng.uniform(-kind.angle, kind.angle)
     R = rotation_about("z", yaw if rng.random() < kind.turn else 0.0) * (1 + kind.scale * rng.uniform(-1, 1))
-    mirrors = rng.random(2) < kind.flip
-    R = np.diag([*np.where(mirrors, -1.0, 1.0), 1.0]) @ R
-    if mirrors.sum() == 1:
+    is_mirrored = rng.random(2) < kind.flip
+    R = np.diag([*np.where(is_mirrored, -1.0, 1.0), 1.0]) @ R
+    if is_mirrored.sum() == 1:
         flip = list(BODY26.flip)
         joints, visible, part = joints[flip], visible[flip], FLIP_PART[part + 1]
-    points, joints, toward = points @ R.T, joints @ R.T, view[:3] @ R.T
-    view = np.concatenate([toward / max(float(np.linalg.norm(toward)), 1e-9), view[3:]]).astype(np.float32)
+    points, joints, direction = points @ R.T, joints @ R.T, view[:3] @ R.T
+    view = np.concatenate([direction / max(float(np.linalg.norm(direction)), 1e-9), view[3:]]).astype(np.float32)
     if rng.random() < kind.drop:
-        keep = random_keep(len(points), share=0.2, rng=rng)
-        points, part = points[keep], part[keep]
+        keep_mask = random_keep(len(points), share=0.2, rng=rng)
+        points, part = points[keep_mask], part[keep_mask]
     if kind.jitter:
         points = jitter(points, sigma=kind.jitter, clip=4 * kind.jitter, rng=rng)
     if rng.random() < kind.strays:
@@ -207,39 +208,50 @@ def augmented(sample: LabeledSample, kind: Augmentation, rng: np.random.Generato
 
 
 def clip_example(
-    samples: Sequence[Sample], rng: np.random.Generator, *, trans_center: bool = False, refined: float = REFINED
+    samples: Sequence[Sample],
+    rng: np.random.Generator,
+    *,
+    trans_center: bool = False,
+    refined: float = REFINED,
+    turn: bool = False,
 ) -> ClipExample:
     """Frames of one person, with rotations and the joints of body26, as a training step shows them.
 
-    The centers are those of the points, or guesses of the pelvis (refined: how often); trans_center: SMPL's trans.
+    The centers are those of the points, or guesses of the pelvis (refined: how often); trans_center: SMPL's trans;
+    turn: all frames are turned about z by one angle.
     """
-    about_pelvis = rng.random() < refined
+    is_about_pelvis = rng.random() < refined
+    R = rotation_about("z", rng.uniform(-np.pi, np.pi)) if turn else np.eye(3)
     frames, clouds = [], []
     for sample in samples:
         assert sample.pose is not None
         joints, center = sample.pose.joints, sample.center
         if trans_center and sample.translation is not None:
             center = sample.translation
-        elif about_pelvis:
+        elif is_about_pelvis:
             center = joints[_PELVIS] + rng.normal(0, PELVIS_ERROR, 3)
-        points = sample.points - center
+        points = (sample.points - center) @ R.T
         part, visible = np.full(len(points), UNKNOWN_PART), np.full(len(joints), np.nan, np.float32)
         view = view_features(center, None)
-        frames.append(_example(rng, points, joints - center, part=part, visible=visible, view=view))
-        around = (
-            np.zeros((0, 3)) if cloud is None else cloud - center for cloud in (sample.background, sample.neighbors)
+        frames.append(_example(rng, points, (joints - center) @ R.T, part=part, visible=visible, view=view))
+        other_clouds = (
+            np.zeros((0, 3)) if cloud is None else (cloud - center) @ R.T
+            for cloud in (sample.background, sample.neighbors)
         )
-        clouds.append((points, *around))
+        clouds.append((points, *other_clouds))
+    rotations = np.stack([np.asarray(sample.rotations) for sample in samples])
+    if turn:
+        rotations[:, 0] = [rotation_vector(R @ root) for root in axis_angle_to_matrix(rotations[:, 0])]
     return ClipExample(
         frames=tuple(frames),
-        rotations=np.stack([np.asarray(sample.rotations) for sample in samples]),
+        rotations=rotations,
         clouds=dict(zip(("person", "background", "neighbors"), zip(*clouds, strict=True), strict=True)),
     )
 
 
-def _example(rng: np.random.Generator, points: np.ndarray, joints: np.ndarray, **known: np.ndarray) -> Example:
+def _example(rng: np.random.Generator, points: np.ndarray, joints: np.ndarray, **arrays: np.ndarray) -> Example:
     seed = int(rng.integers(2**31))
-    return Example(points=points.astype(np.float32), joints=joints.astype(np.float32), seed=seed, **known)
+    return Example(points=points.astype(np.float32), joints=joints.astype(np.float32), seed=seed, **arrays)
 
 
 def disturbed(sample: _Sample, *, strays: float, noise: float, rng: np.random.Generator) -> _Sample:
@@ -253,8 +265,8 @@ def disturbed(sample: _Sample, *, strays: float, noise: float, rng: np.random.Ge
     assert part is not None
     chance = rng.random(2)
     if chance[0] < strays:
-        most = min(_MOST_CLUTTER, _CLUTTER // 3 + len(points))
-        points, part = _with_clutter(points, part, sample.center, most, rng)
+        max_clutter = min(_MOST_CLUTTER, _CLUTTER // 3 + len(points))
+        points, part = _with_clutter(points, part, sample.center, max_clutter, rng)
         points = points.astype(np.float32)
     if chance[1] < noise:
         sigma = np.exp(rng.uniform(*np.log(_NOISE)))
@@ -271,9 +283,9 @@ def _own_center(sample: Sample, points: np.ndarray) -> np.ndarray:
 
 
 def _with_clutter(
-    points: np.ndarray, part: np.ndarray, center: np.ndarray, most: int, rng: np.random.Generator
+    points: np.ndarray, part: np.ndarray, center: np.ndarray, max_clutter: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    clutter = noise_clusters(center, most=most, rng=rng)
+    clutter = noise_clusters(center, most=max_clutter, rng=rng)
     return np.concatenate([points, clutter]), np.concatenate([part, np.zeros(len(clutter), part.dtype)])
 
 
@@ -281,21 +293,21 @@ def seen(joints: np.ndarray, points: np.ndarray) -> np.ndarray:
     """joints (J, 3) m, points (n, 3) m on the body -> (J,) bool: some point lies within `SEEN` of the joint."""
     if not len(points):
         return np.zeros(len(joints), bool)
-    square = (joints**2).sum(1)[:, None] + (points**2).sum(1) - 2 * joints @ points.T
-    return square.min(1) < SEEN**2
+    square_distance = (joints**2).sum(1)[:, None] + (points**2).sum(1) - 2 * joints @ points.T
+    return square_distance.min(1) < SEEN**2
 
 
 def _view(sample: LabeledSample, kind: Augmentation, rng: np.random.Generator) -> tuple[LabeledSample, np.ndarray]:
     """The sample's crop and its center (3,) m."""
     if kind.released:
-        keep, center = released_view(sample.points, sample.joints, sample.centers, sample.box)
-        return _cropped(sample, keep), sample.center if center is None else center
-    keep = np.ones(len(sample.points), bool)
+        keep_mask, center = released_view(sample.points, sample.joints, sample.centers, sample.box)
+        return _cropped(sample, keep_mask), sample.center if center is None else center
+    keep_mask = np.ones(len(sample.points), bool)
     if sample.box is not None and rng.random() < kind.box:
-        keep &= jittered(sample.box, rng).contains(sample.points)
+        keep_mask &= jittered(sample.box, rng).contains(sample.points)
     if rng.random() < kind.cut:
-        keep &= half_space_keep(sample.points, most=0.4, rng=rng)
-    sample = _cropped(sample, keep)
+        keep_mask &= half_space_keep(sample.points, most=0.4, rng=rng)
+    sample = _cropped(sample, keep_mask)
     center = _own_center(sample, sample.points)
     # where the pelvis is not labeled, half way between the hips: what a second pass centers on
     pelvis = sample.joints[_PELVIS]
@@ -305,16 +317,16 @@ def _view(sample: LabeledSample, kind: Augmentation, rng: np.random.Generator) -
     return sample, center
 
 
-def _cropped(sample: LabeledSample, keep: np.ndarray) -> LabeledSample:
-    if keep.all() or keep.sum() < LEAST_POINTS:
+def _cropped(sample: LabeledSample, keep_mask: np.ndarray) -> LabeledSample:
+    if keep_mask.all() or keep_mask.sum() < LEAST_POINTS:
         return sample
     part, visible = part_and_visible(sample)
     # a joint whose points are all gone is not seen any more; points whose part is unknown count as body
-    body = part != 0
-    gone = seen(sample.joints, sample.points[body]) & ~seen(sample.joints, sample.points[keep & body])
-    visible = np.where(gone & (visible == 1), np.float32(0), visible)
+    is_body = part != 0
+    is_lost = seen(sample.joints, sample.points[is_body]) & ~seen(sample.joints, sample.points[keep_mask & is_body])
+    visible = np.where(is_lost & (visible == 1), np.float32(0), visible)
     pose = Pose(joints=sample.joints, visible=visible, skeleton=BODY26, frame="sensor")
-    return replace(sample, points=sample.points[keep], part=part[keep], pose=pose)
+    return replace(sample, points=sample.points[keep_mask], part=part[keep_mask], pose=pose)
 
 
 def part_and_visible(sample: LabeledSample) -> tuple[np.ndarray, np.ndarray]:

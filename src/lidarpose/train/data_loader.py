@@ -106,18 +106,18 @@ class SyntheticSource:
         scene = self._generator.config
         if self.objects and rng.random() < self.objects:
             # several scans are as frequent as of people, of whom they depend on the difficulty
-            hard = self._difficulty(index, rng) if scene.varied else None
-            thing, _ = draw_object(scene, self.seed, index, hard=hard)
-            return object_example(thing, rng, refined=self.refined)
-        hard = self._difficulty(index, rng)
-        sample = self._generator.person(self.seed, index, hard=hard).sample
-        shown = example(disturbed(sample, strays=self.strays, noise=self.noise, rng=rng), rng, refined=self.refined)
-        return replace(shown, person=people_in(sample)) if self.objects else shown
+            difficulty = self._difficulty(index, rng) if scene.varied else None
+            object_sample, _ = draw_object(scene, self.seed, index, hard=difficulty)
+            return object_example(object_sample, rng, refined=self.refined)
+        difficulty = self._difficulty(index, rng)
+        sample = self._generator.person(self.seed, index, hard=difficulty).sample
+        result = example(disturbed(sample, strays=self.strays, noise=self.noise, rng=rng), rng, refined=self.refined)
+        return replace(result, person=people_in(sample)) if self.objects else result
 
     def _difficulty(self, index: int, rng: np.random.Generator) -> float:
         """Of example `index`, in [0, 1]."""
-        hard = min(index / self.easy, 1.0) if self.easy else 1.0
-        return hard if self.scene in _OF_ONE_DIFFICULTY else hard * np.sqrt(rng.random())
+        ceiling = min(index / self.easy, 1.0) if self.easy else 1.0
+        return ceiling if self.scene in _OF_ONE_DIFFICULTY else ceiling * np.sqrt(rng.random())
 
     def clip(self, index: int, *, trans_center: bool) -> ClipExample:
         """A clip of somebody as difficult as the scene is."""
@@ -164,22 +164,23 @@ class StoredSource(_OfDataset):
 
 @dataclass(frozen=True, kw_only=True)
 class ClipSource(_OfDataset):
-    """The clips of datasets. clips, skipped: see `InMemoryDataset.clips`; trans_center: see `clip_example`."""
+    """The clips of datasets. clips, skipped: see `InMemoryDataset.clips`; trans_center, turn: see `clip_example`."""
 
     clips: np.ndarray
     trans_center: bool
+    turn: bool = False
     skipped: Counter[str] = field(default_factory=Counter)
 
     def example(self, index: int) -> ClipExample:
         clip, rng = self._drawn(index, len(self.clips))
         samples = [self._sample(row, rng) for row in self.clips[clip]]
-        return clip_example(samples, rng, trans_center=self.trans_center)
+        return clip_example(samples, rng, trans_center=self.trans_center, turn=self.turn)
 
     def some(self, count: int) -> list[ClipExample]:
         """So many clips at most, evenly spread, to validate on: centered on their points."""
         rng = np.random.default_rng(self.seed)
-        chosen = np.unique(np.linspace(0, len(self.clips) - 1, min(count, len(self.clips))).astype(int))
-        clips = [[self.dataset.sample(row) for row in self.clips[clip]] for clip in chosen]
+        clip_rows = np.unique(np.linspace(0, len(self.clips) - 1, min(count, len(self.clips))).astype(int))
+        clips = [[self.dataset.sample(row) for row in self.clips[clip]] for clip in clip_rows]
         return [clip_example(clip, rng, trans_center=self.trans_center, refined=0.0) for clip in clips]
 
 
@@ -198,8 +199,8 @@ class MixedSource:
     share: float
 
     def example(self, index: int) -> Any:
-        before, after = floor(index * self.share), floor((index + 1) * self.share)
-        return self.other.example(before) if after > before else self.main.example(index - before)
+        other_index, next_index = floor(index * self.share), floor((index + 1) * self.share)
+        return self.other.example(other_index) if next_index > other_index else self.main.example(index - other_index)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,8 +225,8 @@ class Chunks(IterableDataset):
 
     def __iter__(self) -> Iterator[list[Any]]:
         worker = get_worker_info()
-        first, stride = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        for chunk in range(self.start + first, chunks_of(self.steps), stride):
+        offset, stride = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        for chunk in range(self.start + offset, chunks_of(self.steps), stride):
             yield self.batches_of(chunk)
 
     def batches_of(self, chunk: int) -> list[Any]:
@@ -235,15 +236,15 @@ class Chunks(IterableDataset):
             return self._batches_of(chunk)
 
     def _batches_of(self, chunk: int) -> list[Any]:
-        first, batches = chunk * BATCHES * self.batch, min(self.steps - chunk * BATCHES, BATCHES)
-        lanes = lanes_of(self.batch, self.ranks)
-        mine = []
-        for lane in range(self.rank, lanes, self.ranks):
-            numbers = range(first + lane, first + batches * self.batch, lanes)
-            mine.append(sorted(map(self.source.example, numbers), key=attrgetter("size")))
-        share = self.batch // lanes
-        order = np.random.default_rng([self.seed, RandomStream.BATCH_ORDER, chunk]).permutation(batches)
-        return [self.objective.collate([e for lane in mine for e in lane[k * share : (k + 1) * share]]) for k in order]
+        first_number, batch_count = chunk * BATCHES * self.batch, min(self.steps - chunk * BATCHES, BATCHES)
+        lane_count = lanes_of(self.batch, self.ranks)
+        lanes = []
+        for offset in range(self.rank, lane_count, self.ranks):
+            numbers = range(first_number + offset, first_number + batch_count * self.batch, lane_count)
+            lanes.append(sorted(map(self.source.example, numbers), key=attrgetter("size")))
+        share = self.batch // lane_count
+        order = np.random.default_rng([self.seed, RandomStream.BATCH_ORDER, chunk]).permutation(batch_count)
+        return [self.objective.collate([e for lane in lanes for e in lane[k * share : (k + 1) * share]]) for k in order]
 
 
 def chunks_of(steps: int) -> int:
@@ -254,11 +255,11 @@ def chunks_of(steps: int) -> int:
 def lanes_of(batch: int, ranks: int = 1) -> int:
     """How many lanes a chunk has, whatever the number of processes. Raises InputError where they cannot be shared out
     evenly among so many."""
-    lanes = gcd(batch, LANES)
-    if lanes % ranks:
-        fit = ", ".join(str(n) for n in range(1, lanes + 1) if lanes % n == 0)
-        raise InputError(f"a batch of {batch} can be shared out among {fit} processes, got {ranks}: change --batch")
-    return lanes
+    lane_count = gcd(batch, LANES)
+    if lane_count % ranks:
+        counts = ", ".join(str(n) for n in range(1, lane_count + 1) if lane_count % n == 0)
+        raise InputError(f"a batch of {batch} can be shared out among {counts} processes, got {ranks}: change --batch")
+    return lane_count
 
 
 def loader(chunks: Chunks, *, workers: int) -> DataLoader:

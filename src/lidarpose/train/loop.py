@@ -104,9 +104,9 @@ def train(
     _check(device, tracker)
     if resume:
         folder = run_dir.latest(recipe.kind) if folder is None else Path(folder)
-        stored, before = run_dir.read_config(folder, type(recipe))
-        run_dir.check_resumable(folder, stored, recipe)
-        command = "; then ".join(filter(None, (before, command)))
+        stored_recipe, earlier_command = run_dir.read_config(folder, type(recipe))
+        run_dir.check_resumable(folder, stored_recipe, recipe)
+        command = "; then ".join(filter(None, (earlier_command, command)))
     elif folder is not None:
         run_dir.check_new(Path(folder))
     elif int(os.environ.get("WORLD_SIZE", "1")) > 1:
@@ -146,9 +146,9 @@ def _warn(text: str) -> None:
 
 
 def _accelerator(recipe: Recipe, on_cpu: bool, tracker: str | None) -> Accelerator:
-    half = recipe.precision == "bf16" or recipe.precision == "auto" and not on_cpu and torch.cuda.is_bf16_supported()
+    is_bf16 = recipe.precision == "bf16" or recipe.precision == "auto" and not on_cpu and torch.cuda.is_bf16_supported()
     try:
-        return Accelerator(cpu=on_cpu, mixed_precision="bf16" if half else "no", log_with=tracker)
+        return Accelerator(cpu=on_cpu, mixed_precision="bf16" if is_bf16 else "no", log_with=tracker)
     except ValueError as error:
         # of a machine that has no bf16, or a launcher that asks for what is not there
         reason = str(error).partition("\n")[0]
@@ -198,14 +198,14 @@ class _Run:
         """Loads the state of the run that was stopped; stays at the beginning, where none was saved yet."""
         if (self.folder / STATE).is_file():
             progress = run_dir.load_state(self.folder / STATE, self.network, self.mean, self.optimizers)
-            done, self.seconds = progress["steps"], progress["seconds"]
-            if done > self.steps:
-                seen = done * self.recipe.batch
+            steps, self.seconds = progress["steps"], progress["seconds"]
+            if steps > self.steps:
+                people_seen = steps * self.recipe.batch
                 raise InputError(
-                    f"{self.folder}: the run has seen {seen:,} people already, got {self.setup.people:,} in all"
+                    f"{self.folder}: the run has seen {people_seen:,} people already, got {self.setup.people:,} in all"
                 )
             # a longer run makes the last chunk of a shorter one anew, whole
-            self.chunk = self.chunks if done == self.steps else done // BATCHES
+            self.chunk = self.chunks if steps == self.steps else steps // BATCHES
             self.best = float("inf") if progress["best"] is None else progress["best"]
             self.error = progress["validation"]
         elif self.is_main:
@@ -227,7 +227,7 @@ class _Run:
         """All that is left of the run, or until `stop` is asked for. Raises `Interrupted` in the latter case."""
         people, recipe = self.setup.people, self.recipe
         validate_every = recipe.validate or max(people // _VALIDATIONS, 1)
-        started = saved = time.monotonic()
+        start_time = save_time = time.monotonic()
         seconds_before = self.seconds
         with _dead_worker_named(), ExitStack() as stack:
             log = stack.enter_context(open(self.folder / LOG, "a")) if self.is_main else None
@@ -237,27 +237,27 @@ class _Run:
             chunks = self._chunks(self.accelerator.process_index, self.accelerator.num_processes)
             for batches in loader(chunks, workers=recipe.workers):
                 seen_before = self.seen
-                terms, stopping = self._chunk(batches, stop)
+                terms, is_stopping = self._chunk(batches, stop)
                 self._trained_on = batches
-                self.seconds = seconds_before + time.monotonic() - started
+                self.seconds = seconds_before + time.monotonic() - start_time
                 entry = {"people": self.seen, "seconds": round(self.seconds, 1)} | terms
-                last = self.chunk == self.chunks
-                if self.is_main and (last or self.seen // validate_every > seen_before // validate_every):
+                is_last = self.chunk == self.chunks
+                if self.is_main and (is_last or self.seen // validate_every > seen_before // validate_every):
                     entry |= self._validated()
                 self.accelerator.log({k: v for k, v in entry.items() if k != "people"}, step=self.seen)
                 bar.update(min(self.seen, people), self._note(terms))
                 if log is not None:
                     log.write(json.dumps(entry) + "\n")
                     log.flush()
-                    if last or stopping or time.monotonic() - saved > SAVE_EVERY:
+                    if is_last or is_stopping or time.monotonic() - save_time > SAVE_EVERY:
                         # the state must not be on the disk before the log
                         os.fsync(log.fileno())
                         self._save()
-                        saved = time.monotonic()
-                if stopping and not last:
+                        save_time = time.monotonic()
+                if is_stopping and not is_last:
                     # all processes take this branch: the request was shared with the losses
-                    where = ("--out " if recipe.kind == "finetune" else "") + shlex.quote(str(self.folder))
-                    remedy = f"go on with lidarpose {recipe.kind} {where} --resume"
+                    folder_option = ("--out " if recipe.kind == "finetune" else "") + shlex.quote(str(self.folder))
+                    remedy = f"go on with lidarpose {recipe.kind} {folder_option} --resume"
                     raise Interrupted(f"stopped after {self.seen:,} samples, saved: {remedy}", stop.number)
         self.accelerator.wait_for_everyone()
 
@@ -277,8 +277,8 @@ class _Run:
     def _note(self, terms: dict[str, float]) -> str:
         """What the progress bar shows."""
         loss = sum(value for name, value in terms.items() if name not in (*LOGGED, "gradient"))
-        shown = f"mpjpe {terms['mpjpe'] * 1e3:.0f} mm" if "mpjpe" in terms else f"AP {terms['ap']:.3f}"
-        note = f"loss {loss:.3f}, {shown}"
+        metric = f"mpjpe {terms['mpjpe'] * 1e3:.0f} mm" if "mpjpe" in terms else f"AP {terms['ap']:.3f}"
+        note = f"loss {loss:.3f}, {metric}"
         return note if self.error is None else f"{note}, validation {self.error:.0f} {self.setup.error_unit}"
 
     def _chunk(self, batches: list, stop: StopRequest) -> tuple[dict[str, float], bool]:
@@ -287,18 +287,18 @@ class _Run:
         terms = [self._step(arrays, k) for k, arrays in enumerate(batches)]
         names = list(terms[0])
         values = torch.stack([torch.stack([t[name] for name in names]) for t in terms])
-        asked = values.new_full((len(values), 1), float(stop.number > 0))
-        values, asked = self.accelerator.reduce(torch.cat([values, asked], 1), "mean").cpu().split((len(names), 1), 1)
-        broken = (~values.isfinite().all(1)).nonzero().flatten().tolist()
-        if broken:
+        flags = values.new_full((len(values), 1), float(stop.number > 0))
+        values, flags = self.accelerator.reduce(torch.cat([values, flags], 1), "mean").cpu().split((len(names), 1), 1)
+        bad_batches = (~values.isfinite().all(1)).nonzero().flatten().tolist()
+        if bad_batches:
             state = f"{STATE} is kept" if (self.folder / STATE).is_file() else "nothing was saved before"
             raise InputError(
-                f"the loss or its gradient is not finite in batch {broken[0]} of the {len(batches)} from person "
+                f"the loss or its gradient is not finite in batch {bad_batches[0]} of the {len(batches)} from person "
                 f"{self.seen} on: start in another folder with a lower --rate; {state}"
             )
         self.chunk += 1
         means = {name: round(value, 5) for name, value in zip(names, values.mean(0).tolist(), strict=True)}
-        return means, bool(asked.any())
+        return means, bool(flags.any())
 
     def _step(self, arrays: object, k: int) -> dict[str, Tensor]:
         step, recipe, accelerator = self.chunk * BATCHES + k, self.recipe, self.accelerator
@@ -330,11 +330,11 @@ class _Run:
 
     def _recent_batches(self) -> list:
         """All processes' batches of the last whole chunk: they follow from the step alone."""
-        whole = max(self.steps_done // BATCHES, 1) - 1
-        if whole == self.chunk - 1 and self.accelerator.num_processes == 1:
+        chunk = max(self.steps_done // BATCHES, 1) - 1
+        if chunk == self.chunk - 1 and self.accelerator.num_processes == 1:
             return self._trained_on
         # the last chunk may be a single batch, and other processes' batches are not here: made anew
-        return self._chunks().batches_of(whole)
+        return self._chunks().batches_of(chunk)
 
     def _validated(self) -> dict[str, float]:
         """On the main process; the weights of the best validation are kept."""

@@ -36,7 +36,7 @@ Config = NetworkConfig | DaptConfig | BaselineConfig
 PRETRAINED: dict[str, tuple[Any, Skeleton]] = {
     **{size: (config, SMPL24) for size, config in SIZES.items()},
     PAPER: (pretraining_config(), HUMAN15),
-    **{size: (reduced(pretraining_config()), HUMAN15) for size, reduced in REDUCED.items()},
+    **{size: (reduce_config(pretraining_config()), HUMAN15) for size, reduce_config in REDUCED.items()},
     "prn": (PrnConfig(), HUMAN15),
     "lpformer": (LpformerConfig(), HUMAN15),
     "lidarcap": (LidarcapConfig(), SMPL24),
@@ -90,12 +90,12 @@ def expanded_network(init: str, config: Config) -> tuple[Callable[[], nn.Module]
     if not isinstance(config, NetworkConfig):
         raise InputError("init is for the package's own networks: the paper's begin at random")
     path = weights_path(init)
-    smaller, header = load_checkpoint(path)
-    if not isinstance(smaller, PoseNet):
+    small_network, header = load_checkpoint(path)
+    if not isinstance(small_network, PoseNet):
         raise file_error(path, "holds a network of the paper: --init names one of the package's own")
     # tried at once, so that an error comes before a folder is made
-    expand_weights(smaller, config)
-    return partial(expand_weights, smaller, config), header.card
+    expand_weights(small_network, config)
+    return partial(expand_weights, small_network, config), header.card
 
 
 def initial_network(recipe: Finetune) -> tuple[Any, dict]:
@@ -117,44 +117,48 @@ def finetuned_network(
 ) -> tuple[Config, Callable[[], nn.Module]]:
     """The configuration for a dataset's joints, and what makes the network with the weights that it begins with.
     trained: None for random weights."""
-    own = PRETRAINED[recipe.size][0] if trained is None else trained.config
+    base_config = PRETRAINED[recipe.size][0] if trained is None else trained.config
     # of anchors the package's own networks say below what to do instead
-    foreign = ("neck", "head", "keep_anchors") if isinstance(own, BaselineConfig) else ("neck", "head")
-    for name in () if isinstance(own, DaptConfig) else foreign:
+    dapt_settings = ("neck", "head", "keep_anchors") if isinstance(base_config, BaselineConfig) else ("neck", "head")
+    for name in () if isinstance(base_config, DaptConfig) else dapt_settings:
         if getattr(recipe, name) != getattr(Finetune, name):
-            raise InputError(f"{name} is of the paper's network, {own.name} has none: leave it away")
-    if isinstance(own, BaselineConfig):
-        named = own if isinstance(own, LidarcapConfig) else replace(own, joints=joints.joints)
-        config = _with_options(named, recipe.options)
-        if trained is not None and config.width_divisor != own.width_divisor:
-            raise InputError(f"--init has weights for width_divisor={own.width_divisor}: leave that option away")
+            raise InputError(f"{name} is of the paper's network, {base_config.name} has none: leave it away")
+    if isinstance(base_config, BaselineConfig):
+        baseline = (
+            base_config if isinstance(base_config, LidarcapConfig) else replace(base_config, joints=joints.joints)
+        )
+        config = _with_options(baseline, recipe.options)
+        if trained is not None and config.width_divisor != base_config.width_divisor:
+            raise InputError(
+                f"--init has weights for width_divisor={base_config.width_divisor}: leave that option away"
+            )
         return config, partial(build, config) if trained is None else partial(with_joints, trained, config)
-    own = _with_options(own, recipe.options)
-    if isinstance(own, NetworkConfig):
+    base_config = _with_options(base_config, recipe.options)
+    if isinstance(base_config, NetworkConfig):
         if not recipe.keep_anchors and trained is not None:
             raise InputError(
                 "keep_anchors=false is for the paper's network, and --init names one of the package's own: name a "
                 "checkpoint of pretrain --recipe paper, or leave --recipe paper and --keep-anchors away"
             )
-        return own, partial(PoseNet, own) if trained is None else lambda: trained
+        return base_config, partial(PoseNet, base_config) if trained is None else lambda: trained
     if not dataset:
         # synthesized people have every joint; the paper's network those that it is pre-trained on
         joints = HUMAN15
-    fitting = [c for c in CONFIGS.values() if c.bins and set(c.joints) == set(joints.joints)]
-    if not fitting:
+    candidates = [c for c in CONFIGS.values() if c.bins and set(c.joints) == set(joints.joints)]
+    if not candidates:
         raise InputError(f"the paper's network has no configuration for the joints of {joints.name}")
-    like = next((c for c in fitting if c.name == dataset), fitting[0])
+    template = next((c for c in candidates if c.name == dataset), candidates[0])
     if trained is None:
-        own = _with_neck(replace(own, bins=(), ranges=(), coordinates=True), recipe.neck)
+        base_config = _with_neck(replace(base_config, bins=(), ranges=(), coordinates=True), recipe.neck)
     # the paper fine-tunes by heatmaps alone, Table 3 by coordinates too; the neck prn knows no others
-    coordinates = recipe.head == "coordinates" or own.neck == "prn"
-    bins, ranges = ((), ()) if coordinates else (like.bins, like.ranges)
-    same = (own.joints, own.bins, own.ranges) == (like.joints, bins, ranges)
-    if trained is not None and recipe.keep_anchors and same and not (coordinates and own.parts):
+    coordinates = recipe.head == "coordinates" or base_config.neck == "prn"
+    bins, ranges = ((), ()) if coordinates else (template.bins, template.ranges)
+    is_same = (base_config.joints, base_config.bins, base_config.ranges) == (template.joints, bins, ranges)
+    if trained is not None and recipe.keep_anchors and is_same and not (coordinates and base_config.parts):
         # a network of this dataset already, as released ones are
-        return own, lambda: trained
+        return base_config, lambda: trained
     heads: dict[str, Any] = {"parts": 0, "coordinates": coordinates, "auxiliary": False}
-    config = replace(own, name=like.name, joints=like.joints, bins=bins, ranges=ranges, **heads)
+    config = replace(base_config, name=template.name, joints=template.joints, bins=bins, ranges=ranges, **heads)
     if trained is None:
         return config, partial(build, config)
     return config, partial(transferred, trained, config, keep_anchors=recipe.keep_anchors)
@@ -167,11 +171,11 @@ def _with_options(config: Any, options: tuple[str, ...]) -> Any:
         return config
     if not isinstance(config, BaselineConfig):
         raise InputError(f"options are of the baselines' networks, {config.name} has none: leave --options away")
-    known = [field.name for field in fields(config) if field.name != "joints"]
+    option_names = [field.name for field in fields(config) if field.name != "joints"]
     changes: dict[str, Any] = {}
     for option in options:
         name, _, value = option.partition("=")
-        check_name(f"option of {config.name}", name, known)
+        check_name(f"option of {config.name}", name, option_names)
         changes[name] = value or True
         with suppress(ValueError):
             changes[name] = json.loads(value)

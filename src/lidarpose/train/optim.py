@@ -29,16 +29,16 @@ def optimizers(network: nn.Module, recipe: Recipe) -> list[torch.optim.Optimizer
     betas: Any = recipe.betas
     settings: dict[str, Any] = {"lr": recipe.rate, "weight_decay": recipe.decay, "fused": True}
     if not (isinstance(network, PoseNet) and isinstance(recipe, PoseRecipe) and recipe.muon_rate):
-        kind = torch.optim.Adam if recipe.optimizer == "adam" else torch.optim.AdamW
+        optimizer_class = torch.optim.Adam if recipe.optimizer == "adam" else torch.optim.AdamW
         # the paper's: torch's own settings
-        return [kind(_groups(network, recipe), betas=betas or (0.9, 0.999), **settings)]
-    hidden: list[nn.Parameter] = []
-    other: list[nn.Parameter] = []
+        return [optimizer_class(_groups(network, recipe), betas=betas or (0.9, 0.999), **settings)]
+    hidden_matrices: list[nn.Parameter] = []
+    other_parameters: list[nn.Parameter] = []
     for name, value in network.named_parameters():
-        (other if value.ndim != 2 or any(end in name for end in _ENDS) else hidden).append(value)
+        (other_parameters if value.ndim != 2 or any(end in name for end in _ENDS) else hidden_matrices).append(value)
     return [
-        torch.optim.AdamW(other, betas=betas or (0.9, 0.98), **settings),
-        Muon(hidden, lr=recipe.muon_rate, weight_decay=recipe.decay, momentum=0.95),
+        torch.optim.AdamW(other_parameters, betas=betas or (0.9, 0.98), **settings),
+        Muon(hidden_matrices, lr=recipe.muon_rate, weight_decay=recipe.decay, momentum=0.95),
     ]
 
 
@@ -47,10 +47,10 @@ def _groups(network: nn.Module, recipe: Recipe) -> list[dict[str, Any]]:
     times = recipe.heatmap_rate if isinstance(recipe, PoseRecipe) and isinstance(network, DaptNet) else 1.0
     if times == 1:
         return [{"params": list(network.parameters())}]
-    named = dict(network.named_parameters())
-    heatmaps = [value for name, value in named.items() if name.startswith(_HEATMAPS)]
-    others = [value for name, value in named.items() if not name.startswith(_HEATMAPS)]
-    groups: list[dict[str, Any]] = [{"params": others}, {"params": heatmaps, "lr": times * recipe.rate, "times": times}]
+    parameters = dict(network.named_parameters())
+    heatmaps = [value for name, value in parameters.items() if name.startswith(_HEATMAPS)]
+    rest = [value for name, value in parameters.items() if not name.startswith(_HEATMAPS)]
+    groups: list[dict[str, Any]] = [{"params": rest}, {"params": heatmaps, "lr": times * recipe.rate, "times": times}]
     return [group for group in groups if group["params"]]
 
 
@@ -81,9 +81,9 @@ def set_rates(optimizers: list[torch.optim.Optimizer], recipe: Recipe, done: flo
 @torch.no_grad()
 def average(mean: dict[str, Tensor], network: nn.Module, step: int, ema: float) -> None:
     """Moves the running mean of the weights towards the network's, faster while the run is young. In place."""
-    keep = min(ema, (1 + step) / (10 + step))
-    values = dict(network.named_parameters())
-    torch._foreach_lerp_(list(mean.values()), [values[name] for name in mean], 1 - keep)
+    decay = min(ema, (1 + step) / (10 + step))
+    parameters = dict(network.named_parameters())
+    torch._foreach_lerp_(list(mean.values()), [parameters[name] for name in mean], 1 - decay)
 
 
 class Muon(torch.optim.Optimizer):
@@ -107,11 +107,11 @@ class Muon(torch.optim.Optimizer):
         if closure is not None:
             raise ValueError("Muon takes no closure")
         for group in self.param_groups:
-            alike: dict[tuple, list[Tensor]] = {}
+            matrices_by_shape: dict[tuple, list[Tensor]] = {}
             for matrix in group["params"]:
                 if matrix.grad is not None:
-                    alike.setdefault((matrix.shape, matrix.device, matrix.dtype), []).append(matrix)
-            for matrices in alike.values():
+                    matrices_by_shape.setdefault((matrix.shape, matrix.device, matrix.dtype), []).append(matrix)
+            for matrices in matrices_by_shape.values():
                 self._step(matrices, group)
 
     def _step(self, matrices: list[Tensor], group: dict) -> None:
@@ -122,8 +122,8 @@ class Muon(torch.optim.Optimizer):
         gradients = [matrix.grad for matrix in matrices if matrix.grad is not None]
         torch._foreach_lerp_(buffers, gradients, 1 - group["momentum"])
         # Nesterov: look one step ahead
-        ahead = torch._foreach_lerp(gradients, buffers, group["momentum"])
-        update = orthogonalized(torch.stack(ahead))
+        lookahead = torch._foreach_lerp(gradients, buffers, group["momentum"])
+        update = orthogonalized(torch.stack(lookahead))
         rows, columns = matrices[0].shape
         torch._foreach_mul_(matrices, 1 - group["lr"] * group["weight_decay"])
         torch._foreach_add_(matrices, list(update.unbind()), alpha=-group["lr"] * max(1, rows / columns) ** 0.5)
@@ -131,11 +131,11 @@ class Muon(torch.optim.Optimizer):
 
 def orthogonalized(matrices: Tensor) -> Tensor:
     """matrices (K, M, N) -> (K, M, N): their singular values brought near 1 by a Newton-Schulz iteration."""
-    tall = matrices.shape[1] > matrices.shape[2]
-    x = matrices.mT if tall else matrices
+    is_tall = matrices.shape[1] > matrices.shape[2]
+    x = matrices.mT if is_tall else matrices
     x = x / x.norm(dim=(1, 2), keepdim=True).clamp(min=_EPS)
     a, b, c = _COEFFICIENTS
     for _ in range(_ITERATIONS):
         gram = x @ x.mT
         x = torch.baddbmm(x, torch.baddbmm(gram, gram, gram, beta=b, alpha=c), x, beta=a)
-    return x.mT if tall else x
+    return x.mT if is_tall else x

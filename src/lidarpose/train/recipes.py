@@ -59,9 +59,9 @@ TYPES: dict[Any, tuple] = {
 }
 
 
-def _setting(default: Any, words: str, metavar: str = "") -> Any:
+def _setting(default: Any, help_text: str, metavar: str = "") -> Any:
     """A field with its help and what stands for its value there, by default that of its type; SHARE: from 0 to 1."""
-    return field(default=default, metadata={"help": words, "metavar": metavar})
+    return field(default=default, metadata={"help": help_text, "metavar": metavar})
 
 
 def _checked(f: Field, value: Any) -> Any:
@@ -72,12 +72,12 @@ def _checked(f: Field, value: Any) -> Any:
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"{f.name} must be {expected}, got {value!r}") from None
     if f.type in (int, float, float | None) and value is not None:
-        least, below = _LEAST.get(f.name, 0), f.name in _BELOW_ONE
+        least, is_below_one = _LEAST.get(f.name, 0), f.name in _BELOW_ONE
         if not value >= least:
             raise InputError(f"{f.name} must be at least {least}, got {value:g}")
         check_finite(f.name, value)
-        if f.metadata["metavar"] == "SHARE" and (value > 1 or below and value == 1):
-            raise InputError(f"{f.name} must be a share, {'below' if below else 'at most'} 1, got {value}")
+        if f.metadata["metavar"] == "SHARE" and (value > 1 or is_below_one and value == 1):
+            raise InputError(f"{f.name} must be a share, {'below' if is_below_one else 'at most'} 1, got {value}")
     return value
 
 
@@ -124,7 +124,7 @@ class PoseRecipe(Recipe):
 
     muon_rate: float = _setting(0.02, "peak learning rate of Muon for hidden matrices; 0: AdamW for all", "RATE")
     heatmap_rate: float = _setting(
-        1.0, "of the paper's network: rate of the last layer of its heatmaps, in times of the rate"
+        1.0, "of the paper's network: rate of the last layer of its heatmaps, as a multiple of --rate"
     )
     bone: float = _setting(0.0, "weight of the error of bones' lengths")
     symmetry: float = _setting(0.0, "weight of the difference of left and right bones")
@@ -207,7 +207,7 @@ class Finetune(PoseRecipe):
     epochs: float = _setting(20.0, "how often each sample is seen")
     split: str = _setting("train", "samples to learn from; all: of every split")
     interval: int = _setting(1, "only every so many frames, as published recipes thin out")
-    augment: str = _setting("default", "what happens to people: default, paper, lidarhmr or none")
+    augment: str = _setting("default", "what happens to people: default, paper, lidarhmr, turn or none")
     mix: float = _setting(0.25, "share of synthesized people, below 1", "SHARE")
     scene: str = _setting("wild", "of the synthesized people: wild, wide, paper or reference")
     hold_out: float = _setting(

@@ -66,22 +66,22 @@ def numbered(kind: str, parent: str | Path = RUNS) -> Path:
 def latest(kind: str, parent: str | Path = RUNS) -> Path:
     """The numbered folder of the run that was started last. Raises InputError where there is none."""
     folders = [Path(parent) / f"{kind}-{number:03d}" for number in sorted(_numbers(Path(parent), kind))]
-    started = [folder for folder in folders if (folder / CONFIG).is_file()]
-    if not started:
+    runs = [folder for folder in folders if (folder / CONFIG).is_file()]
+    if not runs:
         raise InputError(f"{parent} has no run {kind}-... to resume: name its folder")
-    return started[-1]
+    return runs[-1]
 
 
 def _numbers(parent: Path, kind: str) -> list[int]:
-    names = (re.fullmatch(rf"{re.escape(kind)}-(\d{{3,}})", path.name) for path in parent.glob(f"{kind}-*"))
-    return [int(name[1]) for name in names if name]
+    matches = (re.fullmatch(rf"{re.escape(kind)}-(\d{{3,}})", path.name) for path in parent.glob(f"{kind}-*"))
+    return [int(match[1]) for match in matches if match]
 
 
 def check_new(folder: Path) -> None:
     """Raises InputError where the folder holds anything but what a killed run left of a file."""
     if not is_unused(folder, _NAMES):
-        more = "; add --resume to go on with what is there" if (folder / CONFIG).is_file() else ""
-        raise InputError(f"{folder}: expected a new or empty folder for the run{more}")
+        hint = "; add --resume to go on with what is there" if (folder / CONFIG).is_file() else ""
+        raise InputError(f"{folder}: expected a new or empty folder for the run{hint}")
 
 
 def lock(folder: Path) -> AbstractContextManager[None]:
@@ -106,8 +106,8 @@ def read_config(folder: Path, kind: type[AnyRecipe]) -> tuple[AnyRecipe, str]:
     try:
         config = json.loads(content)
         if config["schema"] != SCHEMA:
-            other = f"is of {config['schema']}, this lidarpose goes on with {SCHEMA}"
-            raise InputError(f"{other}: use lidarpose {config['version']}")
+            problem = f"is of {config['schema']}, this lidarpose goes on with {SCHEMA}"
+            raise InputError(f"{problem}: use lidarpose {config['version']}")
         if config["kind"] != kind.kind:
             raise InputError(f"is of a run of `lidarpose {config['kind']}`: resume it by that command")
         return kind(**config["recipe"]), str(config.get("command", ""))
@@ -119,13 +119,13 @@ def read_config(folder: Path, kind: type[AnyRecipe]) -> tuple[AnyRecipe, str]:
 
 def check_resumable(folder: Path, stored: Recipe, wanted: Recipe) -> None:
     """Raises InputError unless a run may go on with the wanted recipe: as it began, or longer."""
-    before = stored.to_dict()
+    settings = stored.to_dict()
     for name, value in wanted.to_dict().items():
-        if name in PATHS and _file_names(value) == _file_names(before[name]):
+        if name in PATHS and _file_names(value) == _file_names(settings[name]):
             continue
-        if name not in (*LENGTHS, *FREE) and value != before[name]:
+        if name not in (*LENGTHS, *FREE) and value != settings[name]:
             raise InputError(
-                f"{folder / CONFIG}: the run has {name} = {before[name]!r}, got {value!r}: a run keeps its recipe"
+                f"{folder / CONFIG}: the run has {name} = {settings[name]!r}, got {value!r}: a run keeps its recipe"
             )
 
 
@@ -192,9 +192,9 @@ def load_state(
                 raise ValueError(f"its {entry} is {value!r}")
         problem = "the state is not of this network"
         network.load_state_dict(_part(tensors, "network."))
-        stored = _part(tensors, "mean.")
+        stored_mean = _part(tensors, "mean.")
         for name, value in mean.items():
-            value.copy_(stored[name])
+            value.copy_(stored_mean[name])
         problem = "the optimizer's memory is damaged"
         for k, optimizer in enumerate(optimizers):
             memory = _memory(_part(tensors, f"optimizer.{k}."), optimizer)

@@ -86,17 +86,17 @@ def Job(*, task: Objective, **settings: Any) -> TrainSetup:  # noqa: N802
 def objective_of(config: Config, recipe: PoseRecipe, layout: str = "ragged") -> Objective:
     """What a network of a configuration minimizes: its entry in `models.NETWORKS`, by its settings of a recipe.
     layout: of the paper's tables."""
-    lengths = {"bone": recipe.bone, "symmetry": recipe.symmetry}
+    bone_weights = {"bone": recipe.bone, "symmetry": recipe.symmetry}
     # what a baseline is shown beside what happens to examples
     shift = augmentation(recipe.augment).shift if isinstance(recipe, Finetune) else 0.0
     # heatmaps are learned the same way in both stages
     stage = "finetune" if isinstance(config, DaptConfig) and config.bins else recipe.kind
-    of_kind: dict[str, dict] = {"pose": lengths, "dapt": {"stage": stage, "layout": layout}}
-    of_kind |= dict.fromkeys(("prn", "lpformer"), {"shift": shift}) | dict.fromkeys(("lidarcap", "ne"), {})
-    settings = of_kind[config.kind]
+    settings_by_kind: dict[str, dict] = {"pose": bone_weights, "dapt": {"stage": stage, "layout": layout}}
+    settings_by_kind |= dict.fromkeys(("prn", "lpformer"), {"shift": shift}) | dict.fromkeys(("lidarcap", "ne"), {})
+    settings = settings_by_kind[config.kind]
     if "prn" in (config.kind, getattr(config, "neck", "")) and recipe.batch < 2:
         raise InputError("batch must be at least 2 for prn, whose batch norms see a few points a person, got 1")
-    if settings is not lengths and any(lengths.values()):
+    if settings is not bone_weights and any(bone_weights.values()):
         raise InputError("bone and symmetry are terms of the package's own networks: leave them at 0")
     return NETWORKS[config.kind].part("objective")(config=config, **settings)
 
@@ -146,19 +146,19 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     if recipe.init:
         network, card["init_card"] = expanded_network(recipe.init, config)
     names = ("scene", "set", "motion", "subjects", "captured", "body", "strays", "noise", "objects")
-    synthetic: dict[str, Any] = {name: getattr(recipe, name) for name in names}
+    synthetic_settings: dict[str, Any] = {name: getattr(recipe, name) for name in names}
 
     def validation() -> Sequence[Example | ClipExample]:
         # as a user's cloud: centered on its points
-        held_out = SyntheticSource(seed=_VALIDATION_SEED, refined=0.0, **(synthetic | {"objects": 0.0}))
+        held_out_source = SyntheticSource(seed=_VALIDATION_SEED, refined=0.0, **(synthetic_settings | {"objects": 0.0}))
         if isinstance(config, LidarcapConfig):
             clips = range(VALIDATION // config.frames)
-            return [held_out.clip(index, trans_center=config.trans_center) for index in clips]
-        return [held_out.example(index) for index in range(VALIDATION)]
+            return [held_out_source.clip(index, trans_center=config.trans_center) for index in clips]
+        return [held_out_source.example(index) for index in range(VALIDATION)]
 
     setup = TrainSetup(
         objective=objective,
-        source=SyntheticSource(seed=recipe.seed, easy=recipe.easy * recipe.people, **synthetic),
+        source=SyntheticSource(seed=recipe.seed, easy=recipe.easy * recipe.people, **synthetic_settings),
         people=recipe.people,
         network=network,
         validation=validation,
@@ -175,11 +175,11 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     for folder in recipe.shards:
         _check_no_test(folder)
     dataset = InMemoryDataset.load(recipe.shards)
-    turned = Augmentation(turn=1.0, flip=0.5)
+    turn_augmentation = Augmentation(turn=1.0, flip=0.5)
     noise = {"strays": recipe.strays, "noise": recipe.noise}
     if is_clip:
         return _of_clips(setup, replace(_clips(dataset, config, recipe), strays=recipe.strays, noise=recipe.noise))
-    source = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=turned, **noise)
+    source = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=turn_augmentation, **noise)
     return replace(setup, source=source, warnings=_damage(dataset) + _no_parts(dataset))
 
 
@@ -198,8 +198,8 @@ def _damage(dataset: InMemoryDataset) -> tuple[str, ...]:
     """What is left out of a dataset, in a line."""
     if not dataset.damaged:
         return ()
-    first, more = dataset.damaged[0], len(dataset.damaged) - 1
-    return (f"left out {len(dataset.damaged)} damaged shards: {first}" + (f", and {more} more" if more else ""),)
+    problem, count = dataset.damaged[0], len(dataset.damaged) - 1
+    return (f"left out {len(dataset.damaged)} damaged shards: {problem}" + (f", and {count} more" if count else ""),)
 
 
 def _no_parts(dataset: InMemoryDataset) -> tuple[str, ...]:
@@ -213,26 +213,26 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
     trained, card = initial_network(recipe)
     split = None if recipe.split == "all" else recipe.split
     kind = augmentation(recipe.augment)
-    full = InMemoryDataset.load(recipe.data, split=split, interval=recipe.interval)
-    held_out, watched = _held_out(recipe, split, full)
-    dataset = full.without(held_out)
+    full_dataset = InMemoryDataset.load(recipe.data, split=split, interval=recipe.interval)
+    held_out_sequences, held_out_dataset = _held_out(recipe, split, full_dataset)
+    dataset = full_dataset.without(held_out_sequences)
     joints = skeleton(dataset.skeleton)
     config, network = finetuned_network(recipe, trained, joints, dataset.dataset)
-    card |= {"data": folder_names(recipe.data), "held_out_sequences": list(held_out)}
+    card |= {"data": folder_names(recipe.data), "held_out_sequences": list(held_out_sequences)}
     source: Source = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=kind)
     if recipe.mix:
-        synthetic = SyntheticSource(
+        synthetic_source = SyntheticSource(
             scene=recipe.scene, seed=recipe.seed, objects=_OBJECTS if getattr(config, "person", False) else 0.0
         )
-        source = MixedSource(main=source, other=synthetic, share=recipe.mix)
+        source = MixedSource(main=source, other=synthetic_source, share=recipe.mix)
 
     def validation() -> list[Example]:
-        if watched is None:
+        if held_out_dataset is None:
             return []
         # a box with a detector's errors where there is one, centered on the points
-        quiet = Augmentation(released=kind.released, box=kind.box, refined=0.0)
-        rows = np.unique(np.linspace(0, len(watched) - 1, min(VALIDATION, len(watched))).astype(int))
-        return [augmented(watched.sample(k), quiet, np.random.default_rng([recipe.seed, k])) for k in rows]
+        cropping = Augmentation(released=kind.released, box=kind.box, refined=0.0)
+        rows = np.unique(np.linspace(0, len(held_out_dataset) - 1, min(VALIDATION, len(held_out_dataset))).astype(int))
+        return [augmented(held_out_dataset.sample(k), cropping, np.random.default_rng([recipe.seed, k])) for k in rows]
 
     setup = TrainSetup(
         objective=objective_of(config, recipe, layout),
@@ -243,17 +243,17 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
         validation=validation,
         joints=joints,
         card=card | {"damaged": list(dataset.damaged)},
-        warnings=_damage(dataset) + ((_NO_VALIDATION,) if watched is None else ()),
+        warnings=_damage(dataset) + ((_NO_VALIDATION,) if held_out_dataset is None else ()),
     )
     if not isinstance(config, LidarcapConfig):
         return setup
-    if recipe.mix or recipe.augment != "none":
-        raise InputError(f"{config.name} learns from clips as they are: leave --mix at 0 and --augment at none")
-    own = _clips(dataset, config, recipe)
-    seen = None if watched is None else _clips(watched, config, recipe)
-    people = max(round(recipe.epochs * len(own.clips)), 1) * config.frames
-    watch = partial(seen.some, VALIDATION // config.frames) if seen is not None else list
-    return replace(_of_clips(setup, own), people=people, validation=watch)
+    if recipe.mix or recipe.augment not in ("none", "turn"):
+        raise InputError(f"{config.name} learns from clips: leave --mix at 0, and --augment at none or turn")
+    clip_source = _clips(dataset, config, recipe)
+    held_out_clips = None if held_out_dataset is None else _clips(held_out_dataset, config, recipe)
+    people = max(round(recipe.epochs * len(clip_source.clips)), 1) * config.frames
+    clip_validation = partial(held_out_clips.some, VALIDATION // config.frames) if held_out_clips is not None else list
+    return replace(_of_clips(setup, clip_source), people=people, validation=clip_validation)
 
 
 def _clips(dataset: InMemoryDataset, config: LidarcapConfig, recipe: Pretrain | Finetune) -> ClipSource:
@@ -265,7 +265,14 @@ def _clips(dataset: InMemoryDataset, config: LidarcapConfig, recipe: Pretrain | 
             f"{config.name} needs {config.frames} consecutive frames of a person with rotations, got none: {reasons}; "
             "lidarpose synth --clips writes some, and prepare of LiDARHuman26M and SLOPER4D"
         )
-    return ClipSource(dataset=dataset, clips=clips, skipped=skipped, seed=recipe.seed, trans_center=config.trans_center)
+    return ClipSource(
+        dataset=dataset,
+        clips=clips,
+        skipped=skipped,
+        seed=recipe.seed,
+        trans_center=config.trans_center,
+        turn=isinstance(recipe, Finetune) and recipe.augment == "turn",
+    )
 
 
 def _of_clips(setup: TrainSetup, source: ClipSource) -> TrainSetup:
@@ -279,16 +286,16 @@ def _of_clips(setup: TrainSetup, source: ClipSource) -> TrainSetup:
 
 
 def _held_out(
-    recipe: Finetune, split: str | None, full: InMemoryDataset
+    recipe: Finetune, split: str | None, dataset: InMemoryDataset
 ) -> tuple[tuple[str, ...], InMemoryDataset | None]:
     """Sequences not to learn from, and what to validate on: the split val where there is one, else those sequences."""
     if split not in (None, "val"):
         # there may be no such split
         with suppress(InputError):
             return (), InMemoryDataset.load(recipe.data, split="val", interval=recipe.interval)
-    if not recipe.hold_out or len(full.sequences) < _LEAST_SEQUENCES:
+    if not recipe.hold_out or len(dataset.sequences) < _LEAST_SEQUENCES:
         return (), None
-    number = max(round(recipe.hold_out * len(full.sequences)), 1)
-    if number == len(full.sequences):
+    count = max(round(recipe.hold_out * len(dataset.sequences)), 1)
+    if count == len(dataset.sequences):
         raise InputError(f"hold_out = {recipe.hold_out} leaves nobody to learn from: lower it")
-    return full.sequences[-number:], full.without(full.sequences[:-number])
+    return dataset.sequences[-count:], dataset.without(dataset.sequences[:-count])

@@ -65,17 +65,17 @@ class InMemoryDataset:
                 problem = f"holds synthetic people, which have no split {split!r}: say --split all"
                 raise file_error(dataset.folder, problem)
             shards = list(_shards(dataset, split, interval, damaged))
-            hides = any(hidden for _, _, hidden in shards)
-            parts += [(dataset, rows, hides) for rows, _, _ in shards]
-            names += chain.from_iterable(own for _, own, _ in shards)
+            has_hidden = any(hidden for _, _, hidden in shards)
+            parts += [(dataset, rows, has_hidden) for rows, _, _ in shards]
+            names += chain.from_iterable(shard_names for _, shard_names, _ in shards)
         skeletons = sorted({dataset.card.skeleton for dataset in datasets})
         if len(skeletons) > 1:
             raise InputError(f"datasets that are learned together need one skeleton, got {', '.join(skeletons)}")
         if not names:
-            where = ", ".join(str(dataset.folder) for dataset in datasets)
-            why = f" ({len(damaged)} shards cannot be read: {damaged[0]})" if damaged else ""
-            what = "labeled people" if split is None else f"labeled people in the split {split!r}"
-            raise InputError(f"{where}: expected {what}, got none{why}; lidarpose prepare says what is there")
+            paths = ", ".join(str(dataset.folder) for dataset in datasets)
+            damage = f" ({len(damaged)} shards cannot be read: {damaged[0]})" if damaged else ""
+            expected = "labeled people" if split is None else f"labeled people in the split {split!r}"
+            raise InputError(f"{paths}: expected {expected}, got none{damage}; lidarpose prepare says what is there")
         sequences, sequence = np.unique(names, return_inverse=True)
         return cls(
             parts=parts,
@@ -93,14 +93,14 @@ class InMemoryDataset:
     def sample(self, row: int) -> LabeledSample:
         """A sample in the sensor's frame; its pose says which joints are visible: 1, 0 or NaN where unknown."""
         part, place = self.place[row]
-        dataset, rows, hides = self.parts[part]
+        dataset, rows, has_hidden = self.parts[part]
         cells = zip(rows.column_names, rows.columns, strict=True)
         sample = _to_body26(dataset.sample({name: _value(column[int(place)]) for name, column in cells}))
-        if hides:
+        if has_hidden:
             return sample
         # a dataset that never says hidden says nothing of what is seen
-        unknown = np.full(len(BODY26), np.nan, np.float32)
-        return replace(sample, pose=replace(sample.pose, visible=unknown))
+        visible = np.full(len(BODY26), np.nan, np.float32)
+        return replace(sample, pose=replace(sample.pose, visible=visible))
 
     def clips(self) -> tuple[np.ndarray, Counter[str]]:
         """Rows (C, `CLIP_FRAMES`) of the clips that consecutive frames with rotations make, and how many frames are
@@ -115,22 +115,23 @@ class InMemoryDataset:
             has_rotations += rows.column("rotations").is_valid().to_pylist()
         # of all rows of the parts those of this dataset
         start = np.cumsum([0, *(rows.num_rows for _, rows, _ in self.parts)])
-        stored = start[self.place[:, 0]] + self.place[:, 1]
-        usable = np.flatnonzero(np.array(has_rotations, bool)[stored])
-        skipped = Counter({"frames without rotations": len(stored) - len(usable)})
-        own = stored[usable].tolist()
-        runs = consecutive([tracks[k] for k in own], [frames[k] for k in own])
-        skipped["frames of fewer than 16 consecutive ones"] = sum(len(run) for run in runs if len(run) < CLIP_FRAMES)
-        clips = [usable[clip_windows(run)] for run in runs if len(run) >= CLIP_FRAMES]
+        part_rows = start[self.place[:, 0]] + self.place[:, 1]
+        usable_rows = np.flatnonzero(np.array(has_rotations, bool)[part_rows])
+        skipped = Counter({"frames without rotations": len(part_rows) - len(usable_rows)})
+        frame_rows = part_rows[usable_rows].tolist()
+        runs = consecutive([tracks[k] for k in frame_rows], [frames[k] for k in frame_rows])
+        reason = f"frames of fewer than {CLIP_FRAMES} consecutive ones"
+        skipped[reason] = sum(len(run) for run in runs if len(run) < CLIP_FRAMES)
+        clips = [usable_rows[clip_windows(run)] for run in runs if len(run) >= CLIP_FRAMES]
         return np.concatenate([np.zeros((0, CLIP_FRAMES), int), *clips]), +skipped
 
     def without(self, sequences: Sequence[str]) -> "InMemoryDataset":
         """The samples that are not of some sequences; the points are shared."""
         names = np.array(self.sequences)
-        left = ~np.isin(names, sequences)
-        rows = left[self.sequence]
-        sequence = (left.cumsum() - 1)[self.sequence[rows]]
-        return replace(self, place=self.place[rows], sequence=sequence, sequences=tuple(names[left].tolist()))
+        is_kept = ~np.isin(names, sequences)
+        rows = is_kept[self.sequence]
+        sequence = (is_kept.cumsum() - 1)[self.sequence[rows]]
+        return replace(self, place=self.place[rows], sequence=sequence, sequences=tuple(names[is_kept].tolist()))
 
 
 def _value(cell: Any) -> Any:
@@ -148,15 +149,15 @@ def _shards(
     missing: the dataset is not finished."""
     frames: Counter[tuple[str, str]] = Counter()
     for shard in range(dataset.card.shards):
-        there = dataset.path(shard).is_file()
+        is_present = dataset.path(shard).is_file()
         try:
             rows = list(dataset.rows(shards=[shard]))
         except InputError as error:
-            if not there:
+            if not is_present:
                 raise
             damaged.append(str(error))
             continue
-        chosen, names, hidden = [], [], False
+        labeled_rows, names, has_hidden = [], [], False
         for row in rows:
             if split is not None and row["split"] != split:
                 continue
@@ -164,11 +165,11 @@ def _shards(
             person = sample.sequence, sample.track
             if frames[person] % interval == 0 and len(sample.points) and sample.joint_labels.any():
                 sample = _to_body26(sample)
-                chosen.append(row)
+                labeled_rows.append(row)
                 names.append(sample.sequence)
-                hidden |= bool((sample.joint_labels == HIDDEN).any())
+                has_hidden |= bool((sample.joint_labels == HIDDEN).any())
             frames[person] += 1
-        yield to_arrow(pyarrow()[0], dataset.card.people, chosen), names, hidden
+        yield to_arrow(pyarrow()[0], dataset.card.people, labeled_rows), names, has_hidden
 
 
 def _to_body26(sample: LabeledSample) -> LabeledSample:

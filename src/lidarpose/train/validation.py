@@ -23,10 +23,10 @@ def validate(
     device = next(network.parameters()).device
     batches = [objective.collate(list(examples[k : k + batch])) for k in range(0, len(examples), batch)]
     joints = np.concatenate([objective.joints(network, arrays, device=device) for arrays in batches])
-    true = np.stack([frame.joints for example in examples for frame in example.frames])
+    true_joints = np.stack([frame.joints for example in examples for frame in example.frames])
     # labeled, and of a joint that the network has; what is not finite though it should be, must be seen
-    counted = ~np.isnan(true).any(-1) & ~np.isnan(joints).all((0, 2))
-    return float(np.linalg.norm(joints - true, axis=-1)[counted].mean() * 1e3), joints
+    is_counted = ~np.isnan(true_joints).any(-1) & ~np.isnan(joints).all((0, 2))
+    return float(np.linalg.norm(joints - true_joints, axis=-1)[is_counted].mean() * 1e3), joints
 
 
 def batch_norms(network: nn.Module) -> list[_BatchNorm]:
@@ -61,8 +61,8 @@ def draw_examples(examples: list[Example], joints: np.ndarray, skeleton: Skeleto
 
     def pose(joints: np.ndarray) -> Pose | None:
         # none where the skeleton's joints are not all known
-        own = joints[BODY26.map_to(skeleton)]
-        return None if np.isnan(own).any() else Pose(joints=own, skeleton=skeleton)
+        skeleton_joints = joints[BODY26.map_to(skeleton)]
+        return None if np.isnan(skeleton_joints).any() else Pose(joints=skeleton_joints, skeleton=skeleton)
 
     panels = []
     for example, predicted in zip(examples, joints, strict=True):

@@ -99,8 +99,8 @@ def _draw_panel(ax, panel: ScanPanel) -> None:
     ax.set_title(panel.label, fontsize=10, parse_math=False)
     ax.tick_params(labelsize=7, color=_FAINT, labelcolor=_FAINT)
     ax.spines[:].set_color(_HIGH)
-    inside = points[(np.abs(points[:, :2] - [left + span / 2, bottom + span / 2]) <= span / 2).all(1)]
-    _draw_points(ax, inside[thinned(len(inside), _MAX_POINTS)])
+    inside_points = points[(np.abs(points[:, :2] - [left + span / 2, bottom + span / 2]) <= span / 2).all(1)]
+    _draw_points(ax, inside_points[thinned(len(inside_points), _MAX_POINTS)])
     if panel.sensor is not None:
         ax.plot(*panel.sensor, ls="", marker="^", ms=8, color=_INK, mec="white", zorder=5)
         ax.annotate("sensor", panel.sensor, (7, -3), textcoords="offset points", fontsize=8, zorder=5)
@@ -123,14 +123,14 @@ def _draw_panel(ax, panel: ScanPanel) -> None:
 def _window(panel: ScanPanel, points: np.ndarray) -> tuple[np.ndarray, float]:
     """The lower left corner and the side of a square that holds the people, their tracks and the sensor, else most
     points."""
-    shown = [box.center[None, :2] for box in panel.boxes] + [np.asarray(track)[:, :2] for track in panel.tracks]
+    extent_points = [box.center[None, :2] for box in panel.boxes] + [np.asarray(track)[:, :2] for track in panel.tracks]
     if panel.places is not None and len(panel.places):
-        shown.append(np.asarray(panel.places)[:, :2])
-    if shown and panel.sensor is not None:
-        shown.append(np.array([panel.sensor]))
-    if not shown:
-        shown = [np.percentile(points[:, :2], (2, 98), axis=0) if len(points) else np.zeros((1, 2))]
-    low, high = np.concatenate(shown).min(0), np.concatenate(shown).max(0)
+        extent_points.append(np.asarray(panel.places)[:, :2])
+    if extent_points and panel.sensor is not None:
+        extent_points.append(np.array([panel.sensor]))
+    if not extent_points:
+        extent_points = [np.percentile(points[:, :2], (2, 98), axis=0) if len(points) else np.zeros((1, 2))]
+    low, high = np.concatenate(extent_points).min(0), np.concatenate(extent_points).max(0)
     span = max(float((high - low).max()) + 2 * _MARGIN, _LEAST_SPAN)
     return (low + high) / 2 - span / 2, span
 
@@ -140,10 +140,10 @@ def _draw_points(ax, points: np.ndarray) -> None:
     from matplotlib import colormaps
 
     height = points[:, 2] - (np.percentile(points[:, 2], 2) if len(points) else 0)
-    by_height = (height >= _BELOW) & (height <= _ABOVE)
+    is_colored = (height >= _BELOW) & (height <= _ABOVE)
     # what stands on the ground last, so that nothing covers it
-    order = np.argsort(by_height, kind="stable")
-    size = np.clip(20_000 / max(len(points), 1), 0.3, 4) * np.where(by_height, 1.5, 1)
+    order = np.argsort(is_colored, kind="stable")
+    size = np.clip(20_000 / max(len(points), 1), 0.3, 4) * np.where(is_colored, 1.5, 1)
     cmap = colormaps["viridis_r"].with_extremes(under=_GROUND, over=_HIGH)
     limits = {"cmap": cmap, "vmin": _BELOW, "vmax": _ABOVE}
     dots = ax.scatter(*points[order, :2].T, s=size[order], c=height[order], linewidths=0, zorder=2, **limits)
@@ -158,8 +158,8 @@ def _draw_box(ax, box: Box) -> None:
     from matplotlib.collections import LineCollection
 
     ax.add_collection(LineCollection(list(box_edges(box)[..., :2]), colors=_BOX, lw=1.1, zorder=5))
-    nose = box.center[:2] + np.array([np.cos(box.yaw), np.sin(box.yaw)]) * (box.size[0] / 2 + 0.6)
-    ax.annotate("", nose, box.center[:2], arrowprops={"arrowstyle": "->", "color": _BOX, "lw": 1.1}, zorder=5)
+    arrow_tip = box.center[:2] + np.array([np.cos(box.yaw), np.sin(box.yaw)]) * (box.size[0] / 2 + 0.6)
+    ax.annotate("", arrow_tip, box.center[:2], arrowprops={"arrowstyle": "->", "color": _BOX, "lw": 1.1}, zorder=5)
     if box.id is not None:
         ax.annotate(
             str(box.id), box.center[:2], (9, 9), textcoords="offset points", fontsize=9, weight="bold", color=_BOX,

@@ -31,9 +31,9 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
     Raises:
         InputError: a folder that is no dataset or has no shard yet, a file that cannot be written or is the dataset's.
     """
-    most = 400 if html else MAX_PEOPLE
-    if not 1 <= count <= most:
-        raise InputError(f"expected 1 to {most} people to draw, got {count}")
+    limit = 400 if html else MAX_PEOPLE
+    if not 1 <= count <= limit:
+        raise InputError(f"expected 1 to {limit} people to draw, got {count}")
     dataset = open_dataset(folder)
     name = Path(folder).resolve().name
     path = Path(out) if out is not None else Path(f"{name}.{'html' if html else 'png'}")
@@ -42,8 +42,8 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
     title = f"{name}: {counted(dataset.card.count, settings.get('what', 'people'))}"
     if "scene" in settings:
         title += f", scene {settings['scene']}"
-    if (written := len(dataset.written())) < dataset.card.shards:
-        title += f", {written:,} of {dataset.card.shards:,} shards written so far"
+    if (num_written := len(dataset.written())) < dataset.card.shards:
+        title += f", {num_written:,} of {dataset.card.shards:,} shards written so far"
     streets: list[ScanPanel] = []
     if "frames" in dataset.card.tables:
         streets = [_street_panel(rows, dataset) for rows in _spread(dataset, "frames", min(count, MAX_SCANS))]
@@ -63,45 +63,52 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
 def _spread(dataset: DatasetReader, table: str, count: int) -> list[list[dict]]:
     """Rows of `count` people, one each, or of streets, one a frame, evenly spread over the shards that are there; of a
     smaller dataset all. Raises InputError where no shard is there."""
-    there = dataset.written(table)
-    if not there:
-        again = f"wait for the first one, or run {dataset.card.writer} again"
-        raise file_error(dataset.folder, f"holds no shard yet; {again}")
-    by_index, most = table == "frames", dataset.card.per_shard
+    written_shards = dataset.written(table)
+    if not written_shards:
+        remedy = f"wait for the first one, or run {dataset.card.writer} again"
+        raise file_error(dataset.folder, f"holds no shard yet; {remedy}")
+    by_index, per_shard = table == "frames", dataset.card.per_shard
     if by_index:
-        keys = {shard: range(shard * most, min((shard + 1) * most, dataset.card.count)) for shard in there}
+        keys = {
+            shard: range(shard * per_shard, min((shard + 1) * per_shard, dataset.card.count))
+            for shard in written_shards
+        }
     else:
-        keys = {shard: range(dataset.rows_of(table, shard)) for shard in there}
+        keys = {shard: range(dataset.rows_of(table, shard)) for shard in written_shards}
     total = sum(map(len, keys.values()))
     count = min(count, total)
     # each in the middle of an equal share
-    wanted = ((2 * np.arange(count) + 1) * total // (2 * count)).tolist()
+    positions = ((2 * np.arange(count) + 1) * total // (2 * count)).tolist()
     groups: list[list[dict]] = []
-    first = 0
+    first_position = 0
     for shard, numbers in keys.items():
-        chosen: dict[int, list[dict]] = {numbers[w - first]: [] for w in wanted if 0 <= w - first < len(numbers)}
-        for number, row in enumerate(dataset.rows(table, [shard]) if chosen else ()):
-            chosen.get(row["index"] if by_index else number, []).append(row)
-        groups += [rows for rows in chosen.values() if rows]
-        first += len(numbers)
+        rows_by_key: dict[int, list[dict]] = {
+            numbers[position - first_position]: []
+            for position in positions
+            if 0 <= position - first_position < len(numbers)
+        }
+        for number, row in enumerate(dataset.rows(table, [shard]) if rows_by_key else ()):
+            rows_by_key.get(row["index"] if by_index else number, []).append(row)
+        groups += [rows for rows in rows_by_key.values() if rows]
+        first_position += len(numbers)
     return groups
 
 
 def _street_panel(rows: list[dict], dataset: DatasetReader) -> ScanPanel:
-    first = rows[0]
+    first_row = rows[0]
     # everybody is in every frame
-    boxes = np.stack([row["box"].reshape(-1, 7) for row in rows if len(row["box"]) == len(first["box"])])
-    joints = first["joints"].reshape(len(first["track"]), -1, 3)
+    boxes = np.stack([row["box"].reshape(-1, 7) for row in rows if len(row["box"]) == len(first_row["box"])])
+    joints = first_row["joints"].reshape(len(first_row["track"]), -1, 3)
     return ScanPanel(
-        points=first["points"].reshape(-1, 3),
+        points=first_row["points"].reshape(-1, 3),
         boxes=[
             Box(center=box[:3], size=box[3:6], yaw=float(box[6]), id=track)
-            for track, box in zip(first["track"].tolist(), boxes[0], strict=True)
+            for track, box in zip(first_row["track"].tolist(), boxes[0], strict=True)
         ],
         poses=Pose(joints=joints, skeleton=skeleton(dataset.card.skeleton)) if len(joints) else None,
         labeled=True,
         tracks=list(boxes[:, :, :2].swapaxes(0, 1)),
-        label=f"#{first['index']} {first['sensor']}: {counted(len(joints), 'people')}, {len(rows)} frames",
+        label=f"#{first_row['index']} {first_row['sensor']}: {counted(len(joints), 'people')}, {len(rows)} frames",
     )
 
 

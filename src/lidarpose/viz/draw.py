@@ -81,27 +81,27 @@ def draw_people(
     if path is not None:
         check_suffix(path, ".png")
     panels = list(panels)
-    shown = panels[:MAX_PEOPLE]
-    columns = min(per_row, max(len(shown), 1))
-    rows = -(-max(len(shown), 1) // columns)
+    shown_panels = panels[:MAX_PEOPLE]
+    columns = min(per_row, max(len(shown_panels), 1))
+    rows = -(-max(len(shown_panels), 1) // columns)
     zoom = {1: 2.0, 2: 1.4}.get(columns, 1.0)
     card_width, card_height = _CARD_WIDTH * zoom, _VIEW_HEIGHT * zoom + _CAPTION
     width = columns * (card_width + _GAP) - _GAP + 2 * _MARGIN
-    top = _MARGIN + (_TITLE if title or len(shown) < len(panels) else 0) + _LEGEND
+    top = _MARGIN + (_TITLE if title or len(shown_panels) < len(panels) else 0) + _LEGEND
     height = top + rows * (card_height + _GAP) - _GAP + _MARGIN
 
     figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
-    _draw_header(figure, panels, shown, title)
+    _draw_header(figure, panels, shown_panels, title)
     grid = {"left": _MARGIN / width, "right": 1 - _MARGIN / width, "wspace": _GAP / card_width}
     grid |= {"bottom": _MARGIN / height, "top": 1 - top / height, "hspace": _GAP / card_height}
     for i, ax in enumerate(figure.subplots(rows, columns, squeeze=False, gridspec_kw=grid).flat):
         ax.set(xticks=[], yticks=[], facecolor="white")
         ax.spines[:].set(color=_HAIRLINE, linewidth=1)
-        if i < len(shown):
-            _draw_card(ax, shown[i], card_width, card_height)
+        if i < len(shown_panels):
+            _draw_card(ax, shown_panels[i], card_width, card_height)
         else:
             ax.set_axis_off()
-    if not shown:
+    if not shown_panels:
         _text(figure, 0.5, 0.5, "no people", size=11, color=_FAINT, ha="center")
     return png_of(figure, path)
 
@@ -139,8 +139,8 @@ def stack_pictures(pictures: list[bytes], path: str | Path | None = None) -> byt
     return buffer.getvalue()
 
 
-def _text(artist, x: float, y: float, words: str, *, size: float, color: str = _INK, **more) -> None:
-    artist.text(x, y, words, fontsize=size, color=color, family="DejaVu Sans", parse_math=False, usetex=False, **more)
+def _text(artist, x: float, y: float, text: str, *, size: float, color: str = _INK, **style) -> None:
+    artist.text(x, y, text, fontsize=size, color=color, family="DejaVu Sans", parse_math=False, usetex=False, **style)
 
 
 def shortened(words: str, limit: int) -> str:
@@ -151,16 +151,16 @@ def shortened(words: str, limit: int) -> str:
     return words if len(words) <= limit else f"{words[: limit - 1 - tail]}…{words[len(words) - tail :]}"
 
 
-def _draw_header(figure, panels: list[Panel], shown: list[Panel], title: str) -> None:
+def _draw_header(figure, panels: list[Panel], shown_panels: list[Panel], title: str) -> None:
     """The title, how many people are left out, and a legend of what is drawn."""
     width, height = figure.get_size_inches()
     left, top = _MARGIN / width, 1 - _MARGIN / height
-    note = f"the first {len(shown)} of {len(panels)} people" if len(shown) < len(panels) else ""
+    note = f"the first {len(shown_panels)} of {len(panels)} people" if len(shown_panels) < len(panels) else ""
     # a hash fits
     room = int((width - 2 * _MARGIN) / 0.127) - len(note)
     _text(figure, left, top, shortened(title, max(room, 12)), size=13, weight="bold", va="top")
     _text(figure, 1 - left, top - 0.03 / height, note, size=9, color=_FAINT, va="top", ha="right")
-    if handles := _legend_handles(shown):
+    if handles := _legend_handles(shown_panels):
         figure.legend(
             handles=handles,
             loc="upper left",
@@ -177,23 +177,23 @@ def _draw_header(figure, panels: list[Panel], shown: list[Panel], title: str) ->
         )
 
 
-def _legend_handles(shown: list[Panel]) -> list:
+def _legend_handles(panels: list[Panel]) -> list:
     from matplotlib.lines import Line2D
 
-    parts = [part for panel in shown if (part := panel.part) is not None]
+    parts = [part for panel in panels if (part := panel.part) is not None]
     dot: dict[str, Any] = {"ls": "", "marker": "o", "ms": 4}
     entries: list[dict[str, Any]] = []
-    if any(is_known(panel.pose) for panel in shown):
+    if any(is_known(panel.pose) for panel in panels):
         entries += [{"label": name, "color": color, "lw": 2.6} for name, color in SIDE_COLORS.items()]
-    if any(is_known(panel.truth) for panel in shown):
+    if any(is_known(panel.truth) for panel in panels):
         entries.append({"label": "true", "color": _TRUTH, "lw": 1.2, "ls": _DASHES})
     if any((part > 0).any() for part in parts):
         entries += [{"label": f"{name} part", "color": color, **dot} for name, (_, color) in _PART_SHADES.items()]
     if any((part == 0).any() for part in parts):
         entries.append({"label": "background", "color": _NOT_BODY, **dot})
-    if any(panel.part is None and len(panel.points) for panel in shown):
+    if any(panel.part is None and len(panel.points) for panel in panels):
         entries += [{"label": "near point", "color": _NEAR, **dot}, {"label": "far point", "color": _FAR, **dot}]
-    if any(facing_of(panel) is not None for panel in shown):
+    if any(facing_of(panel) is not None for panel in panels):
         entries.append({"label": "facing", "color": _FAINT, "ls": "", "marker": ">", "ms": 4.5})
     return [Line2D([], [], **entry) for entry in entries]
 
@@ -221,18 +221,20 @@ def _draw_card(ax, panel: Panel, width: float, height: float) -> None:
     extents = [_extent(panel, anchor, seen_from=direction) for direction in directions]
     low, high = extents[0][:, 1]
     spans = [max(extent[1, 0] - extent[0, 0], 0.5) for extent in extents]
-    room, tall = width - _RULER - 0.2, height - _CAPTION - 0.4
-    scale = max(sum(spans) / room, (high - low) / tall, _TALLEST / tall)  # meters an inch
-    spare = (room * scale - sum(spans)) / 2
+    room, view_height = width - _RULER - 0.2, height - _CAPTION - 0.4
+    scale = max(sum(spans) / room, (high - low) / view_height, _TALLEST / view_height)  # meters an inch
+    margin = (room * scale - sum(spans)) / 2
     ground = _CAPTION + 0.1
     ax.set(xlim=(0, width * scale), ylim=(low - ground * scale, low + (height - ground) * scale))
     left = 0.1 * scale
     names = ("from +x", "from −y") if forward is None else ("front", "side")
     for direction, name, extent, span in zip(directions, names, extents, spans, strict=True):
-        right = left + span + spare
+        right = left + span + margin
         shift = (left + right) / 2 - extent[:, 0].mean()
         ax.plot([left, right], [low, low], color=_HAIRLINE, lw=1.2, zorder=1)
-        window = Rectangle((left, low - 0.08 * scale), right - left, (tall + 0.16) * scale, transform=ax.transData)
+        window = Rectangle(
+            (left, low - 0.08 * scale), right - left, (view_height + 0.16) * scale, transform=ax.transData
+        )
         _draw_view(ax, panel, seen_from=direction, shift=shift, window=window)
         if not note:
             write(name, up=height - 0.2, right=(left + right) / 2 / scale, size=7, color=_FAINT)
@@ -241,7 +243,7 @@ def _draw_card(ax, panel: Panel, width: float, height: float) -> None:
             _draw_arrow(ax, x, low - 0.045 * scale, 0.12 * scale, towards_viewer=float(forward @ direction) > 0.5)
         left = right + _RULER * scale
     # a bar of one meter between the views
-    x = (0.1 + _RULER / 2) * scale + spans[0] + spare
+    x = (0.1 + _RULER / 2) * scale + spans[0] + margin
     ax.plot([x, x], [low, low + 1], color=_FAINT, lw=0.9, marker="_", ms=5)
     _text(ax, x - 0.06 * scale, low + 0.5, "1 m", size=6.5, color=_FAINT, rotation=90, ha="right", va="center")
 
@@ -256,8 +258,8 @@ def _extent(panel: Panel, anchor: np.ndarray, *, seen_from: np.ndarray) -> np.nd
         # single far points must not shrink the person
         views.append(np.percentile(project(points, seen_from=seen_from), (1, 99), axis=0))
     view = np.concatenate(views)[:, :2]
-    at = project(anchor, seen_from=seen_from)[:2]
-    extent = np.clip([view.min(0), view.max(0)], at - _REACH, at + _REACH)
+    center = project(anchor, seen_from=seen_from)[:2]
+    extent = np.clip([view.min(0), view.max(0)], center - _REACH, center + _REACH)
     return extent + np.array([[-0.08, 0], [0.08, 0.05]])
 
 
@@ -278,24 +280,24 @@ def _draw_view(ax, panel: Panel, *, seen_from: np.ndarray, shift: float, window)
     rows = np.flatnonzero(np.isfinite(panel.points).all(-1))
     rows = rows[thinned(len(rows), MAX_POINTS_DRAWN)]
     if len(rows):
-        at, depth = place(panel.points[rows])
+        positions, depth = place(panel.points[rows])
         order = np.argsort(depth, kind="stable")
         colors = _depth_colors(depth) if panel.part is None else _part_colors(panel.part[rows])
         area = np.clip(60 / np.sqrt(len(rows)), 1.8, 9)
-        ax.scatter(*at[order].T, s=area, c=colors[order], linewidths=0, zorder=2).set_clip_path(window)
+        ax.scatter(*positions[order].T, s=area, c=colors[order], linewidths=0, zorder=2).set_clip_path(window)
     if is_known(panel.truth):
         bones = place(panel.truth.joints)[0][bone_pairs(panel.truth.skeleton)]
         add_lines(bones, zorder=3, colors=_TRUTH, linewidths=1.2, linestyles=[_DASHES])
     if is_known(panel.pose):
-        at, depth = place(panel.pose.joints)
-        segments, style = _bones(panel.pose, at, depth)
+        positions, depth = place(panel.pose.joints)
+        segments, style = _bones(panel.pose, positions, depth)
         add_lines(segments, zorder=4, capstyle="round", **style)
-        known = np.isfinite(at).all(-1)
-        weight = confidences(panel.pose)[known]
+        is_finite = np.isfinite(positions).all(-1)
+        weight = confidences(panel.pose)[is_finite]
         ax.scatter(
-            *at[known].T,
+            *positions[is_finite].T,
             s=3 + 5 * weight,
-            c=np.array([SIDE_COLORS[side(name)] for name in panel.pose.skeleton.joints])[known],
+            c=np.array([SIDE_COLORS[side(name)] for name in panel.pose.skeleton.joints])[is_finite],
             edgecolors="white",
             linewidths=0.4,
             alpha=0.25 + 0.75 * weight,
@@ -314,7 +316,7 @@ def _draw_arrow(ax, x: float, y: float, length: float, *, towards_viewer: bool) 
         )
 
 
-def _bones(pose: Pose, at: np.ndarray, depth: np.ndarray) -> tuple[list[np.ndarray], dict[str, list]]:
+def _bones(pose: Pose, positions: np.ndarray, depth: np.ndarray) -> tuple[list[np.ndarray], dict[str, list]]:
     """Segments in the order of drawing, far ones first, each over a white one that parts it from what lies behind."""
     from matplotlib.colors import to_rgba
 
@@ -322,17 +324,17 @@ def _bones(pose: Pose, at: np.ndarray, depth: np.ndarray) -> tuple[list[np.ndarr
     segments, colors, widths = [], [], []
     for k in np.argsort(depth[pairs].sum(1), kind="stable"):
         mean = weight[pairs[k]].mean()
-        line = 1.0 + 1.8 * mean
-        segments += [at[pairs[k]]] * 2
+        line_width = 1.0 + 1.8 * mean
+        segments += [positions[pairs[k]]] * 2
         colors += [to_rgba("white", 0.7 * mean), to_rgba(SIDE_COLORS[sides[k]], 0.25 + 0.75 * mean)]
-        widths += [line + 0.9, line]
+        widths += [line_width + 0.9, line_width]
     return segments, {"colors": colors, "linewidths": widths}
 
 
 def _depth_colors(depth: np.ndarray) -> np.ndarray:
     """(n, 3) in [0, 1]: near points dark, far ones light."""
-    near = np.clip(0.5 + (depth - np.median(depth)) / (2 * _DEPTH_SPAN), 0, 1)[:, None]
-    return near * np.array(_NEAR) + (1 - near) * np.array(_FAR)
+    nearness = np.clip(0.5 + (depth - np.median(depth)) / (2 * _DEPTH_SPAN), 0, 1)[:, None]
+    return nearness * np.array(_NEAR) + (1 - nearness) * np.array(_FAR)
 
 
 def _part_colors(part: np.ndarray) -> np.ndarray:

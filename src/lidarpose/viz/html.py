@@ -65,18 +65,18 @@ def render_report(people: list[Panel], *, title: str, summary: list[dict], scans
     skeletons = {pose.skeleton.name: pose.skeleton for p in people for pose in (p.pose, p.truth) if pose is not None}
     skeletons |= {scan.poses.skeleton.name: scan.poses.skeleton for scan in scans if scan.poses is not None}
     limit = max(_FEWEST_POINTS, MAX_POINTS // max(len(people), 1))
-    drawn = [_person_data(p, limit) for p in people]
+    people_data = [_person_data(p, limit) for p in people]
     data = {
         "schema": _SCHEMA,
         "unit": "mm",
         "skeletons": {name: _skeleton_data(s) for name, s in skeletons.items()},
-        "people": drawn,
+        "people": people_data,
         "scans": [_scan_data(scan, max(_FEWEST_SCAN_POINTS, _SCAN_POINTS // len(scans))) for scan in scans],
     }
     # inside a script element only "<" could end the element early
-    blob = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    json_text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     cards = [_scan_card(f"scan{i}", scan) for i, scan in enumerate(scans)]
-    cards += [_card(i, p, len(d["points"]) // 3) for i, (p, d) in enumerate(zip(people, drawn, strict=True))]
+    cards += [_card(i, p, len(d["points"]) // 3) for i, (p, d) in enumerate(zip(people, people_data, strict=True))]
     fields = {
         "TITLE": escape(title),
         "VERSION": escape(__version__),
@@ -84,7 +84,7 @@ def render_report(people: list[Panel], *, title: str, summary: list[dict], scans
         "SCRIPT": _asset("report.js"),
         "SUMMARY": _table(summary),
         "CARDS": "\n".join(cards) or '<p class="none">no people</p>',
-        "DATA": blob,
+        "DATA": json_text,
     }
     # split once, so that a text of the caller's that looks like a field is left alone
     pieces = _asset("report.html").split("%%")
@@ -126,11 +126,11 @@ def _scan_data(scan: ScanPanel, limit: int) -> dict:
     if len(centers):
         low, high = centers.min(0) - _SCAN_REACH, centers.max(0) + _SCAN_REACH
         points = points[((points[:, :2] > low[:2]) & (points[:, :2] < high[:2])).all(1)]
-    near = np.zeros(len(points), bool)
+    is_near = np.zeros(len(points), bool)
     for box in scan.boxes:
-        near |= box.contains(points, margin=_NEAR)
-    rows = [np.flatnonzero(near), np.flatnonzero(~near)]
-    rows = [own[thinned(len(own), limit // 2)] for own in rows]
+        is_near |= box.contains(points, margin=_NEAR)
+    rows = [np.flatnonzero(is_near), np.flatnonzero(~is_near)]
+    rows = [group[thinned(len(group), limit // 2)] for group in rows]
     points = points[np.sort(np.concatenate(rows))]
     if not len(centers):
         centers = points if len(points) else np.zeros((1, 3))
@@ -138,8 +138,8 @@ def _scan_data(scan: ScanPanel, limit: int) -> dict:
     poses = []
     if scan.poses is not None:
         poses = [Pose(joints=joints, skeleton=scan.poses.skeleton) for joints in scan.poses.joints]
-    drawn = [data for pose in poses if (data := _pose_data(pose, center)) is not None]
-    data = {"points": _millimeters(points, center), "facing": None, "pose": None, "truth": None, "poses": drawn}
+    pose_entries = [data for pose in poses if (data := _pose_data(pose, center)) is not None]
+    data = {"points": _millimeters(points, center), "facing": None, "pose": None, "truth": None, "poses": pose_entries}
     return data | {"labeled": scan.labeled}
 
 
@@ -161,11 +161,11 @@ def _millimeters(points: np.ndarray, center: np.ndarray) -> list[int]:
     return np.rint((np.asarray(points, float) - center) * 1000).astype(int).ravel().tolist()
 
 
-def _card(i: int, person: Panel, drawn: int) -> str:
-    """drawn: how many of the person's points are."""
+def _card(i: int, person: Panel, num_drawn: int) -> str:
+    """num_drawn: how many of the person's points are drawn."""
     notes = [missing_pose(person)]
-    if drawn < len(person.points):
-        notes.append(f"{drawn:,} of {len(person.points):,} points drawn")
+    if num_drawn < len(person.points):
+        notes.append(f"{num_drawn:,} of {len(person.points):,} points drawn")
     return _figure(str(i), "card", person.label, describe(person), [note for note in notes if note])
 
 
@@ -194,8 +194,8 @@ def _decimals(values: list) -> int:
     """So many that the column's largest number shows four digits, at most three, and none that only adds zeros."""
     values = [abs(float(v)) for v in values if not isinstance(v, Integral)]
     largest = max(values, default=0.0)
-    most = int(np.clip(3 - math.floor(math.log10(largest)), 0, 3)) if largest > 0 else 3
-    return next((d for d in range(most) if all(round(v, d) == round(v, most) for v in values)), most)
+    limit = int(np.clip(3 - math.floor(math.log10(largest)), 0, 3)) if largest > 0 else 3
+    return next((d for d in range(limit) if all(round(v, d) == round(v, limit) for v in values)), limit)
 
 
 def _table(rows: list[dict]) -> str:
@@ -206,9 +206,9 @@ def _table(rows: list[dict]) -> str:
     classes, decimals = {}, {}
     for key in columns:
         values = [row[key] for row in rows if not _is_missing(row.get(key))]
-        numeric = bool(values) and all(_is_number(v) for v in values)
-        classes[key] = ' class="number"' if numeric else ""
-        decimals[key] = _decimals(values) if numeric else 3
+        is_numeric = bool(values) and all(_is_number(v) for v in values)
+        classes[key] = ' class="number"' if is_numeric else ""
+        decimals[key] = _decimals(values) if is_numeric else 3
 
     def cell(row: dict, key: str) -> str:
         value = row.get(key)

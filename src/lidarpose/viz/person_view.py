@@ -117,8 +117,8 @@ def describe(person: Panel) -> str:
     words = [f"{count:,} point{'' if count == 1 else 's'}"]
     distance = person.distance
     if distance is None:
-        at = middle(person)
-        distance = None if at is None else float(np.linalg.norm(at))
+        center = middle(person)
+        distance = None if center is None else float(np.linalg.norm(center))
     if distance is not None and np.isfinite(distance):
         words.append(f"{distance:.1f} m")
     if is_known(person.pose) and person.pose.confidence is not None:

@@ -98,8 +98,8 @@ def load_motion(
 
 def _format_of(path: Path) -> str:
     suffix = ".json" if path.is_dir() else path.suffix.lower()
-    for format, (_, its_suffix) in FORMATS.items():
-        if suffix == its_suffix:
+    for format, (_, format_suffix) in FORMATS.items():
+        if suffix == format_suffix:
             return format
     expected = f"a file of motion, one of {', '.join(_SUFFIXES)}, or a folder of them"
     # says whether there is such a file at all
@@ -111,11 +111,11 @@ def _sources(folder: Path, format: str | None) -> list[Path]:
     """Files of motion in a folder and its folders, and its folders of pose files, in the order of their names."""
     suffixes = {suffix for name, (_, suffix) in FORMATS.items() if format in (None, name)}
     sources = []
-    for here, _, names in os.walk(folder):
-        files = [Path(here, name) for name in names if not name.lower().endswith(_NO_MOTION)]
+    for directory, _, names in os.walk(folder):
+        files = [Path(directory, name) for name in names if not name.lower().endswith(_NO_MOTION)]
         sources += [file for file in files if file.suffix.lower() in suffixes - {".json"}]
-        if ".json" in suffixes and pose_files(Path(here)):
-            sources.append(Path(here))
+        if ".json" in suffixes and pose_files(Path(directory)):
+            sources.append(Path(directory))
     return sorted(sources)
 
 
@@ -125,7 +125,7 @@ def digest(path: str | os.PathLike) -> str:
     path = Path(path)
     if not path.is_dir():
         return content_digest(path, expected="motion")[:16]
-    files = sorted(Path(here, name) for here, _, names in os.walk(path) for name in names)
+    files = sorted(Path(directory, name) for directory, _, names in os.walk(path) for name in names)
     files = [file for file in files if file.suffix.lower() in (*_SUFFIXES, ".asf")]
     lines = [f"{file.relative_to(path).as_posix()} {content_digest(file, expected='motion')}" for file in files]
     return hashlib.sha256("\n".join(lines).encode("utf-8", "surrogateescape")).hexdigest()[:16]
@@ -136,5 +136,5 @@ def _name_in_folder(name: str, source: Path, folder: Path) -> str:
     if source == folder:
         return name
     stem = source.name if source.is_dir() else source.stem
-    place = source.relative_to(folder).with_name(stem).as_posix()
-    return place + name.removeprefix(stem) if name.startswith(stem) else f"{place}/{name}"
+    prefix = source.relative_to(folder).with_name(stem).as_posix()
+    return prefix + name.removeprefix(stem) if name.startswith(stem) else f"{prefix}/{name}"

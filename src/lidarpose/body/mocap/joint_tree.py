@@ -49,7 +49,7 @@ _CENTRAL = {
 }
 _ESTIMATED = ("foot", "hand", "collar")
 _PREFIX = re.compile(r"mixamorig\d*|bip\d+|biped|character\d*|def|[mf]|avg|smpl")  # what exporters put in front
-_WORDS = frozenset(word for known in _SIDED.values() for word in known)
+_WORDS = frozenset(word for words in _SIDED.values() for word in words)
 _SIDES = ("left_", "right_")
 # ends of limbs that have no name are called after their parent, with this behind
 END = " (end)"
@@ -93,11 +93,11 @@ class JointTree:
     def positions(self, values: np.ndarray) -> np.ndarray:
         """Joints (F, N, 3) of frames of channels (F, C), C those of all joints in order; NaN in frames with values
         that are not finite."""
-        finite = np.isfinite(values).all(1)
-        columns = iter(values[finite].T)
-        count = int(finite.sum())
+        is_finite = np.isfinite(values).all(1)
+        columns = iter(values[is_finite].T)
+        count = int(is_finite.sum())
         rotations: list[np.ndarray] = []
-        places: list[np.ndarray] = []
+        joint_positions: list[np.ndarray] = []
         for joint in self.joints:
             rotation = np.broadcast_to(np.eye(3), (count, 3, 3))
             offset = np.repeat(joint.offset[None], count, 0)
@@ -105,8 +105,8 @@ class JointTree:
                 if channel[0] == "t":
                     offset[:, "xyz".index(channel[1])] += value
                     continue
-                turn = rotation_about(channel[1], np.radians(value) if self.degrees else value)
-                rotation = rotation @ turn if joint.axes is None else turn @ rotation
+                channel_rotation = rotation_about(channel[1], np.radians(value) if self.degrees else value)
+                rotation = rotation @ channel_rotation if joint.axes is None else channel_rotation @ rotation
             if joint.axes is not None:
                 rotation = joint.axes @ rotation @ joint.axes.T
             with np.errstate(over="ignore", invalid="ignore"):
@@ -115,10 +115,10 @@ class JointTree:
                     rotation = rotations[joint.parent] @ rotation
                 if joint.bone is not None:
                     offset = rotation @ joint.bone + offset
-                places.append(places[joint.parent] + offset if joint.parent >= 0 else offset)
+                joint_positions.append(joint_positions[joint.parent] + offset if joint.parent >= 0 else offset)
             rotations.append(rotation)
         positions = np.full((len(values), len(self.joints), 3), np.nan)
-        positions[finite] = np.stack(places, 1)
+        positions[is_finite] = np.stack(joint_positions, 1)
         return positions
 
 
@@ -146,12 +146,12 @@ def tree_motion(
     """
     matched = match_joints(path, tree.names, tree.parents) if matched is None else matched
     positions = tree.positions(values)
-    name, finite = Path(path).stem, np.isfinite(positions).all((1, 2))
-    usable_clips(path, [name], [len(finite)], finite, fps)
-    joints = np.full((len(finite), 24, 3), np.nan)
+    name, is_finite = Path(path).stem, np.isfinite(positions).all((1, 2))
+    usable_clips(path, [name], [len(is_finite)], is_finite, fps)
+    joints = np.full((len(is_finite), 24, 3), np.nan)
     with np.errstate(over="ignore", invalid="ignore"):
-        joints[finite] = smpl_joints(tree.parents, matched, positions[finite])
-    return motion_from_joints(path, joints, [name], [len(finite)], fps=fps, up=up, kind=kind, unit_m=unit_m)
+        joints[is_finite] = smpl_joints(tree.parents, matched, positions[is_finite])
+    return motion_from_joints(path, joints, [name], [len(is_finite)], fps=fps, up=up, kind=kind, unit_m=unit_m)
 
 
 def match_joints(path: object, names: Sequence[str], parents: Sequence[int]) -> dict[str, int]:
@@ -159,28 +159,28 @@ def match_joints(path: object, names: Sequence[str], parents: Sequence[int]) -> 
     by_word: dict[tuple[str, str], int] = {}
     for i, name in enumerate(names):
         by_word.setdefault(_side_and_word(name), i)
-    matched: dict[str, int] = {}
-    for side, known in (("left_", _SIDED), ("right_", _SIDED), ("", _CENTRAL)):
-        for joint, words in known.items():
+    indices: dict[str, int] = {}
+    for side, words_by_joint in (("left_", _SIDED), ("right_", _SIDED), ("", _CENTRAL)):
+        for joint, words in words_by_joint.items():
             candidates = (by_word.get((side, word)) for word in words)
-            index = next((i for i in candidates if i is not None and i not in matched.values()), None)
+            index = next((i for i in candidates if i is not None and i not in indices.values()), None)
             if index is not None:
-                matched[side + joint] = index
+                indices[side + joint] = index
     ends = {parents[i]: i for i, name in enumerate(names) if name.endswith(END)}
     for tip, base in (("foot", "ankle"), ("hand", "wrist")):
         for side in _SIDES:
-            if side + tip not in matched and matched.get(side + base) in ends:
-                matched[side + tip] = ends[matched[side + base]]
-    needed = [j for j in SMPL24.joints if j not in (*_SPINE, "pelvis", "neck") and not j.endswith(_ESTIMATED)]
-    missing = [joint for joint in needed if joint not in matched]
-    if missing:
-        listed = ", ".join(n for n in names if not n.endswith(END))
+            if side + tip not in indices and indices.get(side + base) in ends:
+                indices[side + tip] = ends[indices[side + base]]
+    required_joints = [j for j in SMPL24.joints if j not in (*_SPINE, "pelvis", "neck") and not j.endswith(_ESTIMATED)]
+    missing_joints = [joint for joint in required_joints if joint not in indices]
+    if missing_joints:
+        name_list = ", ".join(n for n in names if not n.endswith(END))
         raise file_error(
             path,
-            f"has no joint for {', '.join(missing)} among {listed or 'no joints'}; needed are left and right "
+            f"has no joint for {', '.join(missing_joints)} among {name_list or 'no joints'}; needed are left and right "
             "hip/UpLeg, knee/Leg, ankle/Foot, shoulder/Arm, elbow/ForeArm, wrist/Hand, and Head",
         )
-    return matched
+    return indices
 
 
 def smpl_joints(parents: Sequence[int], matched: dict[str, int], positions: np.ndarray) -> np.ndarray:
@@ -199,9 +199,9 @@ def smpl_joints(parents: Sequence[int], matched: dict[str, int], positions: np.n
             joints[f"{side}hand"] = wrist + _length_ratio("elbow", "wrist", "hand") * (wrist - elbow)
         if foot is None or _is_short(foot - ankle, ankle - knee):
             shank = ankle - knee
-            across = forward - (forward * unit(shank)).sum(-1, keepdims=True) * unit(shank)
-            length = _length_ratio("knee", "ankle", "foot") * np.linalg.norm(shank, axis=-1, keepdims=True)
-            joints[f"{side}foot"] = ankle + length * unit(across)
+            foot_direction = forward - (forward * unit(shank)).sum(-1, keepdims=True) * unit(shank)
+            foot_length = _length_ratio("knee", "ankle", "foot") * np.linalg.norm(shank, axis=-1, keepdims=True)
+            joints[f"{side}foot"] = ankle + foot_length * unit(foot_direction)
     return np.stack([joints[name] for name in SMPL24.joints], 1)
 
 
@@ -210,22 +210,24 @@ def _spine(
 ) -> list[np.ndarray]:
     """Spine1-3 (F, 3): the three joints between pelvis and neck, or points on the line through the joints that are
     there, at the shipped body's shares of its length."""
-    between: list[int] = []
+    spine_joints: list[int] = []
     i = matched.get("neck", matched["head"])
     while (i := parents[i]) >= 0 and i != matched.get("pelvis"):
-        between.insert(0, i)
-    line = np.stack([hips, *(positions[:, i] for i in between), neck])
+        spine_joints.insert(0, i)
+    line = np.stack([hips, *(positions[:, i] for i in spine_joints), neck])
     bones = np.median(np.linalg.norm(np.diff(line, axis=0), axis=-1), axis=1)
-    if len(between) == 3 and (bones[1:] > _SAME_JOINT * bones.sum()).all():
-        return [positions[:, i] for i in between]
-    rest = mean_adult_joints()
-    body_line = np.stack([rest[[_J["left_hip"], _J["right_hip"]]].mean(0), *(rest[_J[s]] for s in (*_SPINE, "neck"))])
+    if len(spine_joints) == 3 and (bones[1:] > _SAME_JOINT * bones.sum()).all():
+        return [positions[:, i] for i in spine_joints]
+    rest_joints = mean_adult_joints()
+    body_line = np.stack(
+        [rest_joints[[_J["left_hip"], _J["right_hip"]]].mean(0), *(rest_joints[_J[s]] for s in (*_SPINE, "neck"))]
+    )
     shares = np.cumsum(np.linalg.norm(np.diff(body_line, axis=0), axis=-1))
-    along = np.concatenate([[0], np.cumsum(bones)])
-    at = shares[:3] / shares[3] * along[-1]
-    k = np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(bones) - 1)
-    part = (at - along[k]) / np.maximum(bones[k], 1e-12)
-    return [line[n] + p * (line[n + 1] - line[n]) for n, p in zip(k, part, strict=True)]
+    arc_length = np.concatenate([[0], np.cumsum(bones)])
+    joint_arc_length = shares[:3] / shares[3] * arc_length[-1]
+    k = np.clip(np.searchsorted(arc_length, joint_arc_length, side="right") - 1, 0, len(bones) - 1)
+    fraction = (joint_arc_length - arc_length[k]) / np.maximum(bones[k], 1e-12)
+    return [line[n] + p * (line[n + 1] - line[n]) for n, p in zip(k, fraction, strict=True)]
 
 
 def _length_ratio(start: str, middle: str, end: str) -> float:
@@ -241,8 +243,8 @@ def _is_short(bone: np.ndarray, limb: np.ndarray) -> bool:
 
 def _side_and_word(name: str) -> tuple[str, str]:
     """Side and plain word of a joint's name: "mixamorig:LeftUpLeg" and "Bip01 L_up_leg" -> ("left_", "upleg")."""
-    plain = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=^[LR])(?=[A-Z][a-z])", "_", name.rpartition(":")[2])
-    parts = [part for part in re.split(r"[^a-z0-9]+", plain.lower()) if part]
+    snake_case = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=^[LR])(?=[A-Z][a-z])", "_", name.rpartition(":")[2])
+    parts = [part for part in re.split(r"[^a-z0-9]+", snake_case.lower()) if part]
     while len(parts) > 1 and _PREFIX.fullmatch(parts[0]):
         parts.pop(0)
     marks = [(side, mark) for side in _SIDES for mark in (side[:-1], side[0])]

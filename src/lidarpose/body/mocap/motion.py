@@ -45,8 +45,8 @@ class _ClipTable:
         for name, shape in self.ROWS.items():
             array = getattr(self, name)
             if array.shape != (frames, *shape):
-                wanted = ", ".join(map(str, shape))
-                raise InputError(f"{name} must be (frames, {wanted}), {frames} frames, got {array.shape}")
+                row_shape = ", ".join(map(str, shape))
+                raise InputError(f"{name} must be (frames, {row_shape}), {frames} frames, got {array.shape}")
             if not np.isfinite(array).all():
                 raise InputError(f"{name} must be finite; drop the frames that are not")
         if not 0 < self.fps < np.inf:
@@ -70,13 +70,13 @@ class _ClipTable:
         subjects = (subjects,) if isinstance(subjects, str) else tuple(subjects)
         for subject in subjects:
             if not any(_is_of(name, subject) for name in self.names):
-                known = ", ".join(sorted({name.partition("_")[0] for name in self.names}))
-                raise InputError(f"no clip starts with {subject!r}: there are {known}")
-        chosen = np.array([any(_is_of(name, subject) for subject in subjects) for name in self.names], bool)
-        rows = np.repeat(chosen, self.length)
-        arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in self.ROWS}
-        names = tuple(name for name, is_chosen in zip(self.names, chosen, strict=True) if is_chosen)
-        return replace(self, **arrays, names=names, length=self.length[chosen])
+                subject_list = ", ".join(sorted({name.partition("_")[0] for name in self.names}))
+                raise InputError(f"no clip starts with {subject!r}: there are {subject_list}")
+        clip_mask = np.array([any(_is_of(name, subject) for subject in subjects) for name in self.names], bool)
+        frame_mask = np.repeat(clip_mask, self.length)
+        arrays: dict[str, Any] = {name: getattr(self, name)[frame_mask] for name in self.ROWS}
+        names = tuple(name for name, is_selected in zip(self.names, clip_mask, strict=True) if is_selected)
+        return replace(self, **arrays, names=names, length=self.length[clip_mask])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,9 +112,9 @@ class Motion(_ClipTable):
             return self
         # the small number keeps the last frame where rounding would lose it, as from 30 to 10 frames a second
         length = np.array([int((n - 1) / self.fps * hz + 1e-6) + 1 if n else 0 for n in self.length.tolist()], int)
-        when = [s + np.arange(n) * (self.fps / hz) for s, n in zip(self.start, length, strict=True)]
-        last = np.repeat(self.start + self.length - 1, length)
-        rotations, translation = self._between(np.concatenate([*when, np.zeros(0)]), last)
+        fractional_frames = [s + np.arange(n) * (self.fps / hz) for s, n in zip(self.start, length, strict=True)]
+        last_frame = np.repeat(self.start + self.length - 1, length)
+        rotations, translation = self._between(np.concatenate([*fractional_frames, np.zeros(0)]), last_frame)
         return replace(self, rotations=rotations, translation=translation, length=length, fps=float(hz))
 
     def windows(self, frames: int) -> np.ndarray:
@@ -122,13 +122,13 @@ class Motion(_ClipTable):
 
         `motion.rotations[motion.resampled(10).windows(16)]` would mix rates: cut the motion that was resampled.
         """
-        frame, last = self._last_frames()
-        return frame[frame + frames - 1 <= last, None] + np.arange(frames)
+        frame, last_frame = self._last_frames()
+        return frame[frame + frames - 1 <= last_frame, None] + np.arange(frames)
 
     def cut(self, frames: np.ndarray) -> "Motion":
         """One clip of the frames (n,), as of a row of `windows`."""
-        clip = {"rotations": self.rotations[frames], "translation": self.translation[frames]}
-        return replace(self, **clip, names=("",), length=np.array([len(frames)]))
+        arrays = {"rotations": self.rotations[frames], "translation": self.translation[frames]}
+        return replace(self, **arrays, names=("",), length=np.array([len(frames)]))
 
     def pairs(self, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """All poses that have one `dt` >= 0 seconds later in their clip, with that one.
@@ -137,13 +137,13 @@ class Motion(_ClipTable):
             The poses (n, 24, 3, 3), facing +x; those `dt` later (n, 24, 3, 3) and the way of the pelvis until then
             (n, 3) m, both in the axes of the first; float32.
         """
-        frame, last = self._with_later(dt)
-        later, translation = self._between(frame + dt * self.fps, last)
-        first = self.rotations[frame]
-        unyaw = rotation_about("z", -heading(first))
-        step = (unyaw @ (translation - self.translation[frame])[..., None])[..., 0]
-        later[:, 0] = unyaw @ later[:, 0]
-        return without_yaw(first), later, step.astype(np.float32)
+        frame, last_frame = self._with_later(dt)
+        later_rotations, translation = self._between(frame + dt * self.fps, last_frame)
+        first_rotations = self.rotations[frame]
+        inverse_yaw = rotation_about("z", -heading(first_rotations))
+        step = (inverse_yaw @ (translation - self.translation[frame])[..., None])[..., 0]
+        later_rotations[:, 0] = inverse_yaw @ later_rotations[:, 0]
+        return without_yaw(first_rotations), later_rotations, step.astype(np.float32)
 
     def places(self, dt: float) -> np.ndarray:
         """Where the poses of `pairs` were recorded: (n, 3) float32, the pelvis's x and y m and the heading rad."""
@@ -152,27 +152,27 @@ class Motion(_ClipTable):
 
     def _with_later(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
         """The frames (n,) that have one `dt` s later in their clip, and the last one (n,) of that clip."""
-        frame, last = self._last_frames()
-        has_later = frame + dt * self.fps <= last + 1e-6
-        return frame[has_later], last[has_later]
+        frame, last_frame = self._last_frames()
+        has_later = frame + dt * self.fps <= last_frame + 1e-6
+        return frame[has_later], last_frame[has_later]
 
     def _last_frames(self) -> tuple[np.ndarray, np.ndarray]:
         """All frames (F,), and the last one (F,) of the clip that each is in."""
         return np.arange(len(self.rotations)), np.repeat(self.start + self.length - 1, self.length)
 
-    def _between(self, when: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rotations (n, 24, 3, 3) and translation (n, 3) at frames `when` (n,), not whole, up to their clip's last."""
-        frame = np.minimum((when + 1e-6).astype(int), last)
-        after = np.minimum(frame + 1, last)
-        share = np.clip(when - frame, 0, 1)[:, None]
-        share[share < 1e-5] = 0
+    def _between(self, fractional_frame: np.ndarray, last_frame: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations (n, 24, 3, 3) and translation (n, 3) at frames `fractional_frame` (n,), up to their clip's last."""
+        frame = np.minimum((fractional_frame + 1e-6).astype(int), last_frame)
+        next_frame = np.minimum(frame + 1, last_frame)
+        weight = np.clip(fractional_frame - frame, 0, 1)[:, None]
+        weight[weight < 1e-5] = 0
         rotations, translation = self.rotations[frame], self.translation[frame]
-        mixed = np.flatnonzero(share[:, 0])
-        for block in np.array_split(mixed, len(mixed) // _BLOCK + 1):
-            a, b = self.rotations[frame[block]].astype(float), self.rotations[after[block]].astype(float)
-            turn = rotation_vector(np.swapaxes(a, -1, -2) @ b)
-            rotations[block] = a @ axis_angle_to_matrix(share[block, None] * turn)
-            translation[block] += share[block] * (self.translation[after[block]] - translation[block])
+        interpolated_rows = np.flatnonzero(weight[:, 0])
+        for block in np.array_split(interpolated_rows, len(interpolated_rows) // _BLOCK + 1):
+            a, b = self.rotations[frame[block]].astype(float), self.rotations[next_frame[block]].astype(float)
+            rotation_vectors = rotation_vector(np.swapaxes(a, -1, -2) @ b)
+            rotations[block] = a @ axis_angle_to_matrix(weight[block, None] * rotation_vectors)
+            translation[block] += weight[block] * (self.translation[next_frame[block]] - translation[block])
         return rotations, translation
 
 
@@ -193,23 +193,23 @@ def join(motions: Sequence[Motion], *, source: str) -> Motion:
 def facing_x(rotations: np.ndarray, translation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Clips (n, F, 24, 3, 3) and (n, F, 3) turned about z and moved, so that each begins over the origin (its z is
     kept) and faces +x. Cut them with `Motion.windows`."""
-    unyaw = rotation_about("z", -heading(rotations[:, 0]))[:, None]
+    inverse_yaw = rotation_about("z", -heading(rotations[:, 0]))[:, None]
     rotations = np.array(rotations)
-    rotations[:, :, 0] = unyaw @ rotations[:, :, 0]
-    way = translation - translation[:, :1] * [1, 1, 0]
-    return rotations, (unyaw @ way[..., None])[..., 0].astype(np.float32)
+    rotations[:, :, 0] = inverse_yaw @ rotations[:, :, 0]
+    displacement = translation - translation[:, :1] * [1, 1, 0]
+    return rotations, (inverse_yaw @ displacement[..., None])[..., 0].astype(np.float32)
 
 
 def load_clips(path: str | PathLike) -> Clips:
     """Reads a clips file (its layout is at the top of this module). Raises InputError where it is another."""
-    stored, _ = read_npz(path, (*_KEYS, "joint_names"), expected="an npz file of clips")
-    missing = [key for key in _KEYS if key not in stored]
-    if missing:
-        raise file_error(path, f"clips need {', '.join(_KEYS)}; {', '.join(missing)} is missing")
-    joints, clip, start, length, fps = (stored[key] for key in _KEYS)
-    order = stored.get("joint_names")
-    if order is not None and tuple(map(str, np.ravel(order))) != SMPL24.joints:
-        raise file_error(path, f"joint_names must be SMPL's 24 in SMPL's order, got {', '.join(map(str, order))}")
+    arrays, _ = read_npz(path, (*_KEYS, "joint_names"), expected="an npz file of clips")
+    missing_keys = [key for key in _KEYS if key not in arrays]
+    if missing_keys:
+        raise file_error(path, f"clips need {', '.join(_KEYS)}; {', '.join(missing_keys)} is missing")
+    joints, clip, start, length, fps = (arrays[key] for key in _KEYS)
+    joint_names = arrays.get("joint_names")
+    if joint_names is not None and tuple(map(str, np.ravel(joint_names))) != SMPL24.joints:
+        raise file_error(path, f"joint_names must be SMPL's 24 in SMPL's order, got {', '.join(map(str, joint_names))}")
     if fps.size != 1 or fps.dtype.kind not in "iuf":
         raise file_error(path, f"fps must be one number, got {fps.tolist()}")
     if joints.dtype.kind not in "iuf" or joints.shape[1:] != (24, 3):
@@ -222,8 +222,8 @@ def load_clips(path: str | PathLike) -> Clips:
     # in narrow or unsigned numbers an end could overflow
     start, length = start.astype(np.int64), length.astype(np.int64)
     if ((start < 0) | (length < 0) | (start > len(joints) - length)).any():
-        inside = f"inside the {len(joints)} frames, got up to frame {(start + length).max()}"
-        raise file_error(path, f"clips must lie {inside}")
+        expected = f"inside the {len(joints)} frames, got up to frame {(start + length).max()}"
+        raise file_error(path, f"clips must lie {expected}")
     spans = [np.arange(s, s + n) for s, n in zip(start, length, strict=True)]
     frames = np.concatenate([*spans, np.zeros(0, int)]).astype(int)
     try:
@@ -274,15 +274,15 @@ def usable_clips(
     pieces: list[tuple[str, int]] = []
     for name, end, count in zip(names, np.cumsum(length), length, strict=True):
         frames = slice(end - count, end)
-        bad = count - int(good[frames].sum())
-        if bad > _MOST_DROPPED * count:
+        bad_count = count - int(good[frames].sum())
+        if bad_count > _MOST_DROPPED * count:
             raise file_error(
                 path,
-                f"{bad} of {count} frames have values that are not finite or bones without length "
+                f"{bad_count} of {count} frames have values that are not finite or bones without length "
                 f"(at most {_MOST_DROPPED:.0%} can be left out); repair the recording",
             )
         gaps = np.flatnonzero(np.diff(number[frames][good[frames]]) != 1) + 1
-        for k, piece in enumerate(np.diff([0, *gaps, count - bad]) if count else ()):
+        for k, piece in enumerate(np.diff([0, *gaps, count - bad_count]) if count else ()):
             pieces.append((name if k == 0 else f"{name}#{k + 1}", int(piece)))
     if not pieces:
         raise file_error(path, "holds no frame of motion")

@@ -80,24 +80,24 @@ def motion_from_joints(
     Raises:
         InputError: For sizes or speeds that people do not have, upside down, or with too many frames to leave out.
     """
-    good = np.isfinite(joints).all((1, 2))
-    if not good.any():
+    is_usable = np.isfinite(joints).all((1, 2))
+    if not is_usable.any():
         raise file_error(path, "expected joints at finite positions, got no frame with any")
     with np.errstate(over="ignore", invalid="ignore"):
-        joints = joints * meters_per_unit(path, joints[good], unit_m)
-    if not np.abs(joints[good]).max() < _FARTHEST:
+        joints = joints * meters_per_unit(path, joints[is_usable], unit_m)
+    if not np.abs(joints[is_usable]).max() < _FARTHEST:
         raise file_error(path, "joints lie farther than 100 km from the origin; expected one unit throughout")
-    joints = joints @ rotation_from_up(up or _up_axis(path, joints[good])).T
-    good[good] = shortest_bone(joints[good])[0] > SHORTEST_BONE
-    clips = usable_clips(path, names, length, good, fps)
-    joints = joints[good]
+    joints = joints @ rotation_from_up(up or _up_axis(path, joints[is_usable])).T
+    is_usable[is_usable] = shortest_bone(joints[is_usable])[0] > SHORTEST_BONE
+    clips = usable_clips(path, names, length, is_usable, fps)
+    joints = joints[is_usable]
     _check_speed(path, joints, clips["length"], fps)
     rotations = retarget_positions(joints)
     body = mean_adult_joints()[None].astype(np.float32), rotations, np.zeros((len(joints), 3), np.float32)
-    at_origin = forward_kinematics(SMPL24.parents, *body)[1]
+    origin_joints = forward_kinematics(SMPL24.parents, *body)[1]
     return Motion(
         rotations=rotations,
-        translation=(joints[:, _HIPS].mean(1) - at_origin[:, _HIPS].mean(1)).astype(np.float32),
+        translation=(joints[:, _HIPS].mean(1) - origin_joints[:, _HIPS].mean(1)).astype(np.float32),
         source=f"{kind}: {path}",
         **clips,
     )
@@ -111,8 +111,8 @@ def meters_per_unit(path: object, joints: np.ndarray, unit_m: float | None = Non
         raise file_error(path, "the legs or the trunk have no length; expected the offsets of a person's bones")
     if max(left, right) > _UNEVEN * min(left, right):
         raise file_error(path, f"the left leg is {left:.4g} long, the right {right:.4g}; expected one unit throughout")
-    rest = mean_adult_joints()[None]
-    ratio = ((left + right) / 2 + trunk) / (_median_length(rest, "left_") + _median_length(rest, "trunk"))
+    rest_joints = mean_adult_joints()[None]
+    ratio = ((left + right) / 2 + trunk) / (_median_length(rest_joints, "left_") + _median_length(rest_joints, "trunk"))
     scale = unit_m or min(UNITS.values(), key=lambda m: abs(np.log(ratio * m / _TYPICAL)))
     if not _SMALLEST < ratio * scale < _LARGEST:
         remedy = f"known units are {', '.join(UNITS)}: scale the skeleton to one of them"
@@ -170,90 +170,92 @@ def retarget_positions(joints: np.ndarray) -> np.ndarray:
         raise InputError(f"joints must be (n, 24, 3), SMPL's joints in meters, got {joints.shape}")
     if not np.isfinite(joints).all():
         raise InputError("joints must be finite numbers; drop or fill the missing ones before retargeting")
-    length, which = shortest_bone(joints)
+    length, bone_names = shortest_bone(joints)
     if (length <= SHORTEST_BONE).any():
-        first = int(np.argmax(length <= SHORTEST_BONE))
-        raise InputError(f"{which[first]} has no length in frame {first}: a bone without length has no direction")
-    rest = mean_adult_joints()[None]
+        frame = int(np.argmax(length <= SHORTEST_BONE))
+        raise InputError(f"{bone_names[frame]} has no length in frame {frame}: a bone without length has no direction")
+    rest_joints = mean_adult_joints()[None]
 
-    turn = np.empty((len(joints), 24, 3, 3))  # global rotations G
-    trunk = _trunk(joints, rest)
-    for name, value in zip(("pelvis", "spine1", "spine2", "spine3"), trunk, strict=True):
-        turn[:, _J[name]] = value
+    global_rotations = np.empty((len(joints), 24, 3, 3))  # G
+    trunk = _trunk(joints, rest_joints)
+    for name, rotation in zip(("pelvis", "spine1", "spine2", "spine3"), trunk, strict=True):
+        global_rotations[:, _J[name]] = rotation
     pelvis, torso = trunk[0], trunk[3]
 
     shoulders = np.zeros((len(joints), 3))  # ours, their middle seen from spine3
     for side, sign in (("left", 1.0), ("right", -1.0)):
-        collar = _swing(torso, f"{side}_collar", f"{side}_shoulder", joints, rest)
+        collar = _swing(torso, f"{side}_collar", f"{side}_shoulder", joints, rest_joints)
         # elbows bend about -z (left) or +z (right) at rest, knees about +y
         arm, leg = ([f"{side}_{name}" for name in chain] for chain in (_ARM, _LEG))
-        arm_turns = _limb(collar, arm, np.array([0.0, 0.0, -sign]), _ELBOW_OVERSTRETCH, joints, rest)
-        leg_turns = _limb(pelvis, leg, np.array([0.0, 1.0, 0.0]), _KNEE_OVERSTRETCH, joints, rest)
-        for name, value in zip((f"{side}_collar", *arm, *leg), (collar, *arm_turns, *leg_turns), strict=True):
-            turn[:, _J[name]] = value
-        shoulders += _carried(torso, _bone(rest, "spine3", f"{side}_collar")) / 2
-        shoulders += _carried(collar, _bone(rest, f"{side}_collar", f"{side}_shoulder")) / 2
-    turn[:, _J["neck"]] = turn[:, _J["head"]] = _head(torso, shoulders, joints, rest)
+        arm_turns = _limb(collar, arm, np.array([0.0, 0.0, -sign]), _ELBOW_OVERSTRETCH, joints, rest_joints)
+        leg_turns = _limb(pelvis, leg, np.array([0.0, 1.0, 0.0]), _KNEE_OVERSTRETCH, joints, rest_joints)
+        for name, rotation in zip((f"{side}_collar", *arm, *leg), (collar, *arm_turns, *leg_turns), strict=True):
+            global_rotations[:, _J[name]] = rotation
+        shoulders += _carried(torso, _bone(rest_joints, "spine3", f"{side}_collar")) / 2
+        shoulders += _carried(collar, _bone(rest_joints, f"{side}_collar", f"{side}_shoulder")) / 2
+    global_rotations[:, _J["neck"]] = global_rotations[:, _J["head"]] = _head(torso, shoulders, joints, rest_joints)
 
-    local = turn.copy()
+    local_rotations = global_rotations.copy()
     parents = np.array(SMPL24.parents[1:])
-    local[:, 1:] = np.swapaxes(turn[:, parents], -1, -2) @ turn[:, 1:]
-    return local.astype(np.float32)
+    local_rotations[:, 1:] = np.swapaxes(global_rotations[:, parents], -1, -2) @ global_rotations[:, 1:]
+    return local_rotations.astype(np.float32)
 
 
 def shortest_bone(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of joints (n, 24, 3): the length (n,) m of the shortest line that retargeting needs, and which (n,) it is."""
     lengths = np.stack([np.linalg.norm(_bone(joints, a, b), axis=-1) for a, b in _LINES])
-    which = lengths.argmin(0)
-    return lengths.min(0), np.array([f"{a} -> {b}" for a, b in _LINES])[which]
+    bone_index = lengths.argmin(0)
+    return lengths.min(0), np.array([f"{a} -> {b}" for a, b in _LINES])[bone_index]
 
 
 def _bone(joints: np.ndarray, start: str, end: str) -> np.ndarray:
     return joints[:, _J[end]] - joints[:, _J[start]]
 
 
-def _frame(along: np.ndarray, hint: np.ndarray) -> np.ndarray:
-    """Axes (n, 3, 3), columns: `along`, the part of `hint` across it, their cross product."""
-    first = unit(along)
-    second = unit(hint - (hint * first).sum(-1, keepdims=True) * first)
-    return np.stack([first, second, np.cross(first, second)], -1)
+def _frame(axis: np.ndarray, hint: np.ndarray) -> np.ndarray:
+    """Axes (n, 3, 3), columns: `axis`, the part of `hint` across it, their cross product."""
+    first_axis = unit(axis)
+    second_axis = unit(hint - (hint * first_axis).sum(-1, keepdims=True) * first_axis)
+    return np.stack([first_axis, second_axis, np.cross(first_axis, second_axis)], -1)
 
 
-def _turn(along: np.ndarray, hint: np.ndarray, rest_along: np.ndarray, rest_hint: np.ndarray) -> np.ndarray:
-    return _frame(along, hint) @ np.swapaxes(_frame(rest_along, rest_hint), -1, -2)
+def _turn(axis: np.ndarray, hint: np.ndarray, rest_axis: np.ndarray, rest_hint: np.ndarray) -> np.ndarray:
+    return _frame(axis, hint) @ np.swapaxes(_frame(rest_axis, rest_hint), -1, -2)
 
 
 def _middle(joints: np.ndarray, name: str) -> np.ndarray:
     return (joints[:, _J[f"left_{name}"]] + joints[:, _J[f"right_{name}"]]) / 2
 
 
-def _carried(turn: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """turn (n, 3, 3) applied to offset (1, 3) -> (n, 3)."""
-    return turn @ offset[0]
+def _carried(rotation: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """rotation (n, 3, 3) applied to offset (1, 3) -> (n, 3)."""
+    return rotation @ offset[0]
 
 
-def _trunk(joints: np.ndarray, rest: np.ndarray) -> list[np.ndarray]:
+def _trunk(joints: np.ndarray, rest_joints: np.ndarray) -> list[np.ndarray]:
     """Global rotations of pelvis and spine1-3: the bend is shared evenly, the line hips -> neck is the source's."""
-    pelvis, torso = (frame(joints) @ np.swapaxes(frame(rest), -1, -2) for frame in (_pelvis_frame, _torso_frame))
-    across = rotation_vector(np.swapaxes(pelvis, -1, -2) @ torso)
-    turns = [pelvis, *(pelvis @ axis_angle_to_matrix(share * across) for share in (1 / 3, 2 / 3)), torso]
+    pelvis, torso = (frame(joints) @ np.swapaxes(frame(rest_joints), -1, -2) for frame in (_pelvis_frame, _torso_frame))
+    bend = rotation_vector(np.swapaxes(pelvis, -1, -2) @ torso)
+    rotations = [pelvis, *(pelvis @ axis_angle_to_matrix(share * bend) for share in (1 / 3, 2 / 3)), torso]
     # spines are curved and cut differently in every skeleton, the line from the hips to the neck is not
-    line = _carried(pelvis, rest[:, _J["spine1"]] - _middle(rest, "hip"))
-    for turn, start, end in zip(turns[1:], ("spine1", "spine2", "spine3"), ("spine2", "spine3", "neck"), strict=True):
-        line = line + _carried(turn, _bone(rest, start, end))
-    fix = rotation_between(line, joints[:, _J["neck"]] - _middle(joints, "hip"))
-    return [fix @ turn for turn in turns]
+    hips_to_neck = _carried(pelvis, rest_joints[:, _J["spine1"]] - _middle(rest_joints, "hip"))
+    for rotation, start, end in zip(
+        rotations[1:], ("spine1", "spine2", "spine3"), ("spine2", "spine3", "neck"), strict=True
+    ):
+        hips_to_neck = hips_to_neck + _carried(rotation, _bone(rest_joints, start, end))
+    correction = rotation_between(hips_to_neck, joints[:, _J["neck"]] - _middle(joints, "hip"))
+    return [correction @ rotation for rotation in rotations]
 
 
-def _head(torso: np.ndarray, shoulders: np.ndarray, joints: np.ndarray, rest: np.ndarray) -> np.ndarray:
+def _head(torso: np.ndarray, shoulders: np.ndarray, joints: np.ndarray, rest_joints: np.ndarray) -> np.ndarray:
     """The neck's global rotation: the head in the source's direction from the middle of the shoulders.
 
     The bone neck -> head is too short and too differently cut for its own direction to be of use.
     """
-    reach = np.linalg.norm(rest[:, _J["head"]] - _middle(rest, "shoulder"))
-    head = shoulders + reach * unit(joints[:, _J["head"]] - _middle(joints, "shoulder"))
-    neck = _carried(torso, _bone(rest, "spine3", "neck"))
-    return rotation_between(_carried(torso, _bone(rest, "neck", "head")), head - neck) @ torso
+    head_distance = np.linalg.norm(rest_joints[:, _J["head"]] - _middle(rest_joints, "shoulder"))
+    head = shoulders + head_distance * unit(joints[:, _J["head"]] - _middle(joints, "shoulder"))
+    neck = _carried(torso, _bone(rest_joints, "spine3", "neck"))
+    return rotation_between(_carried(torso, _bone(rest_joints, "neck", "head")), head - neck) @ torso
 
 
 def _pelvis_frame(joints: np.ndarray) -> np.ndarray:
@@ -262,51 +264,58 @@ def _pelvis_frame(joints: np.ndarray) -> np.ndarray:
 
 def _torso_frame(joints: np.ndarray) -> np.ndarray:
     shoulders, collars = (_bone(joints, f"right_{name}", f"left_{name}") for name in ("shoulder", "collar"))
-    width = np.linalg.norm(collars, axis=-1, keepdims=True) / np.linalg.norm(shoulders, axis=-1, keepdims=True)
+    width_ratio = np.linalg.norm(collars, axis=-1, keepdims=True) / np.linalg.norm(shoulders, axis=-1, keepdims=True)
     # the collars are rigid with the chest and the shoulders are not, but some skeletons put both collars in one point
-    across = np.where(width > _LEAST_COLLAR_WIDTH, collars, shoulders)
+    lateral_axis = np.where(width_ratio > _LEAST_COLLAR_WIDTH, collars, shoulders)
     up = _bone(joints, "spine3", "neck")
-    return _frame(up, across)
+    return _frame(up, lateral_axis)
 
 
-def _swing(parent: np.ndarray, start: str, end: str, joints: np.ndarray, rest: np.ndarray) -> np.ndarray:
+def _swing(parent: np.ndarray, start: str, end: str, joints: np.ndarray, rest_joints: np.ndarray) -> np.ndarray:
     """The parent's rotation (n, 3, 3) plus the smallest turn that gives the bone start -> end its direction."""
-    return rotation_between(_carried(parent, _bone(rest, start, end)), _bone(joints, start, end)) @ parent
+    return rotation_between(_carried(parent, _bone(rest_joints, start, end)), _bone(joints, start, end)) @ parent
 
 
-def _hinge(first: np.ndarray, second: np.ndarray, straight: np.ndarray, overstretch: float) -> np.ndarray:
-    """The axis (n, 3) about which `second` is bent from `first`, `straight` where the joint is straight.
+def _hinge(upper: np.ndarray, lower: np.ndarray, straight_axis: np.ndarray, overstretch: float) -> np.ndarray:
+    """The axis (n, 3) about which `lower` is bent from `upper`, `straight_axis` where the joint is straight.
 
-    A small bend the other way round than `straight` is a joint stretched too far; a larger one, over `overstretch`
-    (a sine) more, is a limb that is rotated that far. In between the axis changes without a jump.
+    A small bend the other way round than `straight_axis` is a joint stretched too far; a larger one, over
+    `overstretch` (a sine) more, is a limb that is rotated that far. In between the axis changes without a jump.
     """
-    first, second, straight = unit(first), unit(second), unit(straight)
-    normal = np.cross(first, second)
+    upper, lower, straight_axis = unit(upper), unit(lower), unit(straight_axis)
+    normal = np.cross(upper, lower)
     # the sine falls again beyond a right angle, where the bend is as plain as can be
-    bend = np.where((first * second).sum(-1) > 0, np.linalg.norm(normal, axis=-1), 1.0)[:, None]
+    bend_sine = np.where((upper * lower).sum(-1) > 0, np.linalg.norm(normal, axis=-1), 1.0)[:, None]
     normal = unit(normal)
-    against = np.clip(-(normal * straight).sum(-1, keepdims=True), 0, 1)
+    opposition = np.clip(-(normal * straight_axis).sum(-1, keepdims=True), 0, 1)
     low, high = _BEND_FADE
-    weight = np.clip((bend - low - overstretch * against) / (high - low), 0, 1)
+    weight = np.clip((bend_sine - low - overstretch * opposition) / (high - low), 0, 1)
     # evenly from one to the other; where they are opposite, about the limb
-    about = np.cross(straight, normal)
-    sine = np.linalg.norm(about, axis=-1, keepdims=True)
-    angle = np.arctan2(sine, (straight * normal).sum(-1, keepdims=True))
-    about = np.where(sine > 1e-6, unit(about), first)
-    return (axis_angle_to_matrix(weight * angle * about) @ straight[..., None])[..., 0]
+    rotation_axis = np.cross(straight_axis, normal)
+    sine = np.linalg.norm(rotation_axis, axis=-1, keepdims=True)
+    angle = np.arctan2(sine, (straight_axis * normal).sum(-1, keepdims=True))
+    rotation_axis = np.where(sine > 1e-6, unit(rotation_axis), upper)
+    return (axis_angle_to_matrix(weight * angle * rotation_axis) @ straight_axis[..., None])[..., 0]
 
 
 def _limb(
-    parent: np.ndarray, names: list[str], hinge: np.ndarray, overstretch: float, joints: np.ndarray, rest: np.ndarray
+    parent: np.ndarray,
+    names: list[str],
+    hinge: np.ndarray,
+    overstretch: float,
+    joints: np.ndarray,
+    rest_joints: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
     """Global rotations of a limb's four joints, named; the last goes with the one before. parent (n, 3, 3): of what it
     hangs on; hinge (3,): the axis that its second joint bends about at rest; overstretch: see `_hinge`."""
-    bones, rests = ([_bone(j, a, b) for a, b in zip(names[:-1], names[1:], strict=True)] for j in (joints, rest))
-    straight = _swing(parent, names[0], names[1], joints, rest) @ hinge
+    bones, rest_bones = (
+        [_bone(j, a, b) for a, b in zip(names[:-1], names[1:], strict=True)] for j in (joints, rest_joints)
+    )
+    straight_axis = _swing(parent, names[0], names[1], joints, rest_joints) @ hinge
     if names[0].endswith("hip"):
         # where the leg is straight its foot says about what; short where the foot is stretched along the shank
-        straight = straight + 2 * np.cross(unit(bones[2]), unit(bones[1]))
-    axis = _hinge(bones[0], bones[1], straight, overstretch)
-    upper, lower = (_turn(bones[k], axis, rests[k], hinge[None]) for k in (0, 1))
-    end = _swing(lower, names[2], names[3], joints, rest)
+        straight_axis = straight_axis + 2 * np.cross(unit(bones[2]), unit(bones[1]))
+    axis = _hinge(bones[0], bones[1], straight_axis, overstretch)
+    upper, lower = (_turn(bones[k], axis, rest_bones[k], hinge[None]) for k in (0, 1))
+    end = _swing(lower, names[2], names[3], joints, rest_joints)
     return upper, lower, end, end

@@ -59,8 +59,8 @@ def load_amc(path: str | os.PathLike, *, up: str | None = None, fps: float | Non
     one in the folder. fps: by default CMU's 120; up: by default y.
     """
     tree, values, unit_m = read_amc(path)
-    matched = {joint: tree.names.index(bone) for joint, bone in _BONES.items() if bone in tree.names}
-    return tree_motion(path, tree, values, fps=fps or CMU_FPS, up=up or "y", kind="AMC", unit_m=unit_m, matched=matched)
+    indices = {joint: tree.names.index(bone) for joint, bone in _BONES.items() if bone in tree.names}
+    return tree_motion(path, tree, values, fps=fps or CMU_FPS, up=up or "y", kind="AMC", unit_m=unit_m, matched=indices)
 
 
 def _numbers(path: object, what: str, words: Sequence[str], count: int | None = None) -> np.ndarray:
@@ -88,14 +88,14 @@ def read_bvh(path: str | os.PathLike) -> tuple[JointTree, np.ndarray, float | No
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     if not lines or lines[0].upper() != "HIERARCHY":
         raise file_error(path, f"a BVH file starts with HIERARCHY, got {lines[0][:40] if lines else 'nothing'!r}")
-    motion = next((i for i, line in enumerate(lines) if line.upper() == "MOTION"), None)
-    if motion is None:
+    motion_index = next((i for i, line in enumerate(lines) if line.upper() == "MOTION"), None)
+    if motion_index is None:
         raise file_error(path, "has no MOTION part; was it copied completely?")
-    tree = JointTree(joints=_bvh_joints(path, lines[1:motion]))
-    width = sum(len(joint.channels) for joint in tree.joints)
-    if not width:
+    tree = JointTree(joints=_bvh_joints(path, lines[1:motion_index]))
+    channel_count = sum(len(joint.channels) for joint in tree.joints)
+    if not channel_count:
         raise file_error(path, "no joint has CHANNELS, so nothing moves: was it exported with its motion?")
-    return tree, *_bvh_frames(path, lines[motion + 1 :], width)
+    return tree, *_bvh_frames(path, lines[motion_index + 1 :], channel_count)
 
 
 def _bvh_joints(path: object, lines: list[str]) -> list[Joint]:
@@ -105,24 +105,24 @@ def _bvh_joints(path: object, lines: list[str]) -> list[Joint]:
     for line in lines:
         key, *words = line.split()
         key = key.upper()
-        inside = open_joints and not awaits_brace
-        here = joints[open_joints[-1]] if inside else None
-        if key in ("JOINT", "END") and here or (key == "ROOT" and not joints):
-            name = here.name + END if here and key == "END" else line[len(key) :].strip()
-            joints.append(Joint(name=name, parent=open_joints[-1] if here else -1))
+        is_inside = open_joints and not awaits_brace
+        joint = joints[open_joints[-1]] if is_inside else None
+        if key in ("JOINT", "END") and joint or (key == "ROOT" and not joints):
+            name = joint.name + END if joint and key == "END" else line[len(key) :].strip()
+            joints.append(Joint(name=name, parent=open_joints[-1] if joint else -1))
             awaits_brace = True
         elif key == "{" and awaits_brace:
             open_joints.append(len(joints) - 1)
             awaits_brace = False
-        elif here and key == "}":
-            if here.offset is None:
-                raise file_error(path, f"joint {here.name} has no OFFSET")
-            here.offset = np.where([f"t{axis}" in here.channels for axis in "xyz"], 0, here.offset)
+        elif joint and key == "}":
+            if joint.offset is None:
+                raise file_error(path, f"joint {joint.name} has no OFFSET")
+            joint.offset = np.where([f"t{axis}" in joint.channels for axis in "xyz"], 0, joint.offset)
             open_joints.pop()
-        elif here and key == "OFFSET":
-            here.offset = _numbers(path, f"OFFSET of {here.name}", words, 3)
-        elif here and key == "CHANNELS":
-            here.channels = _bvh_channels(path, here.name, words)
+        elif joint and key == "OFFSET":
+            joint.offset = _numbers(path, f"OFFSET of {joint.name}", words, 3)
+        elif joint and key == "CHANNELS":
+            joint.channels = _bvh_channels(path, joint.name, words)
         else:
             expected = "one ROOT, and in its braces OFFSET, CHANNELS, JOINT and End Site"
             raise file_error(path, f"{line[:60]!r} stands where it cannot; expected {expected}")
@@ -134,14 +134,16 @@ def _bvh_joints(path: object, lines: list[str]) -> list[Joint]:
 def _bvh_channels(path: object, name: str, words: list[str]) -> list[str]:
     if not words or words[0] != str(len(words) - 1):
         raise file_error(path, f"CHANNELS of {name} must be a count and as many names, got {' '.join(words)[:60]!r}")
-    unknown = [word for word in words[1:] if word.lower() not in _BVH_CHANNELS]
-    if unknown:
-        raise file_error(path, f"{name} has the channel {unknown[0]!r}; known are Xposition, Zrotation and the like")
+    unknown_channels = [word for word in words[1:] if word.lower() not in _BVH_CHANNELS]
+    if unknown_channels:
+        raise file_error(
+            path, f"{name} has the channel {unknown_channels[0]!r}; known are Xposition, Zrotation and the like"
+        )
     return [_BVH_CHANNELS[word.lower()] for word in words[1:]]
 
 
-def _bvh_frames(path: object, lines: list[str], width: int) -> tuple[np.ndarray, float | None]:
-    """The values (F, width), and frames a second or None."""
+def _bvh_frames(path: object, lines: list[str], channel_count: int) -> tuple[np.ndarray, float | None]:
+    """The values (F, channel_count), and frames a second or None."""
     header = {key.strip().lower(): value for key, _, value in (line.partition(":") for line in lines[:2])}
     if list(header) != ["frames", "frame time"]:
         raise file_error(path, "MOTION must begin with Frames: and Frame Time:; was it copied completely?")
@@ -152,11 +154,11 @@ def _bvh_frames(path: object, lines: list[str], width: int) -> tuple[np.ndarray,
     except ValueError:
         seconds = 0.0
     values = _numbers(path, "the frames of MOTION", " ".join(lines[2:]).split())
-    if len(values) != int(header["frames"]) * width:
-        expected = f"{header['frames'].strip()[:20]} frames of {width} numbers"
+    if len(values) != int(header["frames"]) * channel_count:
+        expected = f"{header['frames'].strip()[:20]} frames of {channel_count} numbers"
         raise file_error(path, f"expected {expected}, got {len(values)} numbers; was it copied completely?")
     # a frame time of almost nothing would be an infinite rate
-    return values.reshape(-1, width), 1 / seconds if 1e-6 < seconds < np.inf else None
+    return values.reshape(-1, channel_count), 1 / seconds if 1e-6 < seconds < np.inf else None
 
 
 # ASF and AMC
@@ -169,12 +171,14 @@ def read_amc(path: str | os.PathLike) -> tuple[JointTree, np.ndarray, float]:
     values = _amc_frames(path)
     skeleton = _skeleton_of(path)
     tree, unit_m = read_asf(skeleton)
-    unknown = sorted(values.keys() - set(tree.names))
-    if unknown:
-        raise file_error(path, f"moves {', '.join(unknown)[:80]}, which {skeleton.name} does not have; is it this one?")
-    missing = [bone for joint, bone in _BONES.items() if bone not in tree.names and joint not in _OPTIONAL]
-    if missing:
-        raise file_error(skeleton, f"has no bone {', '.join(missing)} among {', '.join(sorted(tree.names))}")
+    unknown_bones = sorted(values.keys() - set(tree.names))
+    if unknown_bones:
+        raise file_error(
+            path, f"moves {', '.join(unknown_bones)[:80]}, which {skeleton.name} does not have; is it this one?"
+        )
+    missing_bones = [bone for joint, bone in _BONES.items() if bone not in tree.names and joint not in _OPTIONAL]
+    if missing_bones:
+        raise file_error(skeleton, f"has no bone {', '.join(missing_bones)} among {', '.join(sorted(tree.names))}")
     for joint in tree.joints:
         if joint.name not in values:
             joint.channels = ()
@@ -192,8 +196,8 @@ def _skeleton_of(path: Path) -> Path:
             return skeletons[f"{stem}.asf".lower()]
     if len(skeletons) == 1:
         return next(iter(skeletons.values()))
-    others = f" (there are {', '.join(sorted(skeletons))})" if skeletons else ""
-    raise file_error(path, f"an AMC file needs its skeleton: put {subject}.asf or {path.stem}.asf beside it{others}")
+    hint = f" (there are {', '.join(sorted(skeletons))})" if skeletons else ""
+    raise file_error(path, f"an AMC file needs its skeleton: put {subject}.asf or {path.stem}.asf beside it{hint}")
 
 
 def _words_of_lines(path: Path, expected: str) -> list[list[str]]:
@@ -211,10 +215,12 @@ def read_asf(path: Path) -> tuple[JointTree, float]:
             words = words[1:]
         if words:
             section.append(words)
-    needed = (":root", ":bonedata", ":hierarchy")
-    missing = [name for name in needed if name not in sections]
-    if missing:
-        raise file_error(path, f"an ASF file has {', '.join(needed)}; {', '.join(missing)} is missing")
+    required_sections = (":root", ":bonedata", ":hierarchy")
+    missing_sections = [name for name in required_sections if name not in sections]
+    if missing_sections:
+        raise file_error(
+            path, f"an ASF file has {', '.join(required_sections)}; {', '.join(missing_sections)} is missing"
+        )
     units = {words[0].lower(): words[1] for words in sections.get(":units", []) if len(words) > 1}
     length = _numbers(path, "length of :units", [units.get("length", "0.45")], 1)[0]
     if not 1e-6 < length < 1e6:
@@ -224,56 +230,58 @@ def read_asf(path: Path) -> tuple[JointTree, float]:
         raise file_error(path, f"angle of :units must be deg or rad, got {angle[:40]!r}")
     degrees = angle.startswith("deg")
     bones = {"root": _root(path, {words[0].lower(): words[1:] for words in sections[":root"]}, degrees)}
-    for name, stored in _bone_data(path, sections[":bonedata"]):
+    for name, properties in _bone_data(path, sections[":bonedata"]):
         if name in bones:
             raise file_error(path, f"has the bone {name} twice")
-        bones[name] = _bone(path, name, stored, degrees)
+        bones[name] = _bone(path, name, properties, degrees)
     return JointTree(joints=_in_tree_order(path, sections[":hierarchy"], bones), degrees=degrees), _INCH / length
 
 
-def _root(path: Path, stored: dict[str, list[str]], degrees: bool) -> Joint:
-    channels = tuple(word.lower() for word in stored.get("order", _ASF_CHANNELS))
+def _root(path: Path, properties: dict[str, list[str]], degrees: bool) -> Joint:
+    channels = tuple(word.lower() for word in properties.get("order", _ASF_CHANNELS))
     if sorted(channels) != sorted(_ASF_CHANNELS):
         raise file_error(path, f"order of :root must be TX TY TZ RX RY RZ in any order, got {' '.join(channels)[:60]}")
-    offset = _numbers(path, "position of :root", list(stored.get("position", "000")), 3)
-    axes = _rotation(path, "root", [*stored.get("orientation", "000"), *stored.get("axis", [])[:1]], degrees)
+    offset = _numbers(path, "position of :root", list(properties.get("position", "000")), 3)
+    axes = _rotation(path, "root", [*properties.get("orientation", "000"), *properties.get("axis", [])[:1]], degrees)
     return Joint(name="root", parent=-1, offset=offset, channels=channels, bone=np.zeros(3), axes=axes)
 
 
 def _bone_data(path: Path, lines: list[list[str]]) -> list[tuple[str, dict[str, list[str]]]]:
     """The bones' names and what is stored of each, the first of every keyword."""
     bones: list[tuple[str, dict[str, list[str]]]] = []
-    stored: dict[str, list[str]] | None = None
+    properties: dict[str, list[str]] | None = None
     for key, *words in lines:
         key = key.lower()
         if key == "begin":
-            stored = {}
+            properties = {}
         elif key == "end":
-            if not stored or not stored.get("name"):
+            if not properties or not properties.get("name"):
                 raise file_error(path, "a bone of :bonedata has no name, or an end without begin")
-            bones.append((stored["name"][0], stored))
-            stored = None
-        elif stored is not None:
-            stored.setdefault(key, words)
-    if stored is not None:
+            bones.append((properties["name"][0], properties))
+            properties = None
+        elif properties is not None:
+            properties.setdefault(key, words)
+    if properties is not None:
         raise file_error(path, ":bonedata stops inside a bone; was it copied completely?")
     return bones
 
 
-def _bone(path: Path, name: str, stored: dict[str, list[str]], degrees: bool) -> Joint:
-    missing = [key for key in ("direction", "length") if key not in stored]
-    if missing:
-        raise file_error(path, f"bone {name} has no {', '.join(missing)}")
-    direction = _numbers(path, f"direction of {name}", stored["direction"], 3)
-    length = _numbers(path, f"length of {name}", stored["length"], 1)[0]
-    channels = tuple(word.lower() for word in stored.get("dof", []))
-    unknown = [word for word in channels if word not in _ASF_CHANNELS]
-    if unknown:
-        raise file_error(path, f"bone {name} has the freedom {unknown[0][:40]!r}; known are {', '.join(_ASF_CHANNELS)}")
+def _bone(path: Path, name: str, properties: dict[str, list[str]], degrees: bool) -> Joint:
+    missing_keys = [key for key in ("direction", "length") if key not in properties]
+    if missing_keys:
+        raise file_error(path, f"bone {name} has no {', '.join(missing_keys)}")
+    direction = _numbers(path, f"direction of {name}", properties["direction"], 3)
+    length = _numbers(path, f"length of {name}", properties["length"], 1)[0]
+    channels = tuple(word.lower() for word in properties.get("dof", []))
+    unknown_channels = [word for word in channels if word not in _ASF_CHANNELS]
+    if unknown_channels:
+        raise file_error(
+            path, f"bone {name} has the freedom {unknown_channels[0][:40]!r}; known are {', '.join(_ASF_CHANNELS)}"
+        )
     with np.errstate(over="ignore"):
-        size = np.linalg.norm(direction)
-        bone = direction / size * length if 0 < size < np.inf else np.zeros(3)
-    axes = _rotation(path, name, stored.get("axis", list("000")), degrees)
+        norm = np.linalg.norm(direction)
+        bone = direction / norm * length if 0 < norm < np.inf else np.zeros(3)
+    axes = _rotation(path, name, properties.get("axis", list("000")), degrees)
     return Joint(name=name, offset=np.zeros(3), channels=channels, bone=bone, axes=axes)
 
 
@@ -295,9 +303,9 @@ def _in_tree_order(path: Path, lines: list[list[str]], bones: dict[str, Joint]) 
     for parent, *children in lines:
         if parent.lower() in ("begin", "end") and not children:
             continue
-        unknown = [word for word in (parent, *children) if word not in bones]
-        if unknown:
-            raise file_error(path, f":hierarchy names {unknown[0][:40]!r}, which :bonedata does not have")
+        unknown_bones = [word for word in (parent, *children) if word not in bones]
+        if unknown_bones:
+            raise file_error(path, f":hierarchy names {unknown_bones[0][:40]!r}, which :bonedata does not have")
         for child in children:
             if child in parent_of or child == "root":
                 raise file_error(path, f":hierarchy has {child} twice")
@@ -308,9 +316,9 @@ def _in_tree_order(path: Path, lines: list[list[str]], bones: dict[str, Joint]) 
         for child in children:
             bones[child].parent = k
         order += children
-    loose = [name for name in bones if name not in order]
-    if loose:
-        raise file_error(path, f"{', '.join(loose)[:80]} hangs from nothing in :hierarchy")
+    orphan_bones = [name for name in bones if name not in order]
+    if orphan_bones:
+        raise file_error(path, f"{', '.join(orphan_bones)[:80]} hangs from nothing in :hierarchy")
     return [bones[name] for name in order]
 
 

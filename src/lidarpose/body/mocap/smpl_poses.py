@@ -78,33 +78,35 @@ def motion_from_smpl(
         InputError: For other shapes, degrees, far-off positions and, unless `up` is given, where people do not stand
             along z: those whose `up` is given may lie.
     """
-    world = rotation_from_up(up or "z")
+    R_level_world = rotation_from_up(up or "z")
     try:
         pose, trans = np.asarray(pose, float), np.asarray(trans, float)
     except (TypeError, ValueError, OverflowError, MemoryError):
         raise file_error(path, "pose and trans must be numbers in rows of equal length") from None
     if pose.ndim != 2 or pose.shape[1] != _SMPL or trans.shape != (len(pose), 3):
         raise file_error(path, f"{kind} needs pose (frames, 72) and trans (frames, 3), got {pose.shape}, {trans.shape}")
-    good = np.isfinite(pose).all(1) & np.isfinite(trans).all(1)
-    clips = usable_clips(path, [name], [len(good)], good, fps, number)
-    pose, trans = pose[good].reshape(-1, 24, 3), trans[good]
+    is_usable = np.isfinite(pose).all(1) & np.isfinite(trans).all(1)
+    clips = usable_clips(path, [name], [len(is_usable)], is_usable, fps, number)
+    pose, trans = pose[is_usable].reshape(-1, 24, 3), trans[is_usable]
     with np.errstate(over="ignore"):
-        most, far = np.linalg.norm(pose, axis=-1).max(), np.linalg.norm(trans, axis=-1).max()
-    if most > _MOST_TURN:
-        raise file_error(path, f"pose has a turn of {most:.4g} rad; {kind} has axis-angles in radians, not degrees")
-    if far > _FARTHEST:
-        raise file_error(path, f"trans is {far:.4g} m from the origin; expected meters")
+        max_angle, max_distance = np.linalg.norm(pose, axis=-1).max(), np.linalg.norm(trans, axis=-1).max()
+    if max_angle > _MOST_TURN:
+        raise file_error(
+            path, f"pose has a turn of {max_angle:.4g} rad; {kind} has axis-angles in radians, not degrees"
+        )
+    if max_distance > _FARTHEST:
+        raise file_error(path, f"trans is {max_distance:.4g} m from the origin; expected meters")
 
     rotations = np.empty((len(pose), 24, 3, 3), np.float32)
     rotations[:, 1:] = _R_LEVEL_SMPL @ axis_angle_to_matrix(pose[:, 1:]) @ _R_LEVEL_SMPL.T
-    root = axis_angle_to_matrix(pose[:, 0])
-    rotations[:, 0] = world @ root @ _R_LEVEL_SMPL.T
-    axis = standing_axis(root[..., 1])
+    root_rotations = axis_angle_to_matrix(pose[:, 0])
+    rotations[:, 0] = R_level_world @ root_rotations @ _R_LEVEL_SMPL.T
+    axis = standing_axis(root_rotations[..., 1])
     if up is None and axis not in ("z", None):
         raise file_error(path, f"people stand along {axis}, not z; give load_motion up={axis!r}")
     return Motion(
         rotations=rotations,
-        translation=(trans @ world.T).astype(np.float32),
+        translation=(trans @ R_level_world.T).astype(np.float32),
         source=f"{kind}: {path}",
         **clips,
     )
@@ -112,18 +114,18 @@ def motion_from_smpl(
 
 def load_amass(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
     """The motion of an AMASS file as one clip, named as the file."""
-    stored, names = read_npz(
+    arrays, names = read_npz(
         path, ("poses", "root_orient", "pose_body", "trans", *_RATES), expected="an npz file of motion"
     )
-    poses = stored.get("poses")
-    if poses is None and {"root_orient", "pose_body"} <= stored.keys():
-        parts = stored["root_orient"], stored["pose_body"]
+    poses = arrays.get("poses")
+    if poses is None and {"root_orient", "pose_body"} <= arrays.keys():
+        parts = arrays["root_orient"], arrays["pose_body"]
         if [part.shape[1:] for part in parts] != [(3,), (63,)] or len(parts[0]) != len(parts[1]):
             raise file_error(
                 path, f"needs root_orient (N, 3) and pose_body (N, 63), got {parts[0].shape}, {parts[1].shape}"
             )
         poses = np.concatenate(parts, 1)
-    if poses is None or "trans" not in stored:
+    if poses is None or "trans" not in arrays:
         raise file_error(
             path,
             f"holds {', '.join(names) or 'nothing'}; an npz of motion needs poses (or root_orient and "
@@ -132,11 +134,11 @@ def load_amass(path: str | os.PathLike, *, up: str | None = None, fps: float | N
     if poses.dtype.kind not in "iuf" or poses.ndim != 2 or poses.shape[1] < _BODY:
         raise file_error(path, f"poses must be numbers (N, 66 or more) as (N, 156), got {poses.dtype} {poses.shape}")
     if fps is None:
-        fps = _frame_rate(path, next((stored[key] for key in _RATES if key in stored), None), _RATES[0])
+        fps = _frame_rate(path, next((arrays[key] for key in _RATES if key in arrays), None), _RATES[0])
     width = _SMPL if poses.shape[1] == _SMPL else _BODY
     pose = np.zeros((len(poses), _SMPL))
     pose[:, :width] = poses[:, :width]
-    return motion_from_smpl(path, pose, stored["trans"], name=Path(path).stem, fps=fps, up=up, kind="AMASS")
+    return motion_from_smpl(path, pose, arrays["trans"], name=Path(path).stem, fps=fps, up=up, kind="AMASS")
 
 
 def load_sloper4d(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
@@ -147,11 +149,11 @@ def load_sloper4d(path: str | os.PathLike, *, up: str | None = None, fps: float 
     motions = []
     for person in (p for p in _PEOPLE if isinstance(labels.get(p), dict)):
         pairs = [(labels[person].get(f"{prefix}pose"), labels[person].get(f"{prefix}trans")) for prefix in ("opt_", "")]
-        poses = next((pair for pair in pairs if pair[0] is not None and pair[1] is not None), None)
-        if poses is not None:
+        pose_and_trans = next((pair for pair in pairs if pair[0] is not None and pair[1] is not None), None)
+        if pose_and_trans is not None:
             rate = fps or _frame_rate(path, labels.get("framerate"), "framerate")
             name = f"{Path(path).stem}_{person.removesuffix('_person')}"
-            motions.append(motion_from_smpl(path, *poses, name=name, fps=rate, up=up, kind="SLOPER4D"))
+            motions.append(motion_from_smpl(path, *pose_and_trans, name=name, fps=rate, up=up, kind="SLOPER4D"))
     if not motions:
         keys = ", ".join(map(str, labels)) or "nothing"
         raise file_error(path, f"expected second_person with pose (n, 72) and trans (n, 3), got {keys}")
@@ -171,8 +173,8 @@ def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: fl
         name = str(entry.get("seq_path", entry.get("motion_id", Path(path).stem)))
         try:
             pose = np.asarray(entry["gt"] if entry.get("gt") is not None else entry["gt_joint"], float)
-            place = next((entry[key] for key in ("T_1", "trans") if entry.get(key) is not None), np.zeros(3))
-            trans = np.asarray(place, float).reshape(3)
+            position = next((entry[key] for key in ("T_1", "trans") if entry.get(key) is not None), np.zeros(3))
+            trans = np.asarray(position, float).reshape(3)
             # of NoiseMotion's three the middle one, as its reader
             pose = pose.reshape(-1, _SMPL)[pose.size // _SMPL // 2]
         except (KeyError, TypeError, ValueError, OverflowError, IndexError):
@@ -180,17 +182,17 @@ def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: fl
         clips.setdefault(name, []).append((pose, trans))
     if not clips:
         raise file_error(path, "expected LIPD's, FreeMotion's or NoiseMotion's dicts with gt (72) or gt_joint (24, 3)")
-    posed = any(isinstance(entry, dict) and entry.get("gt") is not None for entry in entries)
+    has_poses = any(isinstance(entry, dict) and entry.get("gt") is not None for entry in entries)
     rate, length = fps or LIDARHUMAN26M_FPS, [len(frames) for frames in clips.values()]
-    poses, places = map(np.array, zip(*(frame for frames in clips.values() for frame in frames), strict=True))
-    if not posed:
-        joints = poses.reshape(-1, 24, 3) + places[:, None]
+    poses, positions = map(np.array, zip(*(frame for frames in clips.values() for frame in frames), strict=True))
+    if not has_poses:
+        joints = poses.reshape(-1, 24, 3) + positions[:, None]
         return motion_from_joints(path, joints, list(clips), length, fps=rate, up=up, kind="LIPD", unit_m=1.0)
     # their loaders do not say which axis is up
     up = up or standing_axis(axis_angle_to_matrix(poses[:, :3])[..., 1]) or "z"
     ends = np.cumsum(length)
     motions = [
-        motion_from_smpl(path, poses[e - n : e], places[e - n : e], name=name, fps=rate, up=up, kind="a corpus")
+        motion_from_smpl(path, poses[e - n : e], positions[e - n : e], name=name, fps=rate, up=up, kind="a corpus")
         for name, n, e in zip(clips, length, ends, strict=True)
     ]
     return join(motions, source=f"corpus: {path}")

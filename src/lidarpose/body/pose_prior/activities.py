@@ -30,9 +30,9 @@ ARM_NAMES = tuple(TABLES["arms"])
 OWN_ARMS, CAPTURED_ARMS = ARM_NAMES.index("own"), ARM_NAMES.index("as_captured")
 
 
-def _angle(activity: dict, name: str, plain: str) -> list[float]:
+def _angle(activity: dict, name: str, plain_name: str) -> list[float]:
     angles = activity.get("angles", {})
-    return angles.get(name, angles.get(plain, TABLES["angles"][plain]["default"]))
+    return angles.get(name, angles.get(plain_name, TABLES["angles"][plain_name]["default"]))
 
 
 def _arm_odds(activity: dict) -> list[float]:
@@ -88,12 +88,12 @@ def rotations_from_angles(angles: np.ndarray) -> np.ndarray:
     euler[:, _COLLAR_LIFTS] += _LIFT_SIGNS * collar_lift(angles[:, _RAISED_OUT])
     rotations = _from_euler(np.radians(euler.reshape(len(angles), 24, 3)))
     inward = np.radians(angles[:, _INWARD])
-    turn = np.zeros((len(angles), 2, 3, 3), np.float32)
-    turn[..., 0, 0] = turn[..., 2, 2] = np.cos(inward)
-    turn[..., 0, 2] = np.sin(inward)
-    turn[..., 2, 0] = -turn[..., 0, 2]
-    turn[..., 1, 1] = 1
-    rotations[:, _SHOULDERS] = rotations[:, _SHOULDERS] @ turn
+    inward_rotation = np.zeros((len(angles), 2, 3, 3), np.float32)
+    inward_rotation[..., 0, 0] = inward_rotation[..., 2, 2] = np.cos(inward)
+    inward_rotation[..., 0, 2] = np.sin(inward)
+    inward_rotation[..., 2, 0] = -inward_rotation[..., 0, 2]
+    inward_rotation[..., 1, 1] = 1
+    rotations[:, _SHOULDERS] = rotations[:, _SHOULDERS] @ inward_rotation
     return rotations
 
 
@@ -140,12 +140,12 @@ def _euler_map() -> tuple[np.ndarray, np.ndarray]:
     matrix, zero = np.zeros((len(ANGLES), 24, 3), np.float32), np.zeros((24, 3), np.float32)
     y, x, z = 0, 1, 2
     # the joints that share angles about y, x and z, evenly
-    shared = {
+    joints_by_angles = {
         ("tilt", "roll", "yaw"): ("pelvis",),
         ("bend", "side", "twist"): ("spine1", "spine2", "spine3"),
         ("nod", "neck_side", "neck_twist"): ("neck", "head"),
     }
-    for names, joints in shared.items():
+    for names, joints in joints_by_angles.items():
         for axis, name in enumerate(names):
             matrix[ANGLE_INDEX[name], [_J[joint] for joint in joints], axis] = 1 / len(joints)
     for side, sign in _SIDES:
@@ -163,11 +163,11 @@ EULER_FROM_ANGLES, _AT_ZERO = _euler_map()
 
 
 def _mirror() -> tuple[np.ndarray, np.ndarray]:
-    other = {"left": "right_", "right": "left_"}
+    other_side = {"left": "right_", "right": "left_"}
     parts = [name.partition("_") for name in ANGLES]
-    index = [ANGLE_INDEX[other[a] + c if a in other else a + b + c] for a, b, c in parts]
-    odd = ("roll", "yaw", "side", "twist", "neck_side", "neck_twist")
-    return np.array(index), np.array([-1.0 if name in odd else 1.0 for name in ANGLES])
+    index = [ANGLE_INDEX[other_side[a] + c if a in other_side else a + b + c] for a, b, c in parts]
+    odd_angles = ("roll", "yaw", "side", "twist", "neck_side", "neck_twist")
+    return np.array(index), np.array([-1.0 if name in odd_angles else 1.0 for name in ANGLES])
 
 
 _MIRROR_INDEX, _MIRROR_SIGN = _mirror()

@@ -34,16 +34,16 @@ def _capsules() -> tuple[np.ndarray, ...]:
             rows[f"{side}_{name}"] = (_J[f"{side}_{c['joint']}"], start, end, c["radius"])
     index = {name: i for i, name in enumerate(rows)}
     pairs = []
-    for side, other in (("left", "right"), ("right", "left")):
+    for side, other_side in (("left", "right"), ("right", "left")):
         for a, b in collisions["same_side"]:
             pairs.append((index[f"{side}_{a}"], index[b if b in trunk else f"{side}_{b}"]))
         for a, b in collisions["across"]:
             if side == "left" or a != b:
-                pairs.append((index[f"{side}_{a}"], index[f"{other}_{b}"]))
+                pairs.append((index[f"{side}_{a}"], index[f"{other_side}_{b}"]))
     joint, start, end, radius = (np.array(column) for column in zip(*rows.values(), strict=True))
-    on_floor = [[TABLES["activities"][kind].get(word, ()) for kind in KINDS] for word in ("rests_on", "touches")]
-    rests = np.array([[[name in parts for name in rows] for parts in kinds] for kinds in on_floor])
-    return joint, np.stack([start, end], 1).astype(np.float32), radius.astype(np.float32), np.array(pairs), rests
+    floor_parts = [[TABLES["activities"][kind].get(word, ()) for kind in KINDS] for word in ("rests_on", "touches")]
+    floor_mask = np.array([[[name in parts for name in rows] for parts in kinds] for kinds in floor_parts])
+    return joint, np.stack([start, end], 1).astype(np.float32), radius.astype(np.float32), np.array(pairs), floor_mask
 
 
 def _mass_of_joints() -> np.ndarray:
@@ -75,10 +75,10 @@ _LEVELS = _levels()
 @cache
 def _bones() -> np.ndarray:
     """(24, 3, 1) float32 m: from each joint's parent to it at rest."""
-    rest = mean_adult_joints()
+    rest_joints = mean_adult_joints()
     parents = np.array(SMPL24.parents)
     parents[0] = 0  # the root is at the origin
-    return np.ascontiguousarray((rest - rest[parents])[..., None], np.float32)
+    return np.ascontiguousarray((rest_joints - rest_joints[parents])[..., None], np.float32)
 
 
 def body_frames(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -87,14 +87,14 @@ def body_frames(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     `rig.forward_kinematics` a level of the tree at a time, float32.
     """
     # rotation and bone in one 3 x 4 matrix: half the products
-    local = np.empty((len(rotations), 24, 3, 4), np.float32)
-    local[..., :3], local[..., 3:] = rotations, _bones()
-    frames = local.copy()
+    local_frames = np.empty((len(rotations), 24, 3, 4), np.float32)
+    local_frames[..., :3], local_frames[..., 3:] = rotations, _bones()
+    frames = local_frames.copy()
     for rows, parents in _LEVELS:
-        parent = frames[:, parents]
-        frame = parent[..., :3] @ local[:, rows]
-        frame[..., 3] += parent[..., 3]
-        frames[:, rows] = frame
+        parent_frames = frames[:, parents]
+        level_frames = parent_frames[..., :3] @ local_frames[:, rows]
+        level_frames[..., 3] += parent_frames[..., 3]
+        frames[:, rows] = level_frames
     return frames[..., :3], frames[..., 3]
 
 
@@ -105,8 +105,8 @@ def capsule_ends(rotations: np.ndarray, joints: np.ndarray) -> np.ndarray:
 
 def undersides(ends: np.ndarray) -> np.ndarray:
     """ends (n, C, 2, 3) -> (n, 2 C, 3) m: the lowest point of the ball at each end of each capsule."""
-    low = ends - _RADIUS[:, None, None] * np.array([0, 0, 1], np.float32)
-    return low.reshape(len(ends), 2 * len(_JOINT), 3)
+    lowest_points = ends - _RADIUS[:, None, None] * np.array([0, 0, 1], np.float32)
+    return lowest_points.reshape(len(ends), 2 * len(_JOINT), 3)
 
 
 def self_collision(ends: np.ndarray) -> np.ndarray:
@@ -120,8 +120,8 @@ def hovering(ends: np.ndarray, kind: np.ndarray) -> np.ndarray:
     feet."""
     gap = np.zeros(len(kind), np.float32)
     rows = np.flatnonzero(_ON_FLOOR[kind])
-    low = (ends[rows, ..., 2] - _RADIUS[:, None]).min(2)
-    gap[rows] = np.where(_RESTS[kind[rows]], low - low.min(1, keepdims=True), 0).max(1)
+    bottom_height = (ends[rows, ..., 2] - _RADIUS[:, None]).min(2)
+    gap[rows] = np.where(_RESTS[kind[rows]], bottom_height - bottom_height.min(1, keepdims=True), 0).max(1)
     return gap
 
 
@@ -133,23 +133,23 @@ def mass_center(joints: np.ndarray) -> np.ndarray:
 def _segment_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Least distance (...) of segments a and b (..., 2, 3): nearest points of the lines, clamped (Ericson,
     Real-Time Collision Detection, 5.1.9)."""
-    start, other = a[..., 0, :], b[..., 0, :]
-    u, v, w = a[..., 1, :] - start, b[..., 1, :] - other, start - other
+    start, other_start = a[..., 0, :], b[..., 0, :]
+    u, v, w = a[..., 1, :] - start, b[..., 1, :] - other_start, start - other_start
     ones = np.ones(3, np.float32)
     uu, vv, uv, uw, vw = ((x * y) @ ones for x, y in ((u, u), (v, v), (u, v), (u, w), (v, w)))
     s = np.clip((uv * vw - uw * vv) / np.maximum(uu * vv - uv * uv, 1e-9), 0, 1)
     t = np.clip((uv * s + vw) / vv, 0, 1)
     s = np.clip((uv * t - uw) / uu, 0, 1)
-    apart = w + s[..., None] * u - t[..., None] * v
-    return np.sqrt((apart * apart) @ ones)
+    difference = w + s[..., None] * u - t[..., None] * v
+    return np.sqrt((difference * difference) @ ones)
 
 
 @cache
 def _leg_offsets() -> tuple[np.ndarray, ...]:
     """Of the left and the right leg, float32 m: from the pelvis to the hip, from the hip to the knee, from the knee to
     the ankle, each (2, 3), and from the ankle to the sole's points (2, 4, 3)."""
-    rest = mean_adult_joints()
-    hip, knee, ankle = rest[_HIPS], rest[_KNEES], rest[_ANKLES]
+    rest_joints = mean_adult_joints()
+    hip, knee, ankle = rest_joints[_HIPS], rest_joints[_KNEES], rest_joints[_ANKLES]
     sole = np.stack([_SOLE, _SOLE * [1, -1, 1]])
     return tuple(np.asarray(v, np.float32) for v in (hip, knee - hip, ankle - knee, sole))
 
@@ -176,19 +176,21 @@ def planted_way(points: np.ndarray) -> np.ndarray:
     share = np.exp((height.min(-1, keepdims=True) - height) / np.float32(_BEARING))
     share = share / share.sum(-1, keepdims=True)
     share = (share[:, 1:] + share[:, :-1]) / 2
-    way = np.zeros((*points.shape[:2], 3), points.dtype)
-    np.cumsum(-np.einsum("ntp,ntpk->ntk", share, np.diff(points[..., :2], axis=1)), 1, out=way[:, 1:, :2])
-    return way
+    displacement = np.zeros((*points.shape[:2], 3), points.dtype)
+    np.cumsum(-np.einsum("ntp,ntpk->ntk", share, np.diff(points[..., :2], axis=1)), 1, out=displacement[:, 1:, :2])
+    return displacement
 
 
 def walked_way(pace: np.ndarray, strides: np.ndarray, course: np.ndarray) -> np.ndarray:
     """The way (n, T, 2) m over the ground of people who make `pace` (n, T) m a stride, have made `strides` (n, T) and
     head for `course` (n, T) rad."""
-    way = np.zeros((*pace.shape, 2))
-    middle = (course[:, 1:] + course[:, :-1]) / 2
-    step = (pace[:, 1:] + pace[:, :-1]) / 2 * np.diff(strides, axis=1)
-    np.cumsum(step[..., None] * np.stack([np.cos(middle), np.sin(middle)], -1), 1, out=way[:, 1:])
-    return way
+    displacement = np.zeros((*pace.shape, 2))
+    mean_course = (course[:, 1:] + course[:, :-1]) / 2
+    step_length = (pace[:, 1:] + pace[:, :-1]) / 2 * np.diff(strides, axis=1)
+    np.cumsum(
+        step_length[..., None] * np.stack([np.cos(mean_course), np.sin(mean_course)], -1), 1, out=displacement[:, 1:]
+    )
+    return displacement
 
 
 # kinds that keep their balance: on both feet or on a foot and a knee, and on one foot
@@ -219,8 +221,8 @@ def balanced(angles: np.ndarray, kind: np.ndarray) -> np.ndarray:
     of what it stands on; the leg that reaches lower bends more, or the front leg of a kneeling body reaches to the
     ground. One linear step, whose error is millimeters; several for the unusual kinds, whose legs are bent far.
     """
-    for moves in (_STATIC | _ONE_FOOT, *[_AGAIN] * 2):
-        angles = _balance_once(angles, kind, np.flatnonzero(moves[kind]))
+    for kind_mask in (_STATIC | _ONE_FOOT, *[_AGAIN] * 2):
+        angles = _balance_once(angles, kind, np.flatnonzero(kind_mask[kind]))
     return angles
 
 
@@ -228,20 +230,28 @@ def _balance_once(angles: np.ndarray, kind: np.ndarray, rows: np.ndarray) -> np.
     """A step of `balanced` for some rows."""
     if not len(rows):
         return angles
-    part, kneel = angles[rows], kind[rows] == _KNEEL
-    rotations = rotations_from_angles(part)
+    row_angles, is_kneeling = angles[rows], kind[rows] == _KNEEL
+    rotations = rotations_from_angles(row_angles)
     joints = body_frames(rotations)[1]
     points = _ground_points(rotations, joints)
     center = mass_center(joints)
-    lean = _lean(part, overhang(center, _bearing_points(part, points, kneel)), center, joints, kneel)
+    lean = _lean(
+        row_angles, overhang(center, _bearing_points(row_angles, points, is_kneeling)), center, joints, is_kneeling
+    )
     # the lean changes the feet's heights too: the soles stay level to the front
     points[:, :8, 2] -= np.repeat(joints[:, _ANKLES, 0], 4, 1) * lean[:, :1]
     points[:, :8, 2] -= (points[:, :8, 1] - np.repeat(joints[:, _HIPS, 1], 4, 1)) * lean[:, 1:]
-    both = _STATIC[kind[rows]]
-    least = np.where(_AGAIN[kind[rows[both]]], _SHORTEST[0], _SHORTEST[1])
-    part[both] = _level_feet(part[both], joints[both], points[both], kneel[both], least[:, None])
+    is_on_both_feet = _STATIC[kind[rows]]
+    least_reach = np.where(_AGAIN[kind[rows[is_on_both_feet]]], _SHORTEST[0], _SHORTEST[1])
+    row_angles[is_on_both_feet] = _level_feet(
+        row_angles[is_on_both_feet],
+        joints[is_on_both_feet],
+        points[is_on_both_feet],
+        is_kneeling[is_on_both_feet],
+        least_reach[:, None],
+    )
     angles = angles.copy()
-    angles[rows] = np.clip(part, LIMITS[0], LIMITS[1])
+    angles[rows] = np.clip(row_angles, LIMITS[0], LIMITS[1])
     return angles
 
 
@@ -249,14 +259,14 @@ def overhang(center: np.ndarray, points: np.ndarray, margin: float = _MARGIN) ->
     """center (n, 3) of mass, points (n, P, 3) that may bear it -> (n, 2) m: the way the center must go for it to lie
     `margin` inside the outline of the lowest points; 0 where it does."""
     height = points[..., 2] - points[..., 2].min(1, keepdims=True)
-    light = _FADE * np.maximum(height - _TOUCHING, 0)
-    flat = points[..., :2]
-    share = np.exp(-light / 0.05)[..., None]
-    middle = (share * flat).sum(1) / share.sum(1)
-    outline = (flat @ _AROUND - light[..., None]).max(1)
-    room, wide = outline - center[:, :2] @ _AROUND, outline - middle @ _AROUND
-    share = np.clip((margin - room) / np.maximum(wide - room, 1e-4), 0, 1).max(1)
-    return share[:, None] * (middle - center[:, :2])
+    penalty = _FADE * np.maximum(height - _TOUCHING, 0)
+    points_xy = points[..., :2]
+    weight = np.exp(-penalty / 0.05)[..., None]
+    weighted_center = (weight * points_xy).sum(1) / weight.sum(1)
+    outline = (points_xy @ _AROUND - penalty[..., None]).max(1)
+    clearance, half_width = outline - center[:, :2] @ _AROUND, outline - weighted_center @ _AROUND
+    fraction = np.clip((margin - clearance) / np.maximum(half_width - clearance, 1e-4), 0, 1).max(1)
+    return fraction[:, None] * (weighted_center - center[:, :2])
 
 
 def _ground_points(rotations: np.ndarray, joints: np.ndarray) -> np.ndarray:
@@ -265,43 +275,47 @@ def _ground_points(rotations: np.ndarray, joints: np.ndarray) -> np.ndarray:
     return np.concatenate([sole_points(rotations).reshape(len(joints), 8, 3), knees], 1)
 
 
-def _bearing_points(part: np.ndarray, points: np.ndarray, kneel: np.ndarray) -> np.ndarray:
+def _bearing_points(angles: np.ndarray, points: np.ndarray, is_kneeling: np.ndarray) -> np.ndarray:
     """The points that will bear the body when it is level: of one that kneels both soles and the knee behind."""
-    rows = np.flatnonzero(kneel)
+    rows = np.flatnonzero(is_kneeling)
     points = points.copy()
     points[rows, :, 2] = 0
-    points[rows, 8 + part[rows][:, _HIP].argmax(1), 2] = 1
+    points[rows, 8 + angles[rows][:, _HIP].argmax(1), 2] = 1
     return points
 
 
 def _level_feet(
-    part: np.ndarray, joints: np.ndarray, points: np.ndarray, kneel: np.ndarray, least: np.ndarray
+    angles: np.ndarray, joints: np.ndarray, points: np.ndarray, is_kneeling: np.ndarray, least_reach: np.ndarray
 ) -> np.ndarray:
     """The poses (n, 27) with legs bent so that both feet, or the front foot and the other knee, are equally low, in
-    place too; least (n, 1) m from hip to ankle."""
-    rest = mean_adult_joints()[[_HIPS[0], _KNEES[0], _ANKLES[0]]]
-    thigh, shank = np.linalg.norm(np.diff(rest, axis=0), axis=1).tolist()
-    low = np.stack([points[:, :4, 2].min(1), points[:, 4:8, 2].min(1)], 1)
-    up = low.max(1, keepdims=True) - low
-    i = np.flatnonzero(kneel)
-    if len(i):
-        front = part[i][:, _HIP].argmax(1)
-        rear = 1 - front
-        floor = points[i, 8 + rear, 2]
-        up[i] = 0
-        up[i, front] = floor - low[i, front]
+    place too; least_reach (n, 1) m from hip to ankle."""
+    rest_joints = mean_adult_joints()[[_HIPS[0], _KNEES[0], _ANKLES[0]]]
+    thigh, shank = np.linalg.norm(np.diff(rest_joints, axis=0), axis=1).tolist()
+    sole_height = np.stack([points[:, :4, 2].min(1), points[:, 4:8, 2].min(1)], 1)
+    lift = sole_height.max(1, keepdims=True) - sole_height
+    kneeling_rows = np.flatnonzero(is_kneeling)
+    if len(kneeling_rows):
+        front_leg = angles[kneeling_rows][:, _HIP].argmax(1)
+        rear_leg = 1 - front_leg
+        floor_height = points[kneeling_rows, 8 + rear_leg, 2]
+        lift[kneeling_rows] = 0
+        lift[kneeling_rows, front_leg] = floor_height - sole_height[kneeling_rows, front_leg]
         # the toes behind touch the floor beside the knee
-        part[i, _KNEE[rear]] += np.degrees((floor - low[i, rear]) / shank)
-    leg = joints[:, _ANKLES] - joints[:, _HIPS]
-    reach = np.linalg.norm(leg, axis=-1)
-    steep = np.maximum(-leg[..., 2] / reach, 0.5)
+        angles[kneeling_rows, _KNEE[rear_leg]] += np.degrees(
+            (floor_height - sole_height[kneeling_rows, rear_leg]) / shank
+        )
+    leg_vector = joints[:, _ANKLES] - joints[:, _HIPS]
+    reach = np.linalg.norm(leg_vector, axis=-1)
+    steepness = np.maximum(-leg_vector[..., 2] / reach, 0.5)
     knee, fold = _triangle(reach, thigh, shank)
-    new_knee, new_fold = _triangle(np.clip(reach - up / steep, least, 0.9985 * (thigh + shank)), thigh, shank)
-    knee, fold = np.where(up != 0, new_knee - knee, 0), np.where(up != 0, new_fold - fold, 0)
-    part[:, _KNEE] += knee
-    part[:, _HIP] += fold
-    part[:, _ANKLE] += knee - fold
-    return part
+    new_knee, new_fold = _triangle(
+        np.clip(reach - lift / steepness, least_reach, 0.9985 * (thigh + shank)), thigh, shank
+    )
+    knee, fold = np.where(lift != 0, new_knee - knee, 0), np.where(lift != 0, new_fold - fold, 0)
+    angles[:, _KNEE] += knee
+    angles[:, _HIP] += fold
+    angles[:, _ANKLE] += knee - fold
+    return angles
 
 
 def _triangle(reach: np.ndarray, thigh: float, shank: float) -> tuple[np.ndarray, np.ndarray]:
@@ -310,18 +324,21 @@ def _triangle(reach: np.ndarray, thigh: float, shank: float) -> tuple[np.ndarray
     return np.degrees(bend), np.degrees(np.arctan2(shank * np.sin(bend), thigh + shank * np.cos(bend)))
 
 
-def _lean(part: np.ndarray, way: np.ndarray, center: np.ndarray, joints: np.ndarray, kneel: np.ndarray) -> np.ndarray:
-    """Leans bodies, in place, so that their centers of mass go `way` (n, 2) m. Returns how far legs turn, (n, 2) rad,
-    forwards with the body and to the left under it."""
+def _lean(
+    angles: np.ndarray, displacement: np.ndarray, center: np.ndarray, joints: np.ndarray, is_kneeling: np.ndarray
+) -> np.ndarray:
+    """Leans bodies, in place, so that their centers of mass go `displacement` (n, 2) m. Returns how far legs turn,
+    (n, 2) rad, forwards with the body and to the left under it."""
     height = np.maximum(center[:, 2] - joints[:, _ANKLES, 2].min(1), 0.3)
-    forward, left = way[:, 0] / np.where(kneel, _TRUNK_LEAN, height), way[:, 1] / height
-    degrees = np.degrees(forward)
-    part[:, ANGLE_INDEX["tilt"]] += degrees
+    forward_angle = displacement[:, 0] / np.where(is_kneeling, _TRUNK_LEAN, height)
+    left_angle = displacement[:, 1] / height
+    forward_degrees = np.degrees(forward_angle)
+    angles[:, ANGLE_INDEX["tilt"]] += forward_degrees
     # the body turns about its ankles, or the trunk about the hips
-    part[:, _ANKLE] += np.where(kneel, 0, degrees)[:, None]
-    part[:, _HIP] += np.where(kneel, degrees, 0)[:, None]
-    part[:, _ABD] += np.degrees(left)[:, None] * np.array([-1, 1])
-    return np.stack([np.where(kneel, 0, forward), left], 1)
+    angles[:, _ANKLE] += np.where(is_kneeling, 0, forward_degrees)[:, None]
+    angles[:, _HIP] += np.where(is_kneeling, forward_degrees, 0)[:, None]
+    angles[:, _ABD] += np.degrees(left_angle)[:, None] * np.array([-1, 1])
+    return np.stack([np.where(is_kneeling, 0, forward_angle), left_angle], 1)
 
 
 # the limbs: their capsules and the angles that move them, from the trunk outwards
@@ -340,27 +357,29 @@ def settled(angles: np.ndarray, kind: np.ndarray) -> np.ndarray:
     rows = np.flatnonzero(_ON_FLOOR[kind])
     if not len(rows):
         return angles
-    part, rests, touches = angles[rows], _RESTS[kind[rows]], _TOUCHES[kind[rows]][:, _LIMBS]
-    several = np.tile(rests, (4, 1))
+    row_angles, rest_mask, touch_mask = angles[rows], _RESTS[kind[rows]], _TOUCHES[kind[rows]][:, _LIMBS]
+    repeated_rest_mask = np.tile(rest_mask, (4, 1))
     for _ in range(_STEPS):
         # as it is, and with each of a limb's three angles a degree larger
-        bent = np.tile(part, (4, 1, 1))
+        perturbed_angles = np.tile(row_angles, (4, 1, 1))
         for k in range(3):
-            bent[1 + k, :, _LIMB_ANGLES[:, k]] += 1.0
-        height, *larger = _limb_heights(bent.reshape(-1, part.shape[1]), several).reshape(4, len(rows), 4, 3)
-        slope = np.stack(larger, -1) - height[..., None]
-        across = np.swapaxes(slope, -1, -2)
-        wrong = np.where(touches, height, np.minimum(height, 0))[..., None]
-        step = (across @ np.linalg.solve(slope @ across + _DAMPING * np.eye(3), wrong))[..., 0]
-        part[:, _LIMB_ANGLES] -= np.clip(step, -_LONGEST, _LONGEST)
-        part = np.clip(part, LIMITS[0], LIMITS[1])
+            perturbed_angles[1 + k, :, _LIMB_ANGLES[:, k]] += 1.0
+        height, *perturbed_height = _limb_heights(
+            perturbed_angles.reshape(-1, row_angles.shape[1]), repeated_rest_mask
+        ).reshape(4, len(rows), 4, 3)
+        jacobian = np.stack(perturbed_height, -1) - height[..., None]
+        transpose = np.swapaxes(jacobian, -1, -2)
+        residual = np.where(touch_mask, height, np.minimum(height, 0))[..., None]
+        step = (transpose @ np.linalg.solve(jacobian @ transpose + _DAMPING * np.eye(3), residual))[..., 0]
+        row_angles[:, _LIMB_ANGLES] -= np.clip(step, -_LONGEST, _LONGEST)
+        row_angles = np.clip(row_angles, LIMITS[0], LIMITS[1])
     angles = angles.copy()
-    angles[rows] = part
+    angles[rows] = row_angles
     return angles
 
 
-def _limb_heights(angles: np.ndarray, rests: np.ndarray) -> np.ndarray:
+def _limb_heights(angles: np.ndarray, rest_mask: np.ndarray) -> np.ndarray:
     """(n, 4, 3) m: how high the limbs' capsules are above the lowest part that the body rests on."""
     ends = capsule_ends(*body_frames(rotations_from_angles(angles)))
-    low = (ends[..., 2] - _RADIUS[:, None]).min(2)
-    return low[:, _LIMBS] - np.where(rests, low, np.inf).min(1)[:, None, None]
+    bottom_height = (ends[..., 2] - _RADIUS[:, None]).min(2)
+    return bottom_height[:, _LIMBS] - np.where(rest_mask, bottom_height, np.inf).min(1)[:, None, None]

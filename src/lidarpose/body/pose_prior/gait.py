@@ -78,21 +78,21 @@ def add_stride(gait: ndarray, phase: ndarray, style: ndarray, base: ndarray) -> 
             swing, crouch, turn of the hips, asymmetry of the arms.
         base: (n, 27) degrees, thighs from the vertical.
     """
-    length, lift, swing, elbow, elbow_swing, crouch, turn, uneven = style.T
+    length, lift, swing, elbow, elbow_swing, crouch, turn, asymmetry = style.T
     # walkers with long steps swing their arms far and most bend their elbows little
-    runs = gait == _RUN
-    swing = np.where(runs, swing, swing * (0.4 + 0.6 * (0.35 + length)))
-    elbow = np.where(runs, elbow, elbow**1.5)
+    is_running = gait == _RUN
+    swing = np.where(is_running, swing, swing * (0.4 + 0.6 * (0.35 + length)))
+    elbow = np.where(is_running, elbow, elbow**1.5)
     length, lift, swing, elbow, elbow_swing = (
         _RANGES[name][gait, 0] + _RANGES[name][gait, 1] * value
         for name, value in zip(_RANGES, (length, lift, swing, elbow, elbow_swing), strict=True)
     )
     crouch = _CROUCH[gait] * crouch**1.3
-    turning, rolling = 2 * np.pi * phase, 2 * np.pi * (phase + 0.05)
+    turn_phase, roll_phase = 2 * np.pi * phase, 2 * np.pi * (phase + 0.05)
     # the hips turn with the leading leg and drop over the swinging one, the chest turns against them
-    yaw = -(2 + 5 * turn) * length * np.cos(turning)
-    roll = (1 + 3 * turn) * np.sin(rolling)
-    sway = 1.5 * np.sin(rolling - 0.2 * np.pi)  # the hips go over the standing leg
+    yaw = -(2 + 5 * turn) * length * np.cos(turn_phase)
+    roll = (1 + 3 * turn) * np.sin(roll_phase)
+    sway = 1.5 * np.sin(roll_phase - 0.2 * np.pi)  # the hips go over the standing leg
     hip_shift = _HALF_HIPS * np.radians(np.stack([yaw, roll]))[..., None] * _SIDES
 
     leg_phase = phase[:, None] + np.array([0.0, 0.5])
@@ -109,9 +109,9 @@ def add_stride(gait: ndarray, phase: ndarray, style: ndarray, base: ndarray) -> 
     # legs stay in their planes whatever the hips do
     angles[:, _ABD] -= _SIDES * ((roll + sway)[:, None] + yaw[:, None] * np.sin(np.radians(hip)))
     angles[:, _ROT] -= _SIDES * yaw[:, None]
-    forward = -np.cos(2 * np.pi * (leg_phase - _ARM_LAG))  # against the leg of the same side
-    angles[:, _RAISE] += swing[:, None] * (1 + 0.5 * _SIDES * (uneven[:, None] - 0.5)) * forward
-    angles[:, _ELBOW] += elbow[:, None] + elbow_swing[:, None] * (forward + 1) / 2
+    arm_swing = -np.cos(2 * np.pi * (leg_phase - _ARM_LAG))  # against the leg of the same side
+    angles[:, _RAISE] += swing[:, None] * (1 + 0.5 * _SIDES * (asymmetry[:, None] - 0.5)) * arm_swing
+    angles[:, _ELBOW] += elbow[:, None] + elbow_swing[:, None] * (arm_swing + 1) / 2
     for name, change in (("yaw", yaw), ("twist", -1.8 * yaw), ("roll", roll), ("side", -roll)):
         angles[:, ANGLE_INDEX[name]] += change
     return Stride(angles=angles, pace=pace, height=height)
@@ -120,18 +120,18 @@ def add_stride(gait: ndarray, phase: ndarray, style: ndarray, base: ndarray) -> 
 def _stance(gait: ndarray, phase: ndarray) -> tuple[ndarray, ndarray]:
     """phase (n, 2) in [0, 1) of the legs -> phase since the heel strike, below 0 for a foot about to land, and how much
     the place on the ground holds the foot, its contact, in [0, 1]."""
-    end = _STANCE[gait, None]
-    since_strike = np.where(phase > (1 + end) / 2, phase - 1, phase)
-    return since_strike, _smooth(1 - (since_strike - end) / _LEAVE) * _smooth(1 + since_strike / _LAND)
+    stance_end = _STANCE[gait, None]
+    since_strike = np.where(phase > (1 + stance_end) / 2, phase - 1, phase)
+    return since_strike, _smooth(1 - (since_strike - stance_end) / _LEAVE) * _smooth(1 + since_strike / _LAND)
 
 
 def _standing_pitch(gait: ndarray, stance_phase: ndarray, length: ndarray) -> ndarray:
     """The pitch (n, ...), degrees, of a foot on the ground: lands on its heel, lies flat, rises on its toes."""
     shape = (-1,) + (1,) * (stance_phase.ndim - 1)
-    land, flat, rise, leave, up = (value.reshape(shape) for value in _PITCH[gait].T)
-    lands = land * np.clip(1 - stance_phase / flat, 0, 1)
-    leaves = np.maximum((stance_phase - rise) / (_STANCE[gait].reshape(shape) - rise), 0)
-    return length * (lands - leave * np.minimum(leaves, 1.3) ** up)
+    landing_pitch, flat_phase, rise_phase, leaving_pitch, exponent = (value.reshape(shape) for value in _PITCH[gait].T)
+    landing = landing_pitch * np.clip(1 - stance_phase / flat_phase, 0, 1)
+    rise_progress = np.maximum((stance_phase - rise_phase) / (_STANCE[gait].reshape(shape) - rise_phase), 0)
+    return length * (landing - leaving_pitch * np.minimum(rise_progress, 1.3) ** exponent)
 
 
 def _legs(
@@ -143,16 +143,16 @@ def _legs(
     length, lift, crouch = (value[:, None, None] for value in (length, lift, crouch))
     grid = np.broadcast_to(_GRID_CURVES[gait, None], (len(phase), 2, 7, 3))
     curves = np.concatenate([(_basis(phase) @ _COEFFICIENTS[gait])[:, :, None], grid], 2)
-    own_hip, own_knee, own_ankle = np.moveaxis(base[:, _LEG_COLUMNS], 1, 0)[..., None]
-    hip = length * (curves[..., 0] - 4) + 4 + 0.45 * crouch + own_hip
+    base_hip, base_knee, base_ankle = np.moveaxis(base[:, _LEG_COLUMNS], 1, 0)[..., None]
+    hip = length * (curves[..., 0] - 4) + 4 + 0.45 * crouch + base_hip
     # slow steps bend the knee less
-    knee = curves[..., 1] * lift * np.clip(0.45 + 0.55 * length, 0, 1.4) + crouch + own_knee
-    ankle = curves[..., 2] * np.clip(length, 0.5, 1.2) + 0.5 * crouch + own_ankle
+    knee = curves[..., 1] * lift * np.clip(0.45 + 0.55 * length, 0, 1.4) + crouch + base_knee
+    ankle = curves[..., 2] * np.clip(length, 0.5, 1.2) + 0.5 * crouch + base_ankle
     grid = np.broadcast_to(_GRID[gait, None], (len(phase), 2, 7))
-    standing = _standing_pitch(gait, np.concatenate([stance_phase[..., None], grid], 2), length)
+    standing_pitch = _standing_pitch(gait, np.concatenate([stance_phase[..., None], grid], 2), length)
     contact = np.concatenate([contact[..., None], np.ones(grid.shape)], 2)
     pitch = hip - knee + ankle
-    return np.radians(hip), np.radians(knee), np.radians(pitch + contact * (standing - pitch))
+    return np.radians(hip), np.radians(knee), np.radians(pitch + contact * (standing_pitch - pitch))
 
 
 def _ankle(hip: ndarray, knee: ndarray) -> tuple[ndarray, ndarray]:
@@ -179,13 +179,13 @@ def _pace_and_height(gait: ndarray, legs: tuple, rise: ndarray) -> tuple[ndarray
     grid = (_GRID - _GRID.mean(1, keepdims=True))[gait]
     x, z = _ankle(hip, knee)
     roll_x, roll_z = _roll_off(pitch)
-    stands = x - roll_x
-    slope = (stands * grid[:, None]).sum(2) / (grid**2).sum(1)[:, None]
+    foot_position = x - roll_x
+    slope = (foot_position * grid[:, None]).sum(2) / (grid**2).sum(1)[:, None]
     pace = np.maximum(-slope.mean(1), 0.0)
-    center = stands.mean(2) - _BEHIND[gait, None]
+    center = foot_position.mean(2) - _BEHIND[gait, None]
     x = center[..., None] + roll_x - (pace[:, None] * grid)[:, None]
-    highest = np.sqrt(np.maximum(_STRETCHED**2 - x**2, 0.2)) + roll_z - rise[:, None]
-    return pace, np.minimum((roll_z - z).mean((1, 2)), highest.min((1, 2))), center
+    max_height = np.sqrt(np.maximum(_STRETCHED**2 - x**2, 0.2)) + roll_z - rise[:, None]
+    return pace, np.minimum((roll_z - z).mean((1, 2)), max_height.min((1, 2))), center
 
 
 def _place_feet(
@@ -199,14 +199,16 @@ def _place_feet(
     hip, knee, pitch = (value[..., 0] for value in legs)
     x, z = _ankle(hip, knee)
     roll_x, roll_z = _roll_off(pitch)
-    end = _STANCE[gait, None]
-    target = center + roll_x - pace[:, None] * (np.minimum(stance_phase, end + _TRAIL) - end / 2) + shift[0]
+    stance_end = _STANCE[gait, None]
+    target = (
+        center + roll_x - pace[:, None] * (np.minimum(stance_phase, stance_end + _TRAIL) - stance_end / 2) + shift[0]
+    )
     ground = roll_z - height[:, None] - shift[1]
     x = x + _smooth(_FIRST * contact) * (target - x)
     z = np.maximum(z + contact * (ground - z), ground + _TOE_CLEAR * (1 - contact))
     reach = np.hypot(x, z)
-    short = np.minimum(1, _STRAIGHT / reach)
-    x, z, reach = x * short, z * short, reach * short
+    shortening = np.minimum(1, _STRAIGHT / reach)
+    x, z, reach = x * shortening, z * shortening, reach * shortening
     bend = np.arccos(np.clip((reach**2 - _THIGH**2 - _SHANK**2) / (2 * _THIGH * _SHANK), -1, 1))
     thigh = np.arctan2(x, -z) + np.arctan2(_SHANK * np.sin(bend), _THIGH + _SHANK * np.cos(bend))
     hip, knee = thigh - _THIGH_REST, bend - _THIGH_REST + _SHANK_REST

@@ -69,13 +69,13 @@ class Latents:
     def at(self, t: np.ndarray) -> "Latents":
         """The same people t (n,) seconds after these latents, which must be as drawn."""
         t = np.broadcast_to(np.asarray(t, float), self.kind.shape)
-        eager = np.where(self.kind == _CYCLE, 1.0, 0.7 + 0.6 * self.tempo[:, 0])
-        pace = np.concatenate([KIND_PACE[self.kind][:, None], activities.ARM_PACE[self.arm]], 1) * eager[:, None]
+        pace_factor = np.where(self.kind == _CYCLE, 1.0, 0.7 + 0.6 * self.tempo[:, 0])
+        pace = np.concatenate([KIND_PACE[self.kind][:, None], activities.ARM_PACE[self.arm]], 1) * pace_factor[:, None]
         # to and fro between the ends from where they are, half of the people back first
-        start = np.arccos(np.clip(1 - 2 * self.where, -1, 1)) * np.where(self.tempo[:, 1:2] < 0.5, 1, -1)
-        where = (1 - np.cos(start + pace * t[:, None])) / 2
-        falling = self.kind == _FALL
-        where[falling, 0] = np.clip(self.where[falling, 0] + t[falling] / _FALL_TIME, 0, 1)
+        start_phase = np.arccos(np.clip(1 - 2 * self.where, -1, 1)) * np.where(self.tempo[:, 1:2] < 0.5, 1, -1)
+        where = (1 - np.cos(start_phase + pace * t[:, None])) / 2
+        is_falling = self.kind == _FALL
+        where[is_falling, 0] = np.clip(self.where[is_falling, 0] + t[is_falling] / _FALL_TIME, 0, 1)
         return replace(
             self,
             where=where,
@@ -89,24 +89,26 @@ class Latents:
 
         The pace rises and falls by `_HURRY`.
         """
-        base, more = _CADENCES[self.kind].T
-        cadence, begin = base + more * self.style[:, 0], 2 * np.pi * self.tempo[:, 3]
+        base_cadence, extra_cadence = _CADENCES[self.kind].T
+        cadence, start_phase = base_cadence + extra_cadence * self.style[:, 0], 2 * np.pi * self.tempo[:, 3]
         if np.ndim(t) == 2:
-            cadence, begin = cadence[:, None], begin[:, None]
+            cadence, start_phase = cadence[:, None], start_phase[:, None]
         rate = 2 * np.pi * _DRIFT
-        return cadence * (t + _HURRY / rate * (np.sin(begin + rate * t) - np.sin(begin)))
+        return cadence * (t + _HURRY / rate * (np.sin(start_phase + rate * t) - np.sin(start_phase)))
 
     def course(self, times: np.ndarray) -> np.ndarray:
         """Heading (n, T) rad at times (T,) s of those who go, 0 at t = 0: people walk in slight curves."""
-        most = _TURN * (2 * self.tempo[:, 2] - 1)
-        rate, begin = 2 * np.pi * _DRIFT, 7 * np.pi * self.tempo[:, 3]
-        return (most / rate)[:, None] * (np.sin(begin[:, None] + rate * times) - np.sin(begin)[:, None])
+        max_turn_rate = _TURN * (2 * self.tempo[:, 2] - 1)
+        rate, start_phase = 2 * np.pi * _DRIFT, 7 * np.pi * self.tempo[:, 3]
+        return (max_turn_rate / rate)[:, None] * (
+            np.sin(start_phase[:, None] + rate * times) - np.sin(start_phase)[:, None]
+        )
 
     def _sway(self, t: np.ndarray) -> np.ndarray:
         """(n, 27), 0 at t = 0: each angle's own slow swing; the noise itself says how fast and where it stands."""
         rate = 2 * np.pi * (_SWAY_SLOW + (_SWAY_FAST - _SWAY_SLOW) * np.mod(self.noise * 17.0, 1.0))
-        begin = 2 * np.pi * np.mod(self.noise * 29.0, 1.0)
-        return np.sin(begin + rate * t[:, None]) - np.sin(begin)
+        start_phase = 2 * np.pi * np.mod(self.noise * 29.0, 1.0)
+        return np.sin(start_phase + rate * t[:, None]) - np.sin(start_phase)
 
     def _captured(self, t: np.ndarray) -> np.ndarray:
         start, end = self.captured[:, 0], self.captured[:, 1]
@@ -121,15 +123,16 @@ def draw_latents(rng: np.random.Generator, kind: np.ndarray) -> Latents:
     n = len(kind)
     arm = (rng.random((n, 2, 1)) >= _CUMULATIVE_ODDS[kind][:, None, :-1]).sum(2)
     where = rng.random((n, 3))
-    paired = rng.random(n) < _PAIRED_ARMS
-    arm[paired, 1] = arm[paired, 0]
-    near_first = where[:, 1] + _PAIR_SPREAD * rng.uniform(-1, 1, n)
-    where[paired, 2] = np.clip(near_first, 0, 1)[paired]
+    is_paired = rng.random(n) < _PAIRED_ARMS
+    arm[is_paired, 1] = arm[is_paired, 0]
+    paired_position = where[:, 1] + _PAIR_SPREAD * rng.uniform(-1, 1, n)
+    where[is_paired, 2] = np.clip(paired_position, 0, 1)[is_paired]
     # the sum of two uniform numbers: most near the middle, none far out
     noise = rng.random((2, n, len(ANGLES))).sum(0) - 1
     phase, style, mirror, tempo = rng.random(n), rng.random((n, 8)), rng.random(n) < 0.5, rng.random((n, 4))
-    captured, uses = np.zeros((n, 2, len(ANGLES))), (kind == _CAPTURED) | (arm == activities.CAPTURED_ARMS).any(1)
-    captured[uses] = np.clip(captured_angles(rng, int(uses.sum())), *LIMITS)
+    captured = np.zeros((n, 2, len(ANGLES)))
+    uses_captured = (kind == _CAPTURED) | (arm == activities.CAPTURED_ARMS).any(1)
+    captured[uses_captured] = np.clip(captured_angles(rng, int(uses_captured.sum())), *LIMITS)
     return Latents(
         kind=kind, arm=arm, where=where, noise=noise, phase=phase, style=style, mirror=mirror, tempo=tempo,
         captured=captured,
@@ -151,22 +154,24 @@ LOWER = np.tril_indices(len(ANGLES))
 def captured_angles(rng: np.random.Generator, n: int) -> np.ndarray:
     """n pairs of poses of one component of the mixture: angles (n, 2, 27), degrees, in the order of `ANGLES`; limits
     are not applied. The first of a pair is distributed as the mixture; to move is to go towards the second."""
-    cumulative, means, roots = _mixture()
-    component = np.searchsorted(cumulative, rng.random(n))
+    cumulative_weights, means, roots = _mixture()
+    component = np.searchsorted(cumulative_weights, rng.random(n))
     normal = rng.standard_normal((n, 2, len(ANGLES)))
     features = means[component, None] + _SPREAD * normal @ np.swapaxes(roots[component], -1, -2)
-    pair = np.arange(2)
+    pair_index = np.arange(2)
     for shift, arm in enumerate(_ARMS, 1):
         rows = np.flatnonzero(rng.random(n) < _OTHER_ARM)
-        features[np.ix_(rows, pair, arm)] = features[np.ix_((rows + shift) % n, pair, arm)]
+        features[np.ix_(rows, pair_index, arm)] = features[np.ix_((rows + shift) % n, pair_index, arm)]
     return from_features(features.reshape(-1, len(ANGLES))).reshape(n, 2, len(ANGLES))
 
 
 def from_features(features: np.ndarray) -> np.ndarray:
     """The mixture's features (n, 27) -> angles (n, 27), degrees."""
     angles = np.array(features, float)
-    for part, sign in SHOULDERS:
-        angles[:, part] = shoulder_angles(axis_angle_to_matrix(np.radians(angles[:, part])) @ hanging_arm(sign), sign)
+    for columns, sign in SHOULDERS:
+        angles[:, columns] = shoulder_angles(
+            axis_angle_to_matrix(np.radians(angles[:, columns])) @ hanging_arm(sign), sign
+        )
     return angles
 
 
@@ -179,10 +184,10 @@ def hanging_arm(sign: float) -> np.ndarray:
 def _mixture() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Cumulative weights (K,), means (K, 27) and Cholesky factors (K, 27, 27), degrees."""
     with resources.files("lidarpose.body").joinpath("assets/motion_prior.npz").open("rb") as file:
-        stored = dict(np.load(file, allow_pickle=False))
-    weights = stored["weights"].astype(float)
+        arrays = dict(np.load(file, allow_pickle=False))
+    weights = arrays["weights"].astype(float)
     roots = np.zeros((len(weights), len(ANGLES), len(ANGLES)))
-    roots[:, *LOWER] = stored["roots"]
-    cumulative = np.cumsum(weights / weights.sum())
-    cumulative[-1] = 1.0
-    return cumulative, stored["means"].astype(float), roots
+    roots[:, *LOWER] = arrays["roots"]
+    cumulative_weights = np.cumsum(weights / weights.sum())
+    cumulative_weights[-1] = 1.0
+    return cumulative_weights, arrays["means"].astype(float), roots

@@ -128,12 +128,12 @@ def sample_clips(
     n, frames = check_int("n", n, least=0), check_int("frames", frames, least=0)
     if not 0 < hz < np.inf:
         raise InputError(f"clips need hz > 0, got {hz}")
-    last = max(0, frames - 1) / hz
-    latents, _ = _draw_people(rng, n, _kind_shares(mix), np.arange(0, last + _CHECK_EVERY, _CHECK_EVERY))
-    every = max(1, int(np.ceil(1 / (hz * _MOMENT))))
-    motion = _motion(latents, np.linspace(0, last, max(0, frames - 1) * every + 1))
+    duration = max(0, frames - 1) / hz
+    latents, _ = _draw_people(rng, n, _kind_shares(mix), np.arange(0, duration + _CHECK_EVERY, _CHECK_EVERY))
+    substeps = max(1, int(np.ceil(1 / (hz * _MOMENT))))
+    motion = _motion(latents, np.linspace(0, duration, max(0, frames - 1) * substeps + 1))
     rotations, translation, clearance = (
-        value[:, ::every][:, :frames] for value in (motion.rotations, motion.translation, motion.clearance)
+        value[:, ::substeps][:, :frames] for value in (motion.rotations, motion.translation, motion.clearance)
     )
     return DrawnClips(rotations=rotations, translation=translation, clearance=clearance, kind=motion.kind)
 
@@ -177,16 +177,16 @@ def _draw_people(rng: np.random.Generator, n: int, shares: np.ndarray, times: np
     is_clip = len(times) > 1
     refused_share = 1 - (1 - activities.SELF_COLLISION) ** (_CLIP_POSES if is_clip else 1)
     spare_shares = shares * refused_share / (1 - refused_share)
-    spares = int(np.ceil(n * (_CLIP_SPARES if is_clip else _SPARES))) + _LEAST_SPARES if n else 0
-    drawn = (n, shares), (spares, spare_shares / spare_shares.sum())
-    kind = np.concatenate([rng.choice(len(KINDS), count, p=p) for count, p in drawn])
+    spare_count = int(np.ceil(n * (_CLIP_SPARES if is_clip else _SPARES))) + _LEAST_SPARES if n else 0
+    groups = (n, shares), (spare_count, spare_shares / spare_shares.sum())
+    kind = np.concatenate([rng.choice(len(KINDS), count, p=p) for count, p in groups])
     latents = draw_latents(rng, kind)
     if is_clip:
         latents.where[kind == _FALL, 0] *= _EARLY_FALL
     rotations = _poses(latents, times)[0]
-    wrong = _is_wrong(rotations, kind)
-    rows, refused, free = np.arange(n), np.flatnonzero(wrong[:n]), n + np.flatnonzero(~wrong[n:])
-    rows[refused[: len(free)]] = free[: len(refused)]
+    is_invalid = _is_wrong(rotations, kind)
+    rows, refused_rows, spare_rows = np.arange(n), np.flatnonzero(is_invalid[:n]), n + np.flatnonzero(~is_invalid[n:])
+    rows[refused_rows[: len(spare_rows)]] = spare_rows[: len(refused_rows)]
     return latents.take(rows), rotations[rows]
 
 
@@ -194,9 +194,9 @@ def _is_wrong(rotations: np.ndarray, kind: np.ndarray) -> np.ndarray:
     """rotations (n, T, 24, 3, 3) of the kinds (n,) -> (n,) bool: at some moment parts are too deep in each other, or
     what the body rests on is in the air."""
     ends = constraints.capsule_ends(*constraints.body_frames(rotations.reshape(-1, 24, 3, 3)))
-    wrong = constraints.self_collision(ends).max(1) > _MOST_DEPTH
-    wrong |= constraints.hovering(ends, np.repeat(kind, rotations.shape[1])) > _MOST_GAP
-    return wrong.reshape(rotations.shape[:2]).any(1)
+    is_invalid = constraints.self_collision(ends).max(1) > _MOST_DEPTH
+    is_invalid |= constraints.hovering(ends, np.repeat(kind, rotations.shape[1])) > _MOST_GAP
+    return is_invalid.reshape(rotations.shape[:2]).any(1)
 
 
 def _poses(latents: Latents, times: np.ndarray) -> tuple[np.ndarray, Stride]:
@@ -214,47 +214,47 @@ def _motion(latents: Latents, times: np.ndarray) -> DrawnClips:
     """The people at times (T,) s, facing +x at the first, which is 0."""
     n, moments = len(latents), len(times)
     rotations, stride = _poses(latents, times)
-    unyaw = rotation_about("z", -heading(rotations[:, 0])).astype(np.float32)
-    rotations[:, :, 0] = unyaw[:, None] @ rotations[:, :, 0]
-    flat = rotations.reshape(-1, 24, 3, 3)
-    capsules = constraints.undersides(constraints.capsule_ends(*constraints.body_frames(flat)))
-    points = np.concatenate([constraints.sole_points(flat).reshape(len(flat), 8, 3), capsules], 1)
+    inverse_yaw = rotation_about("z", -heading(rotations[:, 0])).astype(np.float32)
+    rotations[:, :, 0] = inverse_yaw[:, None] @ rotations[:, :, 0]
+    flat_rotations = rotations.reshape(-1, 24, 3, 3)
+    capsules = constraints.undersides(constraints.capsule_ends(*constraints.body_frames(flat_rotations)))
+    points = np.concatenate([constraints.sole_points(flat_rotations).reshape(len(flat_rotations), 8, 3), capsules], 1)
     points = points.reshape(n, moments, points.shape[1], 3)
-    way = constraints.planted_way(points)
-    travels = np.isin(latents.kind, _TRAVELS)
-    if travels.any():
-        course = latents.course(times)[travels]
-        pace = stride.pace.reshape(n, moments)[travels]
-        ahead = constraints.walked_way(pace, latents.strides(np.broadcast_to(times, (n, moments)))[travels], course)
-        way[travels, :, :2] = ahead @ np.swapaxes(unyaw[travels, :2, :2], -1, -2)
-        rotations[travels, :, 0] = rotation_about("z", course).astype(np.float32) @ rotations[travels, :, 0]
-    low = points[..., 2].min(2)
+    displacement = constraints.planted_way(points)
+    is_traveling = np.isin(latents.kind, _TRAVELS)
+    if is_traveling.any():
+        course = latents.course(times)[is_traveling]
+        pace = stride.pace.reshape(n, moments)[is_traveling]
+        path = constraints.walked_way(pace, latents.strides(np.broadcast_to(times, (n, moments)))[is_traveling], course)
+        displacement[is_traveling, :, :2] = path @ np.swapaxes(inverse_yaw[is_traveling, :2, :2], -1, -2)
+        rotations[is_traveling, :, 0] = rotation_about("z", course).astype(np.float32) @ rotations[is_traveling, :, 0]
+    lowest_height = points[..., 2].min(2)
     # a runner's hips go on between two steps, a cyclist's stay where they are
-    hips = stride.height.reshape(n, moments) + _HIPS_DOWN * flat[:, 0, 2, 2].reshape(n, moments)
-    runs, cycles = latents.kind == _RUN, latents.kind == _CYCLE
-    clearance = np.where(runs[:, None], np.maximum(hips + low, 0), 0)
-    clearance[cycles] = low[cycles] - low[cycles].min(1, keepdims=True)
-    height = clearance - low
-    way[..., 2] = height - height[:, :1]
-    translation, clearance = way.astype(np.float32), clearance.astype(np.float32)
+    hip_height = stride.height.reshape(n, moments) + _HIPS_DOWN * flat_rotations[:, 0, 2, 2].reshape(n, moments)
+    is_running, is_cycling = latents.kind == _RUN, latents.kind == _CYCLE
+    clearance = np.where(is_running[:, None], np.maximum(hip_height + lowest_height, 0), 0)
+    clearance[is_cycling] = lowest_height[is_cycling] - lowest_height[is_cycling].min(1, keepdims=True)
+    height = clearance - lowest_height
+    displacement[..., 2] = height - height[:, :1]
+    translation, clearance = displacement.astype(np.float32), clearance.astype(np.float32)
     return DrawnClips(rotations=rotations, translation=translation, clearance=clearance, kind=latents.kind)
 
 
 def _angles(latents: Latents) -> Stride:
     """The poses' angles (n, 27), degrees, inside the joints' ranges; arms may be in the trunk."""
-    kind, captured = latents.kind, latents.captured[:, 0]
+    kind, captured_angles = latents.kind, latents.captured[:, 0]
     start, end, spread = activities.KIND_RANGES[:, kind]
     # the cranks of a bicycle move the legs alone
-    place = np.where((kind == _CYCLE)[:, None] & _NO_LEG, latents.style[:, 1:2], latents.where[:, :1])
-    angles = start + place * (end - start) + spread * latents.noise
+    range_fraction = np.where((kind == _CYCLE)[:, None] & _NO_LEG, latents.style[:, 1:2], latents.where[:, :1])
+    angles = start + range_fraction * (end - start) + spread * latents.noise
     pace, height = np.zeros((2, len(kind)))
     rows = np.flatnonzero(_GAIT[kind] >= 0)
     if len(rows):
         stride = add_stride(_GAIT[kind[rows]], latents.phase[rows], latents.style[rows], angles[rows])
         angles[rows], pace[rows], height[rows] = stride.angles, stride.pace, stride.height
-    rows = kind == _CYCLE
-    pace[rows] = _GEAR[0] + _GEAR[1] * latents.style[rows, 0]
-    angles[kind == _CAPTURED] = captured[kind == _CAPTURED]
+    is_cycling = kind == _CYCLE
+    pace[is_cycling] = _GEAR[0] + _GEAR[1] * latents.style[is_cycling, 0]
+    angles[kind == _CAPTURED] = captured_angles[kind == _CAPTURED]
 
     # the table gives thighs from the vertical and feet from the floor: turn both into angles of the joints
     for side in ("left", "right"):
@@ -262,14 +262,14 @@ def _angles(latents: Latents) -> Stride:
         angles[:, ankle] += activities.FLAT_FOOT[kind] * (angles[:, knee] - angles[:, hip])
         angles[:, hip] += activities.UPRIGHT[kind] * angles[:, ANGLE_INDEX["tilt"]]
 
-    for column, part in enumerate(_ARM.values()):
+    for column, arm_columns in enumerate(_ARM.values()):
         arm = latents.arm[:, column]
         rows = np.flatnonzero(arm != activities.OWN_ARMS)
         start, end, spread = activities.ARM_RANGES[:, arm[rows]]
-        where = latents.where[rows, 1 + column, None]
-        angles[rows, part] = start + where * (end - start) + spread * latents.noise[rows, part]
+        arm_fraction = latents.where[rows, 1 + column, None]
+        angles[rows, arm_columns] = start + arm_fraction * (end - start) + spread * latents.noise[rows, arm_columns]
         rows = np.flatnonzero(arm == activities.CAPTURED_ARMS)
-        angles[rows, part] = captured[rows, part]
+        angles[rows, arm_columns] = captured_angles[rows, arm_columns]
     angles = np.clip(angles, LIMITS[0], LIMITS[1])
     angles = np.where(latents.mirror[:, None], mirror_angles(angles), angles)
     return Stride(angles=angles, pace=pace, height=height)
@@ -278,22 +278,23 @@ def _angles(latents: Latents) -> Stride:
 def _free_arms(angles: np.ndarray, moments: int) -> np.ndarray:
     """angles (n * moments, 27) with arms moved forwards, outwards and out of their inward turn until the forearms of
     each person's first moment leave the trunk; all moments by as much."""
-    arm = angles[::moments, _BOTH_ARMS].reshape(-1, 4)
-    rows = np.arange(len(arm))
-    added = np.zeros_like(arm)
+    arm_angles = angles[::moments, _BOTH_ARMS].reshape(-1, 4)
+    rows = np.arange(len(arm_angles))
+    correction = np.zeros_like(arm_angles)
     for _ in range(_TRIES):
-        rows = rows[_in_trunk(np.clip(arm[rows] + added[rows], *_ARM_LIMITS))]
-        behind = arm[rows, :1] < -20  # hands on the back go further back
-        added[rows] += np.where(behind, _FREE_ARM * [-0.5, 1.5, -1, 0], _FREE_ARM)
+        rows = rows[_in_trunk(np.clip(arm_angles[rows] + correction[rows], *_ARM_LIMITS))]
+        is_behind = arm_angles[rows, :1] < -20  # hands on the back go further back
+        correction[rows] += np.where(is_behind, _FREE_ARM * [-0.5, 1.5, -1, 0], _FREE_ARM)
     angles[:, _BOTH_ARMS] = np.clip(
-        angles[:, _BOTH_ARMS] + np.repeat(added.reshape(-1, 8), moments, 0), *np.tile(_ARM_LIMITS, 2)
+        angles[:, _BOTH_ARMS] + np.repeat(correction.reshape(-1, 8), moments, 0), *np.tile(_ARM_LIMITS, 2)
     )
     return angles
 
 
-def _in_trunk(arm: np.ndarray) -> np.ndarray:
-    """arm (n, 4) degrees -> (n,) bool: the forearm's middle or the hand is inside the trunk. In left-arm signs."""
-    rad = np.radians(arm)
+def _in_trunk(arm_angles: np.ndarray) -> np.ndarray:
+    """Whether the forearm's middle or the hand is inside the trunk, (n,) bool; arm_angles (n, 4) degrees, in left-arm
+    signs."""
+    rad = np.radians(arm_angles)
     (cr, co, ci, ce), (sr, so, si, se) = np.cos(rad).T, np.sin(rad).T
     # columns of R_y(-raised) R_x(out - 90) R_y(inward): the arm's y runs along it, its x is the way the elbow bends
     crso, srso = cr * so, sr * so

@@ -43,6 +43,8 @@ _GET = (
     "register at smpl.is.tue.mpg.de, download SMPL for Python v1.1.0, which has the neutral body, "
     "and give --smpl with its .pkl or .npz, or with a folder of SMPL_NEUTRAL, SMPL_MALE and SMPL_FEMALE"
 )
+# why the people of a part after a fault in it are left out
+BAD_REST = "the rest of a part cannot be read"
 
 
 @dataclass(frozen=True)
@@ -61,8 +63,8 @@ class Reader(ABC):
     skeleton: ClassVar[str]
 
     def __init__(self, **settings: Any):
-        about = _datasets()[self.name]
-        self.about = {key: value for key, value in about.items() if key not in ("title", "expected")}
+        info = _datasets()[self.name]
+        self.about = {key: value for key, value in info.items() if key not in ("title", "expected")}
         self.about["settings"] = settings
 
     @abstractmethod
@@ -75,9 +77,9 @@ class Reader(ABC):
 
     def wrong_root(self, root: Path, got: str = "") -> InputError:
         """The error for a folder that is not the dataset's root. got: by default what is in the folder."""
-        about, got = _datasets()[self.name], got or f"got {entries(root)}"
-        problem = f"is not the root of {about['title']}: expected {about['expected']}, {got}"
-        return file_error(root, f"{problem}; get it at {about['get']}")
+        info, got = _datasets()[self.name], got or f"got {entries(root)}"
+        problem = f"is not the root of {info['title']}: expected {info['expected']}, {got}"
+        return file_error(root, f"{problem}; get it at {info['get']}")
 
 
 @cache
@@ -235,9 +237,9 @@ class SmplJoints:
         if (count := betas.shape[-1]) > shapes.shape[-1]:
             path = self.files[self.kind(gender)]
             raise file_error(path, f"has {shapes.shape[-1]} shapes, the labels {count}: give the full model")
-        rest = mean + np.moveaxis(shapes[..., :count] @ betas.T, -1, 0)
+        rest_joints = mean + np.moveaxis(shapes[..., :count] @ betas.T, -1, 0)
         rotations = axis_angle_to_matrix(pose.reshape(len(pose), -1, 3))
-        return forward_kinematics(SMPL24.parents, rest, rotations, rest[:, 0] + trans)[1]
+        return forward_kinematics(SMPL24.parents, rest_joints, rotations, rest_joints[:, 0] + trans)[1]
 
     @cached_property
     def digests(self) -> dict[str, str]:
@@ -271,18 +273,18 @@ class SceneClouds:
     @cached_property
     def _static(self) -> np.ndarray:
         frames = sorted(self._paths)
-        chosen = np.unique(np.linspace(0, len(frames) - 1, SCANS).astype(int)).tolist()
-        return static_points(scan for k in chosen if (scan := self._others(frames[k])) is not None)
+        indices = np.unique(np.linspace(0, len(frames) - 1, SCANS).astype(int)).tolist()
+        return static_points(scan for k in indices if (scan := self._others(frames[k])) is not None)
 
     def around(self, frame: int, R_sensor_scan: np.ndarray, origin: np.ndarray | None = None) -> dict[str, Any]:
         """The fields background and neighbors of a frame's sample, in a frame turned by R_sensor_scan (3, 3) about the
         sensor at origin (3,), by default 0; none where there is no scan."""
-        others = self._others(frame)
-        if others is None:
+        scan = self._others(frame)
+        if scan is None:
             return {}
         origin = np.zeros(3) if origin is None else origin
-        person, others, static = ((x - origin) @ R_sensor_scan.T for x in (self._people(frame), others, self._static))
-        return {"background": window_points(static, person), "neighbors": window_points(others, person)}
+        person, scan, static_map = ((x - origin) @ R_sensor_scan.T for x in (self._people(frame), scan, self._static))
+        return {"background": window_points(static_map, person), "neighbors": window_points(scan, person)}
 
 
 def box_of_joints(joints: np.ndarray, id: str) -> Box:

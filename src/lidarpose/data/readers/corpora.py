@@ -65,8 +65,8 @@ class _Entry:
             return Skipped("empty cloud", self.where)
         if _apart(points, joints) > _NEAR:
             return Skipped("joints are not where the points are", self.where)
-        where: dict[str, Any] = {"sequence": self.sequence, "frame": self.frame, "time": self.frame / _FPS}
-        return base.labeled_sample(points, joints, **where, **labels)
+        frame_labels: dict[str, Any] = {"sequence": self.sequence, "frame": self.frame, "time": self.frame / _FPS}
+        return base.labeled_sample(points, joints, **frame_labels, **labels)
 
 
 class _Corpus(Reader):
@@ -113,13 +113,13 @@ class Lipd(_Corpus):
 
     def _entry(self, entry: _Entry) -> Iterator[LabeledSample | Skipped]:
         joints, points = entry.numbers("gt_joint", (24, 3)), entry.points("pc")
-        placed = {"gt_joint": joints}
+        candidates = {"gt_joint": joints}
         if entry.content.get("trans") is not None:
             trans = entry.numbers("trans", (3,))
-            middle = points.mean(0) if len(points) else 0.0
-            placed |= {"gt_joint + trans": joints + trans, "gt_joint + trans + mean": joints + trans + middle}
-        best = min(placed, key=lambda name: _apart(points, placed[name]) if len(points) else 0.0)
-        yield entry.sample(points, placed[best], track="0", source=f"lipd/{best}", sensor_known=False)
+            mean_point = points.mean(0) if len(points) else 0.0
+            candidates |= {"gt_joint + trans": joints + trans, "gt_joint + trans + mean": joints + trans + mean_point}
+        best_name = min(candidates, key=lambda name: _apart(points, candidates[name]) if len(points) else 0.0)
+        yield entry.sample(points, candidates[best_name], track="0", source=f"lipd/{best_name}", sensor_known=False)
 
 
 class FreeMotion(_Corpus):

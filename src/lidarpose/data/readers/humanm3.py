@@ -7,7 +7,7 @@
     or ROOT/{train,test}.pkl        the authors' database: {"db": [{"pcd": path, "info": [one a camera]}]}
 
 The joints are `human15`, in its order. The database has everybody once a camera; here once. There is no box: one is
-made from the labelled joints, which the center "joints_box" tells, and crops the points.
+made from the labeled joints, which the center "joints_box" tells, and crops the points.
 Sources: soullessrobot/Human-M3-Dataset lib/dataset/human_m3.py, guidodumont/SMPLify-3D datasets/humanm3.py.
 """
 
@@ -43,20 +43,20 @@ class HumanM3(Reader):
         """Sequences as paths below the root, or the databases where none is complete. Raises InputError where there
         is neither, and where only some sequences have labels and clouds."""
         databases = [f"{name}.pkl" for name in sorted(_SPLITS) if (root / f"{name}.pkl").is_file()]
-        below = [path.parent for name in _SPLITS for path in sorted(root.glob(f"*/{name}")) if path.is_dir()]
-        if below and not databases and not any((root / name).is_dir() for name in _SPLITS):
-            raise file_error(root, f"is a folder above HumanM3's root, which is likely {below[0]}: name that")
-        sequences, incomplete = [], ""
+        nested_folders = [path.parent for name in _SPLITS for path in sorted(root.glob(f"*/{name}")) if path.is_dir()]
+        if nested_folders and not databases and not any((root / name).is_dir() for name in _SPLITS):
+            raise file_error(root, f"is a folder above HumanM3's root, which is likely {nested_folders[0]}: name that")
+        sequences, incomplete_sequence = [], ""
         for folder in sorted(_folders(root, _DEEPEST)):
-            missing = [name for name in ("pointcloud", "pose_calib") if not (folder / name).is_dir()]
-            if not missing:
+            missing_folders = [name for name in ("pointcloud", "pose_calib") if not (folder / name).is_dir()]
+            if not missing_folders:
                 sequences.append(folder.relative_to(root).as_posix())
-            elif len(missing) == 1:
-                incomplete = incomplete or f"{folder} without {missing[0]}"
-        if sequences and incomplete:
-            raise file_error(root, f"has {incomplete}: get that folder too, or move its sequence away")
+            elif len(missing_folders) == 1:
+                incomplete_sequence = incomplete_sequence or f"{folder} without {missing_folders[0]}"
+        if sequences and incomplete_sequence:
+            raise file_error(root, f"has {incomplete_sequence}: get that folder too, or move its sequence away")
         if not sequences and not databases:
-            raise self.wrong_root(root, f"got {incomplete or base.entries(root)}")
+            raise self.wrong_root(root, f"got {incomplete_sequence or base.entries(root)}")
         return sequences or databases
 
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
@@ -67,14 +67,14 @@ class HumanM3(Reader):
 def _folders(folder: Path, depth: int) -> Iterator[Path]:
     yield folder
     if depth and not (folder / "pose_calib").is_dir() and not (folder / "pointcloud").is_dir():
-        for below in folder.iterdir():
-            if below.is_dir():
-                yield from _folders(below, depth - 1)
+        for child in folder.iterdir():
+            if child.is_dir():
+                yield from _folders(child, depth - 1)
 
 
 def _read_sequence(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
     labels = base.numbered(root / part / "pose_calib", ".json")
-    first = min(labels, default=0)
+    first_frame = min(labels, default=0)
     for pair in base.paired(labels, base.numbered(root / part / "pointcloud", ".pcd"), f"{part}/{{}}"):
         if isinstance(pair, Skipped):
             yield pair
@@ -94,7 +94,7 @@ def _read_sequence(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
                 people[track] = base.numbers(path, bodies[track], (15, 3), f"joints of {track}")
             except InputError as error:
                 yield Skipped("not 15 joints", str(error))
-        yield from _people(cloud, people, part, frame, (frame - first) / _FPS)
+        yield from _people(cloud, people, part, frame, (frame - first_frame) / _FPS)
 
 
 def _read_database(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
@@ -122,13 +122,15 @@ def _without_copies(info: list[dict], where: str) -> dict[str, np.ndarray]:
     people: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
     for camera in info:
         joints = base.numbers(where, camera["joints_3d"], (-1, 15, 3), "joints_3d")
-        seen = np.ones(joints.shape)
+        visibility = np.ones(joints.shape)
         if camera.get("joints_3d_vis") is not None:
-            seen = base.numbers(where, camera["joints_3d_vis"], joints.shape, "joints_3d_vis")
-        for person, visible in zip(joints, np.all(seen > 0, axis=-1), strict=True):
-            _, before = people.get(person.tobytes(), (None, False))
-            people[person.tobytes()] = person, visible | before
-    return {str(k): np.where(visible[:, None], person, np.nan) for k, (person, visible) in enumerate(people.values())}
+            visibility = base.numbers(where, camera["joints_3d_vis"], joints.shape, "joints_3d_vis")
+        for person, is_visible in zip(joints, np.all(visibility > 0, axis=-1), strict=True):
+            _, was_visible = people.get(person.tobytes(), (None, False))
+            people[person.tobytes()] = person, is_visible | was_visible
+    return {
+        str(k): np.where(is_visible[:, None], person, np.nan) for k, (person, is_visible) in enumerate(people.values())
+    }
 
 
 def _people(
@@ -145,12 +147,12 @@ def _people(
         yield from (Skipped("cloud cannot be read", f"{error} ({track})") for track in people)
         return
     for track, joints in people.items():
-        where, labeled = f"{frame_id}/{track}", joints[~np.isnan(joints).any(-1)]
-        if not len(labeled):
+        where, labeled_joints = f"{frame_id}/{track}", joints[~np.isnan(joints).any(-1)]
+        if not len(labeled_joints):
             yield Skipped("no joint is labelled", where)
             continue
         try:
-            box = base.box_of_joints(labeled, track)
+            box = base.box_of_joints(labeled_joints, track)
         except InputError as error:
             yield Skipped("joints out of reach", f"{where}: {error}")
             continue

@@ -112,14 +112,14 @@ class Itop(Reader):
 
 
 def _sample(
-    cloud: np.ndarray, joints: np.ndarray, is_visible: np.ndarray, R_level_camera: np.ndarray, **where: Any
+    cloud: np.ndarray, joints: np.ndarray, is_visible: np.ndarray, R_level_camera: np.ndarray, **fields: Any
 ) -> LabeledSample | Skipped:
-    """The person in a cloud (n, 3) m with joints (14, 3) m, both in the camera's axes; where: fields of the sample."""
-    is_labeled, frame_id = np.isfinite(joints).all(-1), where["frame_id"]
+    """The person in a cloud (n, 3) m with joints (14, 3) m, both in the camera's axes; fields: those of the sample."""
+    is_labeled, frame_id = np.isfinite(joints).all(-1), fields["frame_id"]
     if not is_labeled.any():
         return Skipped("no joint is labelled", frame_id)
     joints = np.where(is_labeled[:, None], joints, np.nan) @ R_level_camera.T
-    if where["sequence"].startswith("side"):
+    if fields["sequence"].startswith("side"):
         points = person_of_room(cloud) @ R_level_camera.T
         if not len(points):
             return Skipped("nobody stands out of the room", frame_id)
@@ -132,9 +132,9 @@ def _sample(
         points = points[box.contains(points, base.POINT_MARGIN)]
         if not len(points):
             return Skipped("no points in the box", frame_id)
-        where |= {"box": box, "centers": {"joints_box": box.center}}
+        fields |= {"box": box, "centers": {"joints_box": box.center}}
     joint_labels = np.where(is_labeled, np.where(is_visible, SEEN, HIDDEN), UNLABELED).astype(np.uint8)
-    return base.labeled_sample(points, joints, ITOP14, joint_labels=joint_labels, track="0", **where)
+    return base.labeled_sample(points, joints, ITOP14, joint_labels=joint_labels, track="0", **fields)
 
 
 def is_mirrored(joints: np.ndarray) -> bool:
@@ -179,15 +179,19 @@ def _opened(root: Path, part: str) -> Iterator[tuple[Any, Any]]:
                 raise file_error(path, "is missing: get it from zenodo.org/records/3932973 and unpack it by gunzip")
             try:
                 files.append(stack.enter_context(h5py.File(path, "r")))
-                came = {name: getattr(files[-1].get(name), "shape", None) for name in shapes}
-                ids.append(_ids(files[-1]) if came["id"] is not None and came["id"] <= (_MOST_FRAMES,) else [])
+                actual_shapes = {name: getattr(files[-1].get(name), "shape", None) for name in shapes}
+                ids.append(
+                    _ids(files[-1])
+                    if actual_shapes["id"] is not None and actual_shapes["id"] <= (_MOST_FRAMES,)
+                    else []
+                )
             # what h5py raises for damaged files
             except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
                 problem = f"cannot be read as HDF5 ({one_line(str(error))}); was it downloaded and unpacked completely?"
                 raise file_error(path, problem) from None
             for name, shape in shapes.items():
-                if came[name] != (wanted := (len(ids[-1]), *shape)):
-                    raise file_error(path, f"expected {name} of shape {wanted}, got {came[name]}")
+                if actual_shapes[name] != (expected_shape := (len(ids[-1]), *shape)):
+                    raise file_error(path, f"expected {name} of shape {expected_shape}, got {actual_shapes[name]}")
         if ids[0] != ids[1]:
             raise file_error(paths[1], f"is of other frames than {paths[0].name}: get both again")
         yield files[0], files[1]
@@ -208,8 +212,8 @@ def person_of_room(points: np.ndarray) -> np.ndarray:
         return points
     cluster = _clusters(points)
     counts = np.bincount(cluster)
-    largest = points[cluster == counts.argmax()]
-    low, high = largest.min(0) - _NEAR, largest.max(0) + _NEAR
+    largest_cluster = points[cluster == counts.argmax()]
+    low, high = largest_cluster.min(0) - _NEAR, largest_cluster.max(0) + _NEAR
     # arms are raised and stretched towards the camera
     low[2], high[1] = _REGION[0, 2], high[1] + _NEAR
     is_outside = ((points < low) | (points > high)).any(1)
@@ -221,11 +225,11 @@ def _floor(heights: np.ndarray) -> float:
     """The height m below which all is floor, -inf where none is seen: the lowest tenth of the heights then has no more
     points than others have."""
     counts, edges = np.histogram(heights, bins=_STEPS)
-    lowest = counts[:_FLOOR_STEPS]
-    if lowest.sum() <= _FLOOR_STEPS * counts.mean():
+    lowest_counts = counts[:_FLOOR_STEPS]
+    if lowest_counts.sum() <= _FLOOR_STEPS * counts.mean():
         return -np.inf
-    above = lowest[lowest.argmax() :]
-    return float(edges[lowest.argmax() + (above < above.mean()).argmax()])
+    counts_above = lowest_counts[lowest_counts.argmax() :]
+    return float(edges[lowest_counts.argmax() + (counts_above < counts_above.mean()).argmax()])
 
 
 def _clusters(points: np.ndarray) -> np.ndarray:
@@ -240,8 +244,8 @@ def _clusters(points: np.ndarray) -> np.ndarray:
     number = np.arange(len(code))
     while True:
         # the least number of a neighbor, then the least that this one knows of
-        least = np.where(neighbors >= 0, number[neighbors], len(code)).min(0)
-        least = least[least]
-        if (least == number).all():
+        least_number = np.where(neighbors >= 0, number[neighbors], len(code)).min(0)
+        least_number = least_number[least_number]
+        if (least_number == number).all():
             return number[cell]
-        number = least
+        number = least_number

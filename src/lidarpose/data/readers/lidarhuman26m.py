@@ -53,8 +53,8 @@ class LidarHuman26M(Reader):
         self._level = level
         super().__init__(smpl=self._smpl.digests[self._smpl.kind("neutral")], level=level)
         if not level:
-            mounted = "it stands still, z up as far as it was mounted level"
-            self.about["frame"] = f"the LiDAR's own, as in the release: {mounted}"
+            note = "it stands still, z up as far as it was mounted level"
+            self.about["frame"] = f"the LiDAR's own, as in the release: {note}"
 
     def parts(self, root: Path) -> list[str]:
         """The sequences, by number. Raises InputError where poses or clouds are missing altogether."""
@@ -69,12 +69,12 @@ class LidarHuman26M(Reader):
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """The person of a sequence, frame by frame."""
         poses = base.numbered(root / POSE_FOLDER / part, ".json")
-        labels, damaged = {}, {}
+        labels, label_errors = {}, {}
         for frame, paths in poses.items():
             try:
                 labels[frame] = _labels(paths[0])
             except InputError as error:
-                damaged[frame] = str(error)
+                label_errors[frame] = str(error)
         joints, turn = {}, None
         if labels:
             betas, pose, trans = (np.stack(rows) for rows in zip(*labels.values(), strict=True))
@@ -90,45 +90,45 @@ class LidarHuman26M(Reader):
                 yield pair
                 continue
             frame, _, cloud = pair
-            if frame in damaged:
-                yield Skipped("labels cannot be read", damaged[frame])
+            if frame in label_errors:
+                yield Skipped("labels cannot be read", label_errors[frame])
             elif cloud is None:
                 yield Skipped("labels without a cloud", f"{part}/{frame:06d}")
             else:
                 time = (frame - min(poses)) / _FPS
                 R = np.eye(3) if turn is None else turn
                 clip = {"rotations": base.turned_pose(labels[frame][1], R)} | clouds.around(frame, R)
-                where = {"sequence": part, "frame": frame, "frame_id": f"{part}/{cloud.stem}", "time": time}
-                yield _sample(cloud, joints[frame], labels[frame][2], turn, **where, **clip)
+                frame_fields = {"sequence": part, "frame": frame, "frame_id": f"{part}/{cloud.stem}", "time": time}
+                yield _sample(cloud, joints[frame], labels[frame][2], turn, **frame_fields, **clip)
 
 
 def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """betas (10,), pose (72,) rad and trans (3,) m."""
     content = base.read_json(path, "SMPL's beta, pose and trans")
-    missing = [key for key in ("beta", "pose", "trans") if key not in content]
-    if missing:
-        raise file_error(path, f"expected beta, pose and trans, got no {', '.join(missing)}")
+    missing_keys = [key for key in ("beta", "pose", "trans") if key not in content]
+    if missing_keys:
+        raise file_error(path, f"expected beta, pose and trans, got no {', '.join(missing_keys)}")
     sizes = {"beta": 10, "pose": 72, "trans": 3}
     beta, pose, trans = (base.numbers(path, content[key], (size,), key) for key, size in sizes.items())
     return beta, pose, trans
 
 
 def _sample(
-    path: Path, joints: np.ndarray, trans: np.ndarray, turn: np.ndarray | None, **known: Any
+    path: Path, joints: np.ndarray, trans: np.ndarray, turn: np.ndarray | None, **fields: Any
 ) -> LabeledSample | Skipped:
-    """turn: R_level_sensor, None to stay in the sensor's frame; known: other fields of the sample, turned already."""
+    """turn: R_level_sensor, None to stay in the sensor's frame; fields: others of the sample, turned already."""
     try:
         points = base.read_cloud(path)
     except InputError as error:
         return Skipped("cloud cannot be read", str(error))
     if not len(points):
-        return Skipped("empty cloud", known["frame_id"])
+        return Skipped("empty cloud", fields["frame_id"])
     source = "lidarhuman26m"
     if turn is not None:
         points, joints, trans = (x @ turn.T for x in (points, joints, trans))
         source += f", turned level by {np.degrees(np.arccos(np.clip(turn[2, 2], -1, 1))):.0f} deg"
-    known |= {"track": "0", "source": source, "centers": {"trans": trans}, "translation": trans}
-    return base.labeled_sample(points, joints, **known)
+    fields |= {"track": "0", "source": source, "centers": {"trans": trans}, "translation": trans}
+    return base.labeled_sample(points, joints, **fields)
 
 
 def up_of_people(joints: np.ndarray) -> tuple[np.ndarray, float] | None:
@@ -138,20 +138,24 @@ def up_of_people(joints: np.ndarray) -> tuple[np.ndarray, float] | None:
     The mean of the trunks, less what people lean forwards, which is found as the part that turns with them. None where
     fewer than `LEAST_FRAMES` of the people stand upright.
     """
-    at = {name: joints[:, SMPL24.index(name)] for name in ("left_hip", "right_hip", "left_shoulder", "right_shoulder")}
-    trunk = unit(at["left_shoulder"] + at["right_shoulder"] - at["left_hip"] - at["right_hip"])
+    positions = {
+        name: joints[:, SMPL24.index(name)] for name in ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
+    }
+    trunk = unit(
+        positions["left_shoulder"] + positions["right_shoulder"] - positions["left_hip"] - positions["right_hip"]
+    )
     # a person's left times their up is forwards
-    forward = unit(np.cross(at["left_hip"] - at["right_hip"], trunk))
+    forward = unit(np.cross(positions["left_hip"] - positions["right_hip"], trunk))
     up = unit(trunk.mean(0))
     for _ in range(_ROUNDS):
-        upright = trunk @ up > _UPRIGHT
-        if upright.sum() < LEAST_FRAMES:
+        is_upright = trunk @ up > _UPRIGHT
+        if is_upright.sum() < LEAST_FRAMES:
             return None
-        t, f = trunk[upright], forward[upright]
+        t, f = trunk[is_upright], forward[is_upright]
         # t = up + lean * f: a line through both, drawn towards the usual lean where everybody faces one way
-        turned = f - f.mean(0)
+        f_centered = f - f.mean(0)
         trust = _TRUST * len(f)
-        lean = (((t - t.mean(0)) * turned).sum() + trust * _LEAN) / ((turned**2).sum() + trust)
+        lean = (((t - t.mean(0)) * f_centered).sum() + trust * _LEAN) / ((f_centered**2).sum() + trust)
         up = unit(t.mean(0) - lean * f.mean(0))
     return up, _MORE_DOUBT if np.linalg.norm(f.mean(0)) > _ONE_WAY else _DOUBT
 

@@ -1,7 +1,7 @@
 """SLOPER4D (Dai et al. 2023), release 1.0: one person followed by another who carries a LiDAR on the head.
 
     ROOT/SEQUENCE/SEQUENCE_labels.pkl
-        frame_num               (n,) the frames that are labelled; total_frames: those with pictures
+        frame_num               (n,) the frames that are labeled; total_frames: those with pictures
         first_person            lidar_traj (n, 9): frame, x y z m, quaternion x y z w, time s
         second_person           opt_pose or pose (n, 72) rad, opt_trans or trans (n, 3) m, beta (10), gender;
                                 point_clouds, a list of (k, 3) m in the world's frame, and point_frame, whose they are;
@@ -59,21 +59,21 @@ class Sloper4D(Reader):
         names = sorted(path.name.removesuffix(_SUFFIX) for path in _files(root))
         if not names:
             raise self.wrong_root(root)
-        if twice := [name for name in names if names.count(name) > 1]:
-            raise file_error(root, f"has {twice[0]}{_SUFFIX} twice: move one of them away")
+        if duplicates := [name for name in names if names.count(name) > 1]:
+            raise file_error(root, f"has {duplicates[0]}{_SUFFIX} twice: move one of them away")
         return names
 
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """The person of a sequence, frame by frame."""
         path = next(path for path in _files(root) if path.name == part + _SUFFIX)
         content, person, walker = _content(path)
-        pose, trans, which = _poses(path, person)
+        pose, trans, pose_name = _poses(path, person)
         clouds = _clouds(path, person)
         frames = numbers(path, content.get("frame_num"), (-1,), "frame_num").astype(int).tolist()
         total = content.get("total_frames")
         total = len(frames) if total is None else int(numbers(path, total, (), "total_frames"))
-        way = numbers(path, walker.get("lidar_traj"), (-1, 9), "first_person's lidar_traj", finite=False)
-        position, heading = way[:, 1:4], _heading(way[:, 4:8])
+        trajectory = numbers(path, walker.get("lidar_traj"), (-1, 9), "first_person's lidar_traj", finite=False)
+        position, heading = trajectory[:, 1:4], _heading(trajectory[:, 4:8])
         betas = numbers(path, numbers(path, person.get("beta"), (-1,), "beta")[:10], (10,), "beta")[None]
         gender = str(person.get("gender", "neutral")).lower()
         kind = self._smpl.kind(gender)
@@ -82,7 +82,7 @@ class Sloper4D(Reader):
         pose, trans = (np.where(has_pose[:, None], x, 0.0) for x in (pose, trans))
         has_place = np.isfinite(position).all(1) & np.isfinite(heading)
         joints = self._smpl(betas, pose, trans, gender)
-        paths = _scans(path.parent, dict(zip(frames, way[:, 8].tolist(), strict=False)))
+        paths = _scans(path.parent, dict(zip(frames, trajectory[:, 8].tolist(), strict=False)))
         people = {frame: cloud for frame, cloud in clouds.items() if not isinstance(cloud, str)}
         scans = SceneClouds(paths, people.__getitem__)
         for index, frame in enumerate(frames):
@@ -97,22 +97,22 @@ class Sloper4D(Reader):
                 yield Skipped("empty cloud", where)
             elif index >= len(pose) or not has_pose[index]:
                 yield Skipped("cloud without a pose", where)
-            elif index >= len(way) or not has_place[index]:
+            elif index >= len(trajectory) or not has_place[index]:
                 yield Skipped("cloud without the LiDAR's place", where)
             else:
                 R_sensor_world = rotation_about("z", -heading[index])
-                points, own, center = (
+                points, sensor_joints, center = (
                     (x - position[index]) @ R_sensor_world.T for x in (cloud, joints[index], trans[index])
                 )
                 yield labeled_sample(
                     points,
-                    own,
+                    sensor_joints,
                     sequence=part,
                     frame=frame,
                     frame_id=where,
                     track="second_person",
-                    time=float(way[index, 8] - way[0, 8]),
-                    source=f"sloper4d/{which}, {body}",
+                    time=float(trajectory[index, 8] - trajectory[0, 8]),
+                    source=f"sloper4d/{pose_name}, {body}",
                     centers={"trans": center},
                     rotations=turned_pose(pose[index], R_sensor_world),
                     translation=center,
@@ -133,10 +133,10 @@ def _content(path: Path) -> tuple[dict, dict, dict]:
     """The labels, and of them those of the person who is seen and of the one with the LiDAR."""
     content = load_pickle(path)
     if not isinstance(content, dict) or not isinstance(content.get("second_person"), dict):
-        old = isinstance(content, dict) and "SMPL_info" in content
-        got = "those of a release before 1.0 (SMPL_info)" if old else "others"
-        get = "get them at www.lidarhumanmotion.net/data-sloper4d (a form)"
-        raise file_error(path, f"expected labels of SLOPER4D 1.0, with second_person, got {got}: {get}")
+        is_old = isinstance(content, dict) and "SMPL_info" in content
+        actual = "those of a release before 1.0 (SMPL_info)" if is_old else "others"
+        remedy = "get them at www.lidarhumanmotion.net/data-sloper4d (a form)"
+        raise file_error(path, f"expected labels of SLOPER4D 1.0, with second_person, got {actual}: {remedy}")
     walker = content.get("first_person")
     return content, content["second_person"], walker if isinstance(walker, dict) else {}
 
@@ -148,8 +148,10 @@ def _scans(folder: Path, times: dict[int, float]) -> dict[int, Path]:
         with suppress(ValueError):
             files[float(path.stem.replace("_", "."))] = path
     stamps = np.array(sorted(files))
-    nearest = {frame: float(stamps[np.abs(stamps - time).argmin()]) for frame, time in times.items() if len(stamps)}
-    return {frame: files[stamp] for frame, stamp in nearest.items() if abs(stamp - times[frame]) < _SAME_TIME}
+    nearest_stamps = {
+        frame: float(stamps[np.abs(stamps - time).argmin()]) for frame, time in times.items() if len(stamps)
+    }
+    return {frame: files[stamp] for frame, stamp in nearest_stamps.items() if abs(stamp - times[frame]) < _SAME_TIME}
 
 
 def _poses(path: Path, person: dict) -> tuple[np.ndarray, np.ndarray, str]:
@@ -190,5 +192,5 @@ def _clouds(path: Path, person: dict) -> dict[int, np.ndarray | str]:
 def _heading(quaternion: np.ndarray) -> np.ndarray:
     """quaternion (n, 4) x y z w -> (n,) rad: where the turned x axis points, seen from above; NaN for no rotation."""
     x, y, z, w = quaternion.T
-    unit = np.abs(np.linalg.norm(quaternion, axis=1) - 1) < _UNIT
-    return np.where(unit, np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)), np.nan)
+    is_unit = np.abs(np.linalg.norm(quaternion, axis=1) - 1) < _UNIT
+    return np.where(is_unit, np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)), np.nan)

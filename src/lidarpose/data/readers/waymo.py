@@ -75,16 +75,16 @@ class Waymo(Reader):
         files = waymo_v1.parts(root)
         folders = [f"{split}/{name}" for split in SPLITS for name in _components(root / split)]
         if files and folders:
-            mixed = f"{files[0]} is of version 1, {folders[0]} of version 2"
-            raise file_error(root, f"mixes versions of Waymo: {mixed}; keep each in a folder of its own")
+            versions = f"{files[0]} is of version 1, {folders[0]} of version 2"
+            raise file_error(root, f"mixes versions of Waymo: {versions}; keep each in a folder of its own")
         if files or folders:
             return files or _segments(root)
-        got = f"got {entries(root)}"
+        actual = f"got {entries(root)}"
         if root.name in SPLITS or _components(root):
-            got += f"; the root is likely {root.absolute().parent}"
+            actual += f"; the root is likely {root.absolute().parent}"
         if any((root / "individual_files" / split).is_dir() for split in SPLITS):
-            got += f"; the root is likely {root / 'individual_files'}"
-        raise self.wrong_root(root, got)
+            actual += f"; the root is likely {root / 'individual_files'}"
+        raise self.wrong_root(root, actual)
 
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """Everybody with keypoints in a part, in the order of time, then of track. Raises InputError where the labels
@@ -105,20 +105,22 @@ def _segments(root: Path) -> list[str]:
         folder, url = root / split, f"{_BUCKET}/{split}"
         if not _components(folder):
             continue
-        missing = [name for name in COMPONENTS if not any((folder / name).glob("*.parquet"))]
-        if missing:
-            names = missing[0] if len(missing) == 1 else f"{{{','.join(missing)}}}"
-            fetch = f"gcloud storage cp -r {url}/{names} {shlex.quote(f'{folder}/')}"
-            raise file_error(folder, f"lacks {', '.join(missing)}; fetch with: {fetch}")
+        missing_components = [name for name in COMPONENTS if not any((folder / name).glob("*.parquet"))]
+        if missing_components:
+            names = missing_components[0] if len(missing_components) == 1 else f"{{{','.join(missing_components)}}}"
+            command = f"gcloud storage cp -r {url}/{names} {shlex.quote(f'{folder}/')}"
+            raise file_error(folder, f"lacks {', '.join(missing_components)}; fetch with: {command}")
         # a damaged file is a part too: reading it reports it
         labels = sorted((folder / "lidar_hkp").glob("*.parquet"))
         segments = [path.stem for path in labels if rows_of_shard(path) != 0]
         for name in COMPONENTS:
-            missing = [segment for segment in segments if not (folder / name / f"{segment}.parquet").is_file()]
-            if missing:
-                fetch = f"gcloud storage cp {url}/{name}/{missing[0]}.parquet {shlex.quote(f'{folder / name}/')}"
-                problem = f"lacks {len(missing)} of the {len(segments)} segments with keypoints"
-                remedy = f"fetch the first with: {fetch} (or take what you do not want out of lidar_hkp)"
+            missing_segments = [segment for segment in segments if not (folder / name / f"{segment}.parquet").is_file()]
+            if missing_segments:
+                command = (
+                    f"gcloud storage cp {url}/{name}/{missing_segments[0]}.parquet {shlex.quote(f'{folder / name}/')}"
+                )
+                problem = f"lacks {len(missing_segments)} of the {len(segments)} segments with keypoints"
+                remedy = f"fetch the first with: {command} (or take what you do not want out of lidar_hkp)"
                 raise file_error(folder / name, f"{problem}; {remedy}")
         parts += [f"{split}/{segment}" for segment in segments]
     if not parts:
@@ -136,14 +138,14 @@ def _read_segment(root: Path, part: str, margin: float) -> Iterator[LabeledSampl
             yield Skipped(frames.BAD_LABEL, where)
         else:
             labels.append((key, row))
-    joined = _frames(files, labels, margin)
+    frames_by_key = _frames(files, labels, margin)
     try:
-        _add_images(files, joined)
+        _add_images(files, frames_by_key)
     except InputError as error:
-        for frame in joined.values():
+        for frame in frames_by_key.values():
             frame.fail(frames.BAD_IMAGE, str(error))
-    for frame_key in sorted(joined):
-        yield from joined[frame_key].samples()
+    for frame_key in sorted(frames_by_key):
+        yield from frames_by_key[frame_key].samples()
 
 
 def _frames(files: dict[str, Path], labels: list[Row], margin: float) -> dict[FrameKey, frames.Frame]:
@@ -156,11 +158,11 @@ def _frames(files: dict[str, Path], labels: list[Row], margin: float) -> dict[Fr
             calibrations.setdefault(segment, {})[laser] = _calibration(laser, row)
         except InputError as error:
             raise file_error(files["lidar_calibration"], error) from None
-    joined: dict[FrameKey, frames.Frame] = {}
+    frames_by_key: dict[FrameKey, frames.Frame] = {}
     for key, row in labels:
         segment, time, _ = key
-        if (segment, time) not in joined:
-            joined[segment, time] = frames.Frame(
+        if (segment, time) not in frames_by_key:
+            frames_by_key[segment, time] = frames.Frame(
                 sequence=segment,
                 timestamp=time,
                 start=min((t for s, t in poses if s == segment and t is not None), default=time),
@@ -168,34 +170,35 @@ def _frames(files: dict[str, Path], labels: list[Row], margin: float) -> dict[Fr
                 calibrations=calibrations.get(segment, {}),
                 margin=margin,
             )
-        joined[segment, time].people.append(_person(key[2], row, boxes.get(key)))
-    for frame_key, frame in joined.items():
+        frames_by_key[segment, time].people.append(_person(key[2], row, boxes.get(key)))
+    for frame_key, frame in frames_by_key.items():
         pose = poses.get(frame_key, {}).get(_VEHICLE_POSE)
         try:
             frame.T_world_vehicle = None if pose is None else frames.transform(pose, "the vehicle's pose")
         except InputError as error:
             frame.fail(frames.BAD_FRAME, str(error))
-    return joined
+    return frames_by_key
 
 
 def _calibration(laser: int, row: dict[str, Any]) -> frames.Calibration:
     values, low, high = (row[name] for name in _BEAMS)
+    name = f"beam inclinations of laser {laser}"
     return frames.Calibration(
         laser=laser,
         T_vehicle_laser=frames.transform(row[_EXTRINSIC], f"the extrinsic of laser {laser}"),
-        inclinations=numbers(LASER, values, (-1,), "beam inclinations", finite=False) if values else None,
+        inclinations=numbers("lidar_calibration", values, (-1,), name, finite=False) if values else None,
         low=low,
         high=high,
     )
 
 
 def _person(track: str, label: dict[str, Any], box: dict[str, Any] | None) -> frames.LabeledPerson | frames.Problem:
-    kinds, *places, hidden = (label[name] or [] for name in _KEYPOINT_COLUMNS)
-    if len({len(kinds), len(hidden), *map(len, places)}) > 1:
+    kinds, *coordinates, is_occluded = (label[name] or [] for name in _KEYPOINT_COLUMNS)
+    if len({len(kinds), len(is_occluded), *map(len, coordinates)}) > 1:
         return frames.Problem(frames.BAD_LABEL, "its lists have different lengths", track)
     try:
-        positions = numbers("lidar_hkp", places, (3, -1), "keypoints", finite=False)
-        keypoints = zip(kinds, positions.T, hidden, strict=True)
+        positions = numbers("lidar_hkp", coordinates, (3, -1), "keypoints", finite=False)
+        keypoints = zip(kinds, positions.T, is_occluded, strict=True)
         if box is None:
             return frames.person(track, keypoints, None)
         values = numbers("lidar_box", [box[name] for name in _BOX_COLUMNS], (7,), "a box", finite=False)
@@ -204,25 +207,25 @@ def _person(track: str, label: dict[str, Any], box: dict[str, Any] | None) -> fr
         return frames.Problem(frames.BAD_LABEL, str(error), track)
 
 
-def _add_images(files: dict[str, Path], joined: dict[FrameKey, frames.Frame]) -> None:
+def _add_images(files: dict[str, Path], frames_by_key: dict[FrameKey, frames.Frame]) -> None:
     """Adds the range images to their frames, one row at a time."""
-    wanted = {key for key, frame in joined.items() if frame.wanted}
-    if not wanted:
+    needed_keys = {key for key, frame in frames_by_key.items() if frame.wanted}
+    if not needed_keys:
         return
-    posed = {key for key, _ in table(files["lidar_pose"], _IMAGE_KEYS)}
-    poses = images(files["lidar_pose"], (_PIXEL_POSES,), wanted)
+    pose_keys = {key for key, _ in table(files["lidar_pose"], _IMAGE_KEYS)}
+    poses = images(files["lidar_pose"], (_PIXEL_POSES,), needed_keys)
     # both files usually have their frames in the same order, then there is never more than one in it
-    waiting: dict[LaserKey, np.ndarray | None] = {}
-    for key, returns in images(files["lidar"], _RETURNS, wanted):
-        while key in posed and key not in waiting:
+    pending_poses: dict[LaserKey, np.ndarray | None] = {}
+    for key, returns in images(files["lidar"], _RETURNS, needed_keys):
+        while key in pose_keys and key not in pending_poses:
             pose_key, (image,) = next(poses, (key, [None]))
-            waiting[pose_key] = image
-        pixel_poses, frame = waiting.pop(key, None), joined[key[:2]]
-        for which, image in enumerate(returns, 1):
+            pending_poses[pose_key] = image
+        pixel_poses, frame = pending_poses.pop(key, None), frames_by_key[key[:2]]
+        for return_number, image in enumerate(returns, 1):
             if image is not None and not image.size:
                 frame.fail(frames.BAD_IMAGE, f"the values of laser {key[2]} do not fit their shape")
             elif image is not None:
-                frame.add(key[2], which, image[..., 0], pixel_poses)
+                frame.add(key[2], return_number, image[..., 0], pixel_poses)
 
 
 # ---- rows of Parquet files, with little memory: of range images one row at a time. Columns are picked by name and rows
@@ -253,16 +256,16 @@ def images(
     fit its shape. Raises InputError for a damaged file and missing columns.
     """
     names = tuple(f"{column}.{part}" for column in columns for part in ("values", "shape"))
-    keys, first = [key for key, _ in table(path, _IMAGE_KEYS)], 0
+    keys, first_row = [key for key, _ in table(path, _IMAGE_KEYS)], 0
     with open_parquet(path, _REMEDY, **_LITTLE_MEMORY) as file:
         _check(file, names)
         for group in range(file.num_row_groups):
-            own = keys[first : first + file.metadata.row_group(group).num_rows]
-            first += len(own)
-            last = max((k for k, key in enumerate(own) if key[:2] in wanted), default=-1)
+            group_keys = keys[first_row : first_row + file.metadata.row_group(group).num_rows]
+            first_row += len(group_keys)
+            last_row = max((k for k, key in enumerate(group_keys) if key[:2] in wanted), default=-1)
             # nothing is read of a group before the first batch is asked for
             batches = file.iter_batches(batch_size=1, row_groups=[group], columns=names, use_threads=False)
-            for key, batch in zip(own[: last + 1], batches, strict=False):
+            for key, batch in zip(group_keys[: last_row + 1], batches, strict=False):
                 if key[:2] in wanted:
                     cells = [batch.column(name)[0] for name in names]
                     yield key, [_image(*pair) for pair in zip(cells[::2], cells[1::2], strict=True)]
@@ -287,7 +290,7 @@ def _laser(name: int | str) -> int:
     return int(name)
 
 
-def _check(file, needed: tuple[str, ...]) -> None:
-    missing = [name for name in needed if name not in file.schema_arrow.names]
-    if missing:
-        raise InputError(f"has no column {missing[0]}: is it of this component of Waymo v2.0?")
+def _check(file, columns: tuple[str, ...]) -> None:
+    missing_columns = [name for name in columns if name not in file.schema_arrow.names]
+    if missing_columns:
+        raise InputError(f"has no column {missing_columns[0]}: is it of this component of Waymo v2.0?")

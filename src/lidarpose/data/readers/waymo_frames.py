@@ -31,18 +31,17 @@ _JOINTS = {
 } | {1: WAYMO14.index("nose"), 20: WAYMO14.index("head_center")}
 _KINDS = {1: "vehicle", 2: "pedestrian", 3: "sign", 4: "cyclist"}
 
-# why somebody is left out, of both versions of the dataset; BAD_REST is `lidarpose prepare`'s too
+# why somebody is left out, of both versions of the dataset
 BAD_LABEL = "label of another form"
 BAD_IMAGE = "range image cannot be read"
 BAD_FRAME = "frame cannot be read"
-BAD_REST = "the rest of a part cannot be read"
 
 
 def is_image(sizes: Sequence[int | None], count: int) -> bool:
     """Whether a range image of so many values may have these sizes: rows, columns, channels."""
     # of Python's numbers: the product of damaged ones may be 0 in 64 bits
-    known = [size for size in sizes if size is not None]
-    return len(sizes) == len(known) == 3 and min(known) >= 1 and count == math.prod(known)
+    known_sizes = [size for size in sizes if size is not None]
+    return len(sizes) == len(known_sizes) == 3 and min(known_sizes) >= 1 and count == math.prod(known_sizes)
 
 
 def transform(values: Iterable[float] | None, what: str) -> np.ndarray:
@@ -56,8 +55,8 @@ def transform(values: Iterable[float] | None, what: str) -> np.ndarray:
     matrix = matrix.reshape(4, 4)
     R = matrix[:3, :3]
     # entries first: products of far larger ones overflow
-    turns = np.abs(R).max() < 1.01 and np.abs(R @ R.T - np.eye(3)).max() < 0.01 and np.linalg.det(R) > 0
-    if not turns or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+    is_rotation = np.abs(R).max() < 1.01 and np.abs(R @ R.T - np.eye(3)).max() < 0.01 and np.linalg.det(R) > 0
+    if not is_rotation or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise InputError(f"{what} must be a rotation and a shift, got a matrix that is none")
     return matrix
 
@@ -121,8 +120,8 @@ def points_of_image(
     y, z = _turned(y, z, roll)
     z, x = _turned(z, x, pitch)
     x, y = _turned(x, y, yaw)
-    world = np.stack([x + shift[0], y + shift[1], z + shift[2]])
-    return np.linalg.solve(T_world_vehicle[:3, :3], world - T_world_vehicle[:3, 3, None]).T, row
+    world_points = np.stack([x + shift[0], y + shift[1], z + shift[2]])
+    return np.linalg.solve(T_world_vehicle[:3, :3], world_points - T_world_vehicle[:3, 3, None]).T, row
 
 
 def _turned(a: np.ndarray, b: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -161,19 +160,19 @@ def person(
     """Somebody by their labels. keypoints: (type, x y z, whether occluded) each, in any order, types that the skeleton
     lacks ignored; box: center, size (length, width, height) and heading, 7 numbers."""
     joints, labels = np.full((len(WAYMO14), 3), np.nan), np.full(len(WAYMO14), UNLABELED, np.uint8)
-    for keypoint, place, hidden in keypoints:
-        if keypoint in _JOINTS and within_reach(np.asarray(place)):
-            joints[_JOINTS[keypoint]] = place
-            labels[_JOINTS[keypoint]] = HIDDEN if hidden else SEEN
+    for keypoint, position, is_hidden in keypoints:
+        if keypoint in _JOINTS and within_reach(np.asarray(position)):
+            joints[_JOINTS[keypoint]] = position
+            labels[_JOINTS[keypoint]] = HIDDEN if is_hidden else SEEN
     if box is None:
         return Problem("keypoints without a box", track=track)
     if (labels == UNLABELED).all():
         return Problem("no joint is labelled", track=track)
     try:
-        checked = Box(center=np.asarray(box[:3]), size=np.asarray(box[3:6]), yaw=box[6], id=track)
+        labeled_box = Box(center=np.asarray(box[:3]), size=np.asarray(box[3:6]), yaw=box[6], id=track)
     except InputError as error:
         return Problem(BAD_LABEL, str(error), track)
-    return LabeledPerson(track=track, joints=joints, labels=labels, box=checked, kind=kind, counted=counted)
+    return LabeledPerson(track=track, joints=joints, labels=labels, box=labeled_box, kind=kind, counted=counted)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -222,8 +221,8 @@ class Frame:
         ring = len(image) - 1 - row if laser == TOP else np.full(len(row), -1)
         crops = self._crops[laser, which] = []
         for person in self.people:
-            inside = person.box.contains(points, self.margin) if isinstance(person, LabeledPerson) else slice(0)
-            crops.append((points[inside], ring[inside]))
+            selection = person.box.contains(points, self.margin) if isinstance(person, LabeledPerson) else slice(0)
+            crops.append((points[selection], ring[selection]))
 
     def samples(self) -> Iterator[LabeledSample | Skipped]:
         """Everybody, in the order of their tracks, once all images are there."""
@@ -241,8 +240,8 @@ class Frame:
                 if len(points):
                     yield self._sample(person, points, ring)
                     continue
-                counted = "" if person.counted is None else f"the label counts {person.counted}"
-                problem = Problem("no points in the box", counted)
+                count_text = "" if person.counted is None else f"the label counts {person.counted}"
+                problem = Problem("no points in the box", count_text)
             yield Skipped(problem.reason, f"{where}: {problem.why}" if problem.why else where)
 
     def _sample(self, person: LabeledPerson, points: np.ndarray, ring: np.ndarray) -> LabeledSample | Skipped:

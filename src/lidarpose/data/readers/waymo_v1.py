@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.data.readers import waymo_frames as frames
-from lidarpose.data.readers.base import Skipped
+from lidarpose.data.readers.base import BAD_REST, Skipped
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.io.files import file_error
 from lidarpose.sample import LabeledSample
@@ -64,17 +64,17 @@ _MESSAGES = {
 def _message_classes() -> dict[str, Any]:
     """The class of each message, in a pool of its own: Waymo's generated code may be loaded too."""
     file = descriptor_pb2.FileDescriptorProto(name="waymo.proto", package="waymo", syntax="proto2")
-    of = descriptor_pb2.FieldDescriptorProto
+    field_proto = descriptor_pb2.FieldDescriptorProto
     for message, fields in _MESSAGES.items():
-        declared = file.message_type.add(name=message)
+        message_proto = file.message_type.add(name=message)
         for name, number, kind in (field.split(":") for field in fields.split()):
-            label = of.LABEL_REPEATED if kind.startswith("*") else of.LABEL_OPTIONAL
+            label = field_proto.LABEL_REPEATED if kind.startswith("*") else field_proto.LABEL_OPTIONAL
             kind = kind.removeprefix("*")
             if kind in _MESSAGES:
-                typed = {"type": of.TYPE_MESSAGE, "type_name": f".waymo.{kind}"}
+                type_options = {"type": field_proto.TYPE_MESSAGE, "type_name": f".waymo.{kind}"}
             else:
-                typed = {"type": getattr(of, f"TYPE_{kind.upper()}")}
-            declared.field.add(name=name, number=int(number), label=label, **typed)
+                type_options = {"type": getattr(field_proto, f"TYPE_{kind.upper()}")}
+            message_proto.field.add(name=name, number=int(number), label=label, **type_options)
     pool = descriptor_pool.DescriptorPool()
     pool.AddSerializedFile(file.SerializeToString())
     return {name: message_factory.GetMessageClass(pool.FindMessageTypeByName(f"waymo.{name}")) for name in _MESSAGES}
@@ -112,7 +112,7 @@ def read(root: Path, part: str, margin: float) -> Iterator[LabeledSample | Skipp
             start = frame.start
             yield from frame.samples()
     except InputError as error:
-        yield Skipped(frames.BAD_REST, f"{part}: {error}")
+        yield Skipped(BAD_REST, f"{part}: {error}")
 
 
 def records(path: Path) -> Iterator[bytes]:
@@ -127,8 +127,8 @@ def records(path: Path) -> Iterator[bytes]:
                     raise file_error(path, f"is cut off in record {number}; copy it again")
                 length = int.from_bytes(head[:8], "little")
                 if _masked_checksum(head[:8]) != int.from_bytes(head[8:], "little"):
-                    what = "is no TFRecord file" if number == 0 else f"is damaged at record {number}"
-                    raise file_error(path, f"{what} (the checksum of a length is wrong); copy it again")
+                    problem = "is no TFRecord file" if number == 0 else f"is damaged at record {number}"
+                    raise file_error(path, f"{problem} (the checksum of a length is wrong); copy it again")
                 if file.tell() + length + 4 > size:
                     raise file_error(path, f"is cut off in record {number}; copy it again")
                 data, checksum = file.read(length), file.read(4)
@@ -169,26 +169,28 @@ def _frame(message: Any, start: int | None, margin: float) -> frames.Frame:
         try:
             # the pixels' poses are beside the first return and are those of both
             poses = _matrix(laser.ri_return1.range_image_pose_compressed)
-            for which, image in enumerate((laser.ri_return1, laser.ri_return2), 1):
+            for return_number, image in enumerate((laser.ri_return1, laser.ri_return2), 1):
                 if (values := _matrix(image.range_image_compressed)) is not None:
-                    frame.add(laser.name, which, values[..., 0], poses)
+                    frame.add(laser.name, return_number, values[..., 0], poses)
         except InputError as error:
             frame.fail(frames.BAD_IMAGE, str(error))
     return frame
 
 
 def _person(label: Any) -> frames.LabeledPerson | frames.Problem:
-    keypoints, box, counted = [], None, None
+    keypoints, box, num_points = [], None, None
     for keypoint in label.laser_keypoints.keypoint:
         if keypoint.keypoint_3d.HasField("location_m"):
-            at = keypoint.keypoint_3d.location_m
-            keypoints.append((keypoint.type, (at.x, at.y, at.z), keypoint.keypoint_3d.visibility.is_occluded))
+            location = keypoint.keypoint_3d.location_m
+            keypoints.append(
+                (keypoint.type, (location.x, location.y, location.z), keypoint.keypoint_3d.visibility.is_occluded)
+            )
     if label.HasField("box"):
         b = label.box
         box = (b.center_x, b.center_y, b.center_z, b.length, b.width, b.height, b.heading)
     if label.HasField("num_lidar_points_in_box"):
-        counted = label.num_lidar_points_in_box
-    return frames.person(label.id.decode("utf-8", "replace"), keypoints, box, label.type, counted)
+        num_points = label.num_lidar_points_in_box
+    return frames.person(label.id.decode("utf-8", "replace"), keypoints, box, label.type, num_points)
 
 
 def _calibration(laser: Any) -> frames.Calibration:
@@ -215,7 +217,7 @@ def _matrix(compressed: bytes) -> np.ndarray | None:
         raise InputError("a range image is cut off, or far larger than any")
     matrix = parse("MatrixFloat", content, _LARGEST_IMAGE)
     sizes = list(parse("Shape", matrix.shape, _LARGEST_SHAPE).dims)
-    count, rest = divmod(len(matrix.data), 4)
-    if rest or not frames.is_image(sizes, count):
+    count, remainder = divmod(len(matrix.data), 4)
+    if remainder or not frames.is_image(sizes, count):
         raise InputError(f"a range image of {count} values says it is {reprlib.repr(sizes)}")
     return np.frombuffer(matrix.data, "<f4").reshape(sizes)

@@ -31,36 +31,38 @@ class _Crop:
 
 def draw_false(result: DetectorResult, scans: ScanSet) -> bytes | None:
     """The strongest false people as crops, None where there are none."""
-    false = result.detections[result.detections.status == FALSE].sort_values("score", ascending=False, kind="stable")
+    false_people = result.detections[result.detections.status == FALSE].sort_values(
+        "score", ascending=False, kind="stable"
+    )
     crops = []
-    for row in false.head(MOST).itertuples():
-        words = (f"{row.score:.2f}", row.thing, f"{row.distance:.0f} m")
-        crops.append(_crop(scans.loaders[row.scan](), result.boxes[row.scan][row.detection], words))
+    for row in false_people.head(MOST).itertuples():
+        label_parts = (f"{row.score:.2f}", row.thing, f"{row.distance:.0f} m")
+        crops.append(_crop(scans.loaders[row.scan](), result.boxes[row.scan][row.detection], label_parts))
     return _sheet(crops, f"{result.dataset}: the strongest false people (red), labeled people blue")
 
 
 def draw_missed(result: DetectorResult, scans: ScanSet) -> bytes | None:
     """People whom the detector misses at one false person a scan, the most points first; None where there are none."""
     threshold = result.thresholds[f"{REFERENCE:g}"]
-    missed = result.people[result.people.score < threshold].sort_values("points", ascending=False, kind="stable")
+    missed_people = result.people[result.people.score < threshold].sort_values("points", ascending=False, kind="stable")
     crops = []
-    for row in missed.head(MOST).itertuples():
+    for row in missed_people.head(MOST).itertuples():
         scan, score = scans.loaders[row.scan](), f"{row.score:.2f}" if row.detection >= 0 else "no score"
-        words = (score, f"{row.points} points", f"{row.distance:.0f} m", "mounted" * row.mounted)
-        crops.append(_crop(scan, scan.boxes[row.person], words))
-    title = f"{result.dataset}: {len(missed)} people missed above {threshold:.2f}, the most points first (red)"
+        label_parts = (score, f"{row.points} points", f"{row.distance:.0f} m", "mounted" * row.mounted)
+        crops.append(_crop(scan, scan.boxes[row.person], label_parts))
+    title = f"{result.dataset}: {len(missed_people)} people missed above {threshold:.2f}, the most points first (red)"
     return _sheet(crops, title)
 
 
-def _crop(scan: LabeledScan, box: Box, words: Sequence[str]) -> _Crop:
-    near = scan.points[(np.abs(scan.points[:, :2] - box.center[:2]) < 1.5 * _REACH).all(1)]
-    own = int(box.contains(near).sum())
+def _crop(scan: LabeledScan, box: Box, label_parts: Sequence[str]) -> _Crop:
+    points = scan.points[(np.abs(scan.points[:, :2] - box.center[:2]) < 1.5 * _REACH).all(1)]
+    num_inside = int(box.contains(points).sum())
     people = [person for person in scan.boxes if np.hypot(*(person.center - box.center)[:2]) < _REACH]
     towards = (np.zeros(3) if scan.origin is None else scan.origin)[:2] - box.center[:2]
     where = shorten(" ".join((scan.name, scan.sensor, scan.kind)), 36)
-    label = " · ".join(filter(None, words)) + f"\n{where} · {own} inside"
+    label = " · ".join(filter(None, label_parts)) + f"\n{where} · {num_inside} inside"
     return _Crop(
-        points=near[thinned(len(near), _MAX_POINTS)],
+        points=points[thinned(len(points), _MAX_POINTS)],
         box=box,
         people=[person for person in people if person is not box],
         towards=towards / max(float(np.linalg.norm(towards)), 1e-9),
@@ -96,9 +98,9 @@ def _draw_crop(ax, crop: _Crop, right: np.ndarray, up: np.ndarray) -> None:
 
     axes = np.stack([right, up], 1)
     points = crop.points - crop.box.center
-    inside = crop.box.contains(crop.points)
-    near = np.abs(points @ np.cross(right, up)) < (_REACH if up[2] else np.inf)
-    for rows, color, size in ((near & ~inside, "#b5bcc4", 1.2), (inside, _INK, 3.0)):
+    is_inside = crop.box.contains(crop.points)
+    is_near = np.abs(points @ np.cross(right, up)) < (_REACH if up[2] else np.inf)
+    for rows, color, size in ((is_near & ~is_inside, "#b5bcc4", 1.2), (is_inside, _INK, 3.0)):
         ax.scatter(*(points[rows] @ axes).T, s=size, c=color, linewidths=0)
     for box, color in [(crop.box, _ALERT), *((person, _BLUE) for person in crop.people)]:
         edges = (box_edges(box) - crop.box.center) @ axes

@@ -54,9 +54,9 @@ def match(centers: np.ndarray, scores: np.ndarray, people: np.ndarray, wanted: n
     distance = np.linalg.norm(centers[:, None] - people[None], axis=-1)
     distance[distance > MATCH_RADIUS] = np.inf
     for d in np.argsort(-scores, kind="stable"):
-        for near in (np.where(wanted, distance[d], np.inf), distance[d]):
-            if len(people) and np.isfinite(near.min()):
-                of_person[d] = near.argmin()
+        for distances in (np.where(wanted, distance[d], np.inf), distance[d]):
+            if len(people) and np.isfinite(distances.min()):
+                of_person[d] = distances.argmin()
                 distance[:, of_person[d]] = np.inf
                 break
     return of_person
@@ -70,44 +70,51 @@ def score_scan(
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
     """The scan's wanted people, a row each, and its detections. Whom nothing finds has the score -inf."""
     origin = np.zeros(2) if scan.origin is None else scan.origin[:2]
-    places, centers = (np.array([box.center[:2] for box in some]).reshape(-1, 2) for some in (scan.boxes, boxes))
-    distance, far = (np.linalg.norm(at - origin, axis=1) for at in (places, centers))
-    wanted = scan.is_person & (scan.num_points >= LEAST_POINTS) & (distance <= max_range)
+    positions, centers = (
+        np.array([box.center[:2] for box in box_list]).reshape(-1, 2) for box_list in (scan.boxes, boxes)
+    )
+    distance, detection_distance = (np.linalg.norm(xy - origin, axis=1) for xy in (positions, centers))
+    is_wanted = scan.is_person & (scan.num_points >= LEAST_POINTS) & (distance <= max_range)
     # who has no point at all excuses no detection
-    seen = np.where((scan.num_points > 0)[:, None], places, np.inf)
-    of_person = match(centers, scores, seen, wanted)
-    finds = np.append(wanted, False)[of_person]
-    detection = np.full(len(places), -1)
+    visible_positions = np.where((scan.num_points > 0)[:, None], positions, np.inf)
+    of_person = match(centers, scores, visible_positions, is_wanted)
+    is_match = np.append(is_wanted, False)[of_person]
+    detection = np.full(len(positions), -1)
     detection[of_person[of_person >= 0]] = np.flatnonzero(of_person >= 0)
-    where = {"scan": number, "sensor": scan.sensor, "kind": scan.kind}
+    scan_columns = {"scan": number, "sensor": scan.sensor, "kind": scan.kind}
     people = pd.DataFrame(
-        where
-        | {"person": np.arange(len(places)), "points": scan.num_points, "distance": distance}
+        scan_columns
+        | {"person": np.arange(len(positions)), "points": scan.num_points, "distance": distance}
         | {"mounted": scan.mounted, "detection": detection, "score": np.append(scores, -np.inf)[detection]}
-        | {"activity": list(scan.activities or [""] * len(places))}
-        | _conditions(scan, places)
+        | {"activity": list(scan.activities or [""] * len(positions))}
+        | _conditions(scan, positions)
     )
-    status = np.where(finds, PERSON, np.where((of_person >= 0) | (far > max_range), NEITHER, FALSE))
+    status = np.where(is_match, PERSON, np.where((of_person >= 0) | (detection_distance > max_range), NEITHER, FALSE))
     detections = pd.DataFrame(
-        where
-        | {"detection": np.arange(len(boxes)), "score": scores, "distance": far, "status": status.astype(object)}
-        | {"mounted": finds & np.append(scan.mounted, False)[of_person], "thing": _things(scan, boxes)}
+        scan_columns
+        | {
+            "detection": np.arange(len(boxes)),
+            "score": scores,
+            "distance": detection_distance,
+            "status": status.astype(object),
+        }
+        | {"mounted": is_match & np.append(scan.mounted, False)[of_person], "thing": _things(scan, boxes)}
     )
-    return people[wanted], detections
+    return people[is_wanted], detections
 
 
-def _conditions(scan: LabeledScan, places: np.ndarray) -> dict[str, np.ndarray]:
+def _conditions(scan: LabeledScan, positions: np.ndarray) -> dict[str, np.ndarray]:
     """What may make people hard to find, each (P,) bool."""
-    apart = np.linalg.norm(places[:, None] - places[None], axis=-1)
+    distance = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
     # each is near itself
-    company = (apart < _COMPANY).sum(1) > 1
+    has_company = (distance < _COMPANY).sum(1) > 1
     # without the ground and the ceiling
-    grown = [2 * _TOUCHING, 2 * _TOUCHING, -2 * _TOUCHING]
-    wide = [replace(box, size=np.maximum(box.size + grown, 0.1)) for box in scan.boxes]
-    thing = np.full(len(scan.points), -1) if scan.thing is None else scan.thing
-    touching = np.array([(thing[rows] >= 0).any() for rows in rows_inside(wide, scan.points)], bool)
-    low = np.array([box.size[2] < _LOW for box in scan.boxes], bool)
-    return dict(zip(CONDITIONS, (company, touching, low, ~(company | touching | low)), strict=True))
+    margin = [2 * _TOUCHING, 2 * _TOUCHING, -2 * _TOUCHING]
+    grown_boxes = [replace(box, size=np.maximum(box.size + margin, 0.1)) for box in scan.boxes]
+    thing_index = np.full(len(scan.points), -1) if scan.thing is None else scan.thing
+    is_touching = np.array([(thing_index[rows] >= 0).any() for rows in rows_inside(grown_boxes, scan.points)], bool)
+    is_low = np.array([box.size[2] < _LOW for box in scan.boxes], bool)
+    return dict(zip(CONDITIONS, (has_company, is_touching, is_low, ~(has_company | is_touching | is_low)), strict=True))
 
 
 def _things(scan: LabeledScan, boxes: Sequence[Box]) -> list[str]:
@@ -116,8 +123,8 @@ def _things(scan: LabeledScan, boxes: Sequence[Box]) -> list[str]:
         return [""] * len(boxes)
     names = np.array([*scan.things, "ground or building"], object)[scan.thing]
     names[scan.person >= 0] = "part of a person"
-    inside = rows_inside(list(boxes), scan.points)
-    return [pd.Series(names[rows]).mode().iloc[0] if len(rows) else "no points" for rows in inside]
+    box_rows = rows_inside(list(boxes), scan.points)
+    return [pd.Series(names[rows]).mode().iloc[0] if len(rows) else "no points" for rows in box_rows]
 
 
 # ---- all scans
@@ -146,8 +153,8 @@ class DetectorResult:
 
     def row(self, figure: str, at: str = "", group: str = "all", of: str = "all") -> dict[str, Any]:
         """The row of a figure, which must be there."""
-        wanted = {"figure": figure, "at": at, "group": group, "of": of}
-        return next(row for row in self.rows if wanted.items() <= row.items())
+        keys = {"figure": figure, "at": at, "group": group, "of": of}
+        return next(row for row in self.rows if keys.items() <= row.items())
 
 
 def score_detector(
@@ -169,7 +176,7 @@ def score_detector(
         predictor: poses matched people in found and in labeled boxes, where joints are known.
         seed: of the intervals.
     """
-    scored: list[tuple] = []
+    scan_results: list[tuple] = []
     progress(0, len(scans.loaders))
     for number, load in enumerate(scans.loaders):
         scan = load()
@@ -177,10 +184,10 @@ def score_detector(
         people, detections = score_scan(number, scan, boxes, np.asarray(scores, float), max_range=max_range)
         if predictor is not None and scan.joints is not None:
             people = people.assign(**_pose_errors(people, scan, boxes, predictor))
-        about = {"sensor": scan.sensor, "kind": scan.kind, "changed": scan.changed}
-        scored.append((people, detections, boxes, about))
+        scan_info = {"sensor": scan.sensor, "kind": scan.kind, "changed": scan.changed}
+        scan_results.append((people, detections, boxes, scan_info))
         progress(number + 1, len(scans.loaders))
-    *tables, all_boxes, rows_about = zip(*scored, strict=True)
+    *tables, all_boxes, rows_about = zip(*scan_results, strict=True)
     people, detections = (pd.concat(parts, ignore_index=True) for parts in tables)
     if people.empty:
         raise InputError(f"{scans.name} has nobody of {LEAST_POINTS} points and more within {max_range:g} m")
@@ -189,12 +196,12 @@ def score_detector(
     rows, thresholds = _figures(people, detections, table, rng, default_score)
     for at in (f"{REFERENCE:g}", "default"):
         rows += _pose_rows(people, at, thresholds[at], rng) if at in thresholds else []
-    counted = detections[detections.status != NEITHER].assign(people=lambda table: table.status == PERSON)
-    error = aggregate.calibration_error(counted.score, counted.people)
-    rows.append(_row("calibration_error", value=100 * error, unit="%", count=len(counted)))
-    bins = counted.groupby(np.minimum((counted.score * _BINS).astype(int), _BINS - 1))
+    counted_detections = detections[detections.status != NEITHER].assign(people=lambda table: table.status == PERSON)
+    error = aggregate.calibration_error(counted_detections.score, counted_detections.people)
+    rows.append(_row("calibration_error", value=100 * error, unit="%", count=len(counted_detections)))
+    bins = counted_detections.groupby(np.minimum((counted_detections.score * _BINS).astype(int), _BINS - 1))
     reliability = bins.agg(score=("score", "mean"), people=("people", "mean"), detections=("people", "size"))
-    false = detections[(detections.status == FALSE) & (detections.score >= thresholds[f"{REFERENCE:g}"])]
+    false_people = detections[(detections.status == FALSE) & (detections.score >= thresholds[f"{REFERENCE:g}"])]
     return DetectorResult(
         dataset=scans.name,
         scans=len(table),
@@ -205,7 +212,7 @@ def score_detector(
         rows=rows,
         thresholds=thresholds,
         reliability=reliability.round(4).to_dict("records"),
-        things=false.thing[false.thing != ""].value_counts().to_dict(),
+        things=false_people.thing[false_people.thing != ""].value_counts().to_dict(),
     )
 
 
@@ -226,17 +233,17 @@ def _figures(
     count = len(scans)
     # how often each scan counts: once, and as drawn
     weights = np.vstack([np.ones(count), rng.multinomial(count, np.full(count, 1 / count), size=_REPEATS)])
-    false = detections[detections.status == FALSE].sort_values("score", ascending=False, kind="stable")
-    above = {f"{budget:g}": exclusive_thresholds(false, weights, budget) for budget in FALSE_PER_SCAN}
+    false_people = detections[detections.status == FALSE].sort_values("score", ascending=False, kind="stable")
+    operating_bounds = {f"{budget:g}": exclusive_thresholds(false_people, weights, budget) for budget in FALSE_PER_SCAN}
     if default_score is not None:
-        above["default"] = np.full(len(weights), np.nextafter(default_score, -1))
+        operating_bounds["default"] = np.full(len(weights), np.nextafter(default_score, -1))
     groups = [group for group in _groups_of_people(people) if group[2].any() or group[0] == "all"]
     masks = np.array([mask for _, _, mask in groups], float)
     person_weights = weights[:, people.scan]
     total = person_weights @ masks.T
     rows: list[dict[str, Any]] = []
     thresholds: dict[str, float] = {}
-    for at, bounds in above.items():
+    for at, bounds in operating_bounds.items():
         # just above the false person that is one too many
         thresholds[at] = max(0.0, float(np.nextafter(bounds[0], 1)))
         hits = (people.score.to_numpy() > bounds[:, None]) * person_weights
@@ -246,11 +253,11 @@ def _figures(
         for (group, of, mask), draws in zip(groups, recall.T, strict=True):
             ends = _with_interval(draws, people.scan[mask].nunique())
             rows.append(_row("recall", at, group, of, **ends, unit="%", count=int(mask.sum())))
-        rows += _false_rows(at, false[false.score > bounds[0]], scans)
-    on_foot = people[~people.mounted]
-    counted = detections[(detections.status == FALSE) | (detections.status == PERSON) & ~detections.mounted]
-    precision = 100 * average_precision(counted, on_foot, weights)
-    rows.append(_row("average_precision", **_with_interval(precision, count), unit="%", count=len(on_foot)))
+        rows += _false_rows(at, false_people[false_people.score > bounds[0]], scans)
+    people_on_foot = people[~people.mounted]
+    counted_detections = detections[(detections.status == FALSE) | (detections.status == PERSON) & ~detections.mounted]
+    precision = 100 * average_precision(counted_detections, people_on_foot, weights)
+    rows.append(_row("average_precision", **_with_interval(precision, count), unit="%", count=len(people_on_foot)))
     return rows, thresholds | ({} if default_score is None else {"default": default_score})
 
 
@@ -258,24 +265,27 @@ def exclusive_thresholds(false: pd.DataFrame, weights: np.ndarray, budget: float
     """(R,) of each row of weights (R, scans) the lowest bound that at most `budget` false detections a scan, sorted by
     falling score, lie above; -1 where all may."""
     scores, scan = np.append(false.score.to_numpy(float), -1.0), false.scan.to_numpy(int)
-    most = budget * weights.sum(1) + 1e-9
+    max_false = budget * weights.sum(1) + 1e-9
     return np.array(
-        [scores[np.searchsorted(np.cumsum(own[scan]), m, side="right")] for own, m in zip(weights, most, strict=True)]
+        [
+            scores[np.searchsorted(np.cumsum(scan_weights[scan]), m, side="right")]
+            for scan_weights, m in zip(weights, max_false, strict=True)
+        ]
     )
 
 
 def average_precision(detections: pd.DataFrame, people: pd.DataFrame, weights: np.ndarray) -> np.ndarray:
     """Area under precision over recall, precision made falling, 0 to 1, NaN of nobody, for weights (R, scans): (R,)."""
     detections = detections.sort_values("score", ascending=False, kind="stable")
-    scan, finds = detections.scan.to_numpy(int), (detections.status == PERSON).to_numpy()
+    scan, is_match = detections.scan.to_numpy(int), (detections.status == PERSON).to_numpy()
     # equal scores come together
-    last = ~detections.score.duplicated(keep="last").to_numpy()
+    is_last = ~detections.score.duplicated(keep="last").to_numpy()
     areas = np.full(len(weights), np.nan)
-    for row, wanted in enumerate(weights[:, people.scan.to_numpy(int)].sum(1)):
-        own = weights[row][scan]
-        hits, count = np.cumsum(own * finds)[last], np.cumsum(own)[last]
+    for row, num_people in enumerate(weights[:, people.scan.to_numpy(int)].sum(1)):
+        detection_weights = weights[row][scan]
+        hits, count = np.cumsum(detection_weights * is_match)[is_last], np.cumsum(detection_weights)[is_last]
         precision = np.maximum.accumulate((hits / np.maximum(count, 1))[::-1])[::-1]
-        areas[row] = (np.diff(hits, prepend=0) * precision).sum() / wanted if wanted else np.nan
+        areas[row] = (np.diff(hits, prepend=0) * precision).sum() / num_people if num_people else np.nan
     return areas
 
 
@@ -289,31 +299,33 @@ def _with_interval(draws: np.ndarray, units: int) -> dict[str, Any]:
 
 def _groups_of_people(people: pd.DataFrame) -> Iterator[tuple[str, str, np.ndarray]]:
     """Group, of what of it, and whose rows: people on foot by all that is known of them, mounted ones apart."""
-    on_foot, points = ~people.mounted.to_numpy(), people.points.to_numpy()
-    for prefix, some in (("", on_foot), ("mounted, ", ~on_foot)):
-        yield f"{prefix}all", "all", some
+    is_on_foot, points = ~people.mounted.to_numpy(), people.points.to_numpy()
+    for prefix, mask in (("", is_on_foot), ("mounted, ", ~is_on_foot)):
+        yield f"{prefix}all", "all", mask
         for name, rows in aggregate.span_rows(points, POINT_EDGES).items():
-            yield f"{prefix}points", name, some & rows
-    for least, some in (("", on_foot), (", 50 points and more", on_foot & (points >= 50))):
+            yield f"{prefix}points", name, mask & rows
+    for suffix, mask in (("", is_on_foot), (", 50 points and more", is_on_foot & (points >= 50))):
         for column in ("sensor", "kind", "activity"):
             for name in sorted(set(people[column]) - {""}):
-                yield f"{column}{least}", name, some & (people[column] == name).to_numpy()
-        yield f"kind{least}", "indoors", some & people.kind.isin(INDOORS).to_numpy()
+                yield f"{column}{suffix}", name, mask & (people[column] == name).to_numpy()
+        yield f"kind{suffix}", "indoors", mask & people.kind.isin(INDOORS).to_numpy()
         for name in CONDITIONS:
-            yield f"condition{least}", name, some & people[name].to_numpy(bool)
+            yield f"condition{suffix}", name, mask & people[name].to_numpy(bool)
         for name, rows in aggregate.span_rows(people.distance.to_numpy(), DISTANCE_EDGES).items():
-            yield f"distance, m{least}", name, some & rows
+            yield f"distance, m{suffix}", name, mask & rows
 
 
-def _false_rows(at: str, false: pd.DataFrame, scans: pd.DataFrame) -> Iterator[dict[str, Any]]:
+def _false_rows(at: str, false_people: pd.DataFrame, scans: pd.DataFrame) -> Iterator[dict[str, Any]]:
     """False people a scan: of all, of the worst scan, by sensor and kind of scene."""
-    counts = false.scan.value_counts().reindex(scans.index, fill_value=0)
+    counts = false_people.scan.value_counts().reindex(scans.index, fill_value=0)
     yield _row("false_people", at, value=counts.mean(), unit="a scan", count=len(scans))
     yield _row("false_people", at, "worst", "scan", value=counts.max(), unit="a scan", count=1)
     for column in ("sensor", "kind"):
-        for name, own in counts.groupby(scans[column]):
+        for name, group_counts in counts.groupby(scans[column]):
             if name:
-                yield _row("false_people", at, column, name, value=own.mean(), unit="a scan", count=len(own))
+                yield _row(
+                    "false_people", at, column, name, value=group_counts.mean(), unit="a scan", count=len(group_counts)
+                )
 
 
 # ---- poses
@@ -324,16 +336,16 @@ def _pose_errors(
 ) -> dict[str, np.ndarray]:
     """Errors of poses in found and in labeled boxes, mm, NaN without a pose."""
     assert scan.joints is not None
-    matched = people[people.detection >= 0]
+    matched_people = people[people.detection >= 0]
     sources = {
-        "mpjpe_found": [boxes[k] for k in matched.detection],
-        "mpjpe_given": [scan.boxes[k] for k in matched.person],
+        "mpjpe_found": [boxes[k] for k in matched_people.detection],
+        "mpjpe_given": [scan.boxes[k] for k in matched_people.person],
     }
-    true = scan.joints[matched.person][:, BODY26.map_to(HUMAN15)]
+    true = scan.joints[matched_people.person][:, BODY26.map_to(HUMAN15)]
     origin = "unknown" if scan.origin is None else scan.origin
     errors = {name: np.full(len(people), np.nan) for name in sources}
-    for name, own in sources.items():
-        crops = [replace(box, id=None) for box in own]
+    for name, source_boxes in sources.items():
+        crops = [replace(box, id=None) for box in source_boxes]
         poses = predictor.predict(scan.points, boxes=crops, sensor_origin=origin, skeleton=HUMAN15.name)
         errors[name][people.detection >= 0] = [
             joint_errors(person.joints[None], joints[None]).mean() if person.has_pose else np.nan
@@ -346,8 +358,10 @@ def _pose_rows(people: pd.DataFrame, at: str, threshold: float, rng: np.random.G
     """MPJPE of people found at an operating point who have a pose in both boxes, and the mean difference."""
     if "mpjpe_found" not in people:
         return
-    both = people[(people.score >= threshold) & people.mpjpe_found.notna() & people.mpjpe_given.notna()]
-    for name in ("mpjpe_found", "mpjpe_given", "mpjpe_difference") if len(both) else ():
-        values = both.mpjpe_found - both.mpjpe_given if name == "mpjpe_difference" else both[name]
-        low, high = aggregate.interval(values, rng, clusters=both.scan.to_numpy()).stated
-        yield _row(name, at, value=values.mean(), low=low, high=high, unit="mm", count=len(both))
+    posed_people = people[(people.score >= threshold) & people.mpjpe_found.notna() & people.mpjpe_given.notna()]
+    for name in ("mpjpe_found", "mpjpe_given", "mpjpe_difference") if len(posed_people) else ():
+        values = (
+            posed_people.mpjpe_found - posed_people.mpjpe_given if name == "mpjpe_difference" else posed_people[name]
+        )
+        low, high = aggregate.interval(values, rng, clusters=posed_people.scan.to_numpy()).stated
+        yield _row(name, at, value=values.mean(), low=low, high=high, unit="mm", count=len(posed_people))

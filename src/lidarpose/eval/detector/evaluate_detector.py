@@ -64,8 +64,8 @@ def _baseline(predictor: Predictor | None, points: np.ndarray, origin: np.ndarra
     if predictor is not None and boxes:
         poses = predictor.predict(points, boxes=boxes, sensor_origin="unknown" if origin is None else origin)
         scores = np.array([np.exp(-person.spread.mean() / _SPREAD) if person.has_pose else 0.0 for person in poses])
-    kept = suppress_near(centers, scores, SAME)
-    return [boxes[k] for k in kept], scores[kept]
+    indices = suppress_near(centers, scores, SAME)
+    return [boxes[k] for k in indices], scores[indices]
 
 
 def run_detector(
@@ -96,13 +96,15 @@ def run_detector(
         check_int("limit", limit, least=1)
     sets = [heldout_scans(limit)] if heldout else []
     sets += [labeled_scans(folder, limit) for folder in folders]
-    default = None
+    default_score = None
     if detect is None:
         detector = Detector(weights) if method in ("detector", "scorer") else None
-        default = detector.header.get("default_score") if detector and method == "detector" else None
+        default_score = detector.header.get("default_score") if detector and method == "detector" else None
         detect = detector_of(method, detector, max_range=max_range)
     predictor = None if network is None else load(network, tta=1)
-    score = partial(score_detector, detect, max_range=max_range, predictor=predictor, seed=seed, default_score=default)
+    score = partial(
+        score_detector, detect, max_range=max_range, predictor=predictor, seed=seed, default_score=default_score
+    )
     return [score(scans, progress=partial(progress, scans.name)) for scans in sets], sets
 
 
@@ -123,6 +125,6 @@ def write_detector(
         for result, scans in zip(results, sets, strict=True):
             files[pictures / f"{scans.name}-false.png"] = draw_false(result, scans)
             files[pictures / f"{scans.name}-missed.png"] = draw_missed(result, scans)
-    written = {path: content for path, content in files.items() if content}
-    write_all_atomic(written)
-    return list(written)
+    contents = {path: content for path, content in files.items() if content}
+    write_all_atomic(contents)
+    return list(contents)

@@ -77,13 +77,13 @@ def synthetic_scan(seed: int, index: int, family: str = HELDOUT, digest: str | N
 
     scene = detection_scene(seed, index, family=family)
     people = len(scene.boxes)
-    alike = "points origin boxes mounted activities sensor kind thing things person joints".split()
+    field_names = "points origin boxes mounted activities sensor kind thing things person joints".split()
     return LabeledScan(
         name=f"{family} {index}",
         num_points=np.bincount(scene.person[scene.person >= 0], minlength=people),
         is_person=np.ones(people, bool),
         changed=digest not in (None, scene.points_digest()),
-        **{name: getattr(scene, name) for name in alike},
+        **{name: getattr(scene, name) for name in field_names},
     )
 
 
@@ -113,20 +113,22 @@ def labeled_scans(folder: str | os.PathLike, limit: int | None = None) -> ScanSe
 def _read_scan(labels: Path, cloud: Path) -> LabeledScan:
     boxes = read_boxes(labels)
     content = json.loads(read_bytes(labels, expected="labels of people"))
-    about: dict[str, Any] = content if isinstance(content, dict) else {"people": content}
-    people = [entry if isinstance(entry, dict) else {} for entry in about["people"]]
+    document: dict[str, Any] = content if isinstance(content, dict) else {"people": content}
+    people = [entry if isinstance(entry, dict) else {} for entry in document["people"]]
     category = [str(entry.get("category", "pedestrian")).lower() for entry in people]
-    riding = [any(word in name for word in _MOUNTED) for name in category]
-    mounted = np.array([own or bool(box.mounted) for own, box in zip(riding, boxes, strict=True)], bool)
-    on_foot = np.array([any(word in name for word in _ON_FOOT) for name in category], bool)
+    is_rider = [any(word in name for word in _MOUNTED) for name in category]
+    is_mounted = np.array(
+        [is_riding or bool(box.mounted) for is_riding, box in zip(is_rider, boxes, strict=True)], bool
+    )
+    is_on_foot = np.array([any(word in name for word in _ON_FOOT) for name in category], bool)
     points = only_returns(read_points(cloud).points)[0]
-    counted = [len(rows) for rows in rows_inside(boxes, points)]
+    point_counts = [len(rows) for rows in rows_inside(boxes, points)]
     try:
-        num_points = [int(entry.get("num_points", own)) for entry, own in zip(people, counted, strict=True)]
+        num_points = [int(entry.get("num_points", count)) for entry, count in zip(people, point_counts, strict=True)]
     except (TypeError, ValueError):
         raise file_error(labels, "expected whole numbers as num_points of people: correct or drop them") from None
     try:
-        origin = as_origin(about.get("sensor_origin", (0.0, 0.0, 0.0)))
+        origin = as_origin(document.get("sensor_origin", (0.0, 0.0, 0.0)))
     except InputError as error:
         raise file_error(labels, error) from None
     return LabeledScan(
@@ -135,8 +137,8 @@ def _read_scan(labels: Path, cloud: Path) -> LabeledScan:
         origin=origin,
         boxes=boxes,
         num_points=np.array(num_points, int),
-        is_person=on_foot | mounted,
-        mounted=mounted,
-        sensor=str(about.get("sensor", "")),
-        kind=str(about.get("kind", "")),
+        is_person=is_on_foot | is_mounted,
+        mounted=is_mounted,
+        sensor=str(document.get("sensor", "")),
+        kind=str(document.get("kind", "")),
     )

@@ -121,19 +121,19 @@ def mean(table: ArrayLike, average: str = "person", *, empty: float | None = Non
     if average == "joint" and empty is not None:
         raise InputError('empty is for average="person": people without labeled joints add none to the other')
     total, count = _person_sums(as_table(table))
-    counted = count > 0 if empty is None else np.ones(len(count), bool)
-    each = np.where(count > 0, total / np.maximum(count, 1), np.nan if empty is None else empty)
-    people, joints = int(counted.sum()), int(count.sum())
+    is_counted = count > 0 if empty is None else np.ones(len(count), bool)
+    person_means = np.where(count > 0, total / np.maximum(count, 1), np.nan if empty is None else empty)
+    people, joints = int(is_counted.sum()), int(count.sum())
     value = np.nan
     if people:
-        value = total.sum() / joints if average == "joint" else each[counted].mean()
+        value = total.sum() / joints if average == "joint" else person_means[is_counted].mean()
     return Score(value, people=people, joints=joints, skipped=len(count) - people)
 
 
 def _person_sums(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Table (n, J) -> (n,) sum over each person's labeled joints, (n,) their number."""
-    labeled = ~np.isnan(table)
-    return np.where(labeled, table, 0.0).sum(1), labeled.sum(1)
+    is_labeled = ~np.isnan(table)
+    return np.where(is_labeled, table, 0.0).sum(1), is_labeled.sum(1)
 
 
 # ---- intervals
@@ -209,19 +209,19 @@ def bootstrap_means(
 ) -> tuple[np.ndarray, int]:
     """The means of `repeats` draws (repeats,), and how many units were drawn from; of nobody NaN and 0."""
     total, count = _person_sums(table)
-    labeled = count > 0
-    total, count = total[labeled], count[labeled]
+    has_label = count > 0
+    total, count = total[has_label], count[has_label]
     if average == "person":
         total, count = total / count, np.ones(len(count))
     if clusters is not None:
-        labels, cluster = np.unique(clusters[labeled], return_inverse=True)
+        labels, cluster = np.unique(clusters[has_label], return_inverse=True)
         total, count = (np.bincount(cluster, values, minlength=len(labels)) for values in (total, count))
     units = len(total)
     means = np.full(repeats, np.nan)
-    at_once = max(1, _BLOCK // max(units, 1))
-    for start in range(0, repeats if units else 0, at_once):
-        drawn = rng.integers(units, size=(min(at_once, repeats - start), units))
-        means[start : start + len(drawn)] = total[drawn].sum(1) / count[drawn].sum(1)
+    block_size = max(1, _BLOCK // max(units, 1))
+    for start in range(0, repeats if units else 0, block_size):
+        indices = rng.integers(units, size=(min(block_size, repeats - start), units))
+        means[start : start + len(indices)] = total[indices].sum(1) / count[indices].sum(1)
     return means, units
 
 
@@ -299,14 +299,14 @@ def by_span(
         raise InputError(f"edges of slices must be two or more rising numbers, got {edges.tolist()}")
     labels = _cluster_labels(clusters, len(table))
     spans = span_rows(values, edges)
-    elsewhere = ~np.any(list(spans.values()), axis=0)
-    if elsewhere.any():
-        spans["elsewhere"] = elsewhere
+    is_elsewhere = ~np.any(list(spans.values()), axis=0)
+    if is_elsewhere.any():
+        spans["elsewhere"] = is_elsewhere
     slices = {}
     for name, rows in spans.items():
-        own = None if labels is None else labels[rows]
-        drawn = None if rng is None else interval(table[rows], rng, average, clusters=own)
-        slices[name] = Slice(score=mean(table[rows], average), interval=drawn)
+        row_clusters = None if labels is None else labels[rows]
+        row_interval = None if rng is None else interval(table[rows], rng, average, clusters=row_clusters)
+        slices[name] = Slice(score=mean(table[rows], average), interval=row_interval)
     return slices
 
 
@@ -331,8 +331,8 @@ def calibration_error(confidence: ArrayLike, hit: ArrayLike, *, bins: int = 10) 
     if not len(confidence):
         return float("nan")
     index = np.minimum((confidence * bins).astype(int), bins - 1)
-    stated, true = np.bincount(index, confidence, bins), np.bincount(index, hit, bins)
-    return float(np.abs(stated - true).sum() / len(confidence))
+    confidence_sums, hit_counts = np.bincount(index, confidence, bins), np.bincount(index, hit, bins)
+    return float(np.abs(confidence_sums - hit_counts).sum() / len(confidence))
 
 
 def auroc(score: ArrayLike, hit: ArrayLike) -> float:
@@ -359,8 +359,8 @@ def _without_nan(name: str, values: ArrayLike) -> np.ndarray:
     values = as_numbers(name, values)
     if values.ndim != 1:
         raise InputError(f"{name} must be (n,), got {values.shape}: pass values.ravel()")
-    if unknown := int(np.isnan(values).sum()):
+    if num_nan := int(np.isnan(values).sum()):
         raise InputError(
-            f"{name} must hold numbers, got NaN in {unknown} of {len(values)}: leave these and their hits out"
+            f"{name} must hold numbers, got NaN in {num_nan} of {len(values)}: leave these and their hits out"
         )
     return values

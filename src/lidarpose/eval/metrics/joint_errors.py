@@ -127,34 +127,35 @@ def aligned_errors(
 ) -> np.ndarray:
     """`joint_errors` after the best similarity of each person's labeled joints (Umeyama 1991, no reflections); NaN for
     everything of people with fewer than three. dapt_compat: as in `pa_mpjpe`."""
-    pred, true, labeled = checked_poses(pred, true, visible)
+    pred, true, is_labeled = checked_poses(pred, true, visible)
     if dapt_compat or legacy:
         if np.isnan(true).any():
             raise InputError("dapt_compat aligns all joints, labeled or not: true must hold no NaN")
         # the released code asks the number of people whether the array is transposed
         axes = (0, 2, 1) if len(pred) in (2, 3) else (0, 1, 2)
-        aligned = similarity_align(pred.transpose(axes), true.transpose(axes)).transpose(axes)
-        return _distances(aligned, true, labeled)
-    labeled &= (labeled.sum(1) >= LEAST_ALIGNED)[:, None]
+        aligned_pred = similarity_align(pred.transpose(axes), true.transpose(axes)).transpose(axes)
+        return _distances(aligned_pred, true, is_labeled)
+    is_labeled &= (is_labeled.sum(1) >= LEAST_ALIGNED)[:, None]
     # joints without a label go to the mean of the others, where they neither move nor turn anything
-    known, count = labeled[..., None], np.maximum(labeled.sum(1), 1)[:, None, None]
-    pred, filled = (
-        np.where(known, joints, np.where(known, joints, 0.0).sum(1, keepdims=True) / count) for joints in (pred, true)
+    joint_mask, count = is_labeled[..., None], np.maximum(is_labeled.sum(1), 1)[:, None, None]
+    pred, filled_true = (
+        np.where(joint_mask, joints, np.where(joint_mask, joints, 0.0).sum(1, keepdims=True) / count)
+        for joints in (pred, true)
     )
-    return _distances(similarity_align(pred, filled), true, labeled)
+    return _distances(similarity_align(pred, filled_true), true, is_labeled)
 
 
 def acceleration_errors(pred: ArrayLike, true: ArrayLike, rate: float, visible: ArrayLike | None = None) -> np.ndarray:
     """(n, (T - 2) J) mm/s^2: distance of predicted and true acceleration, see `acceleration_error`; NaN where none."""
-    pred, true, labeled = checked_poses(pred, true, visible, trailing=("frames", "joints", "3"))
+    pred, true, is_labeled = checked_poses(pred, true, visible, trailing=("frames", "joints", "3"))
     if pred.shape[1] < 3:
         raise InputError(f"acceleration needs sequences of 3 frames or more, got {pred.shape[1]}")
     if not (np.isfinite(rate) and rate > 0):
         raise InputError(f"rate must be a positive number of frames a second, got {rate}")
-    offset = np.where(labeled[..., None], pred - true, 0.0)
-    known = labeled[:, :-2] & labeled[:, 1:-1] & labeled[:, 2:]
+    offset = np.where(is_labeled[..., None], pred - true, 0.0)
+    has_acceleration = is_labeled[:, :-2] & is_labeled[:, 1:-1] & is_labeled[:, 2:]
     error = np.linalg.norm(offset[:, :-2] - 2 * offset[:, 1:-1] + offset[:, 2:], axis=-1) * rate**2 * 1e3
-    return np.where(known, error, np.nan).reshape(len(error), -1)
+    return np.where(has_acceleration, error, np.nan).reshape(len(error), -1)
 
 
 def joint_hits(
@@ -167,9 +168,9 @@ def joint_hits(
     return np.where(np.isnan(error), np.nan, 100.0 * (error < threshold * torso * 1e3))
 
 
-def _distances(pred: np.ndarray, true: np.ndarray, labeled: np.ndarray) -> np.ndarray:
-    offset = np.where(labeled[..., None], pred - true, 0.0)
-    return np.where(labeled, np.linalg.norm(offset, axis=-1) * 1e3, np.nan)
+def _distances(pred: np.ndarray, true: np.ndarray, is_labeled: np.ndarray) -> np.ndarray:
+    offset = np.where(is_labeled[..., None], pred - true, 0.0)
+    return np.where(is_labeled, np.linalg.norm(offset, axis=-1) * 1e3, np.nan)
 
 
 def _mean(table: np.ndarray, average: str, dapt_compat: bool, *, empty: float) -> Score:
@@ -183,18 +184,18 @@ def _mean(table: np.ndarray, average: str, dapt_compat: bool, *, empty: float) -
 
 
 def checked_poses(pred, true, visible, trailing=("joints", "3")) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """pred, true (n, ..., 3), labeled (n, ...) bool, a new array, where the dots are as many as `trailing` says."""
+    """pred, true (n, ..., 3), is_labeled (n, ...) bool, a new array, where the dots are as many as `trailing` says."""
     pred, true = as_numbers("pred", pred), as_numbers("true", true)
     if pred.shape != true.shape or pred.ndim < len(trailing) or pred.shape[-1] != 3 or not pred.shape[-2]:
-        wanted = ", ".join(("...", *trailing))
-        raise InputError(f"pred and true must both be ({wanted}), got {pred.shape} and {true.shape}")
+        expected_shape = ", ".join(("...", *trailing))
+        raise InputError(f"pred and true must both be ({expected_shape}), got {pred.shape} and {true.shape}")
     if not np.isfinite(pred).all():
-        joints = int((~np.isfinite(pred).all(-1)).sum())
-        raise InputError(f"pred must be finite, got NaN or infinity in {joints} joints: predict every joint")
+        num_joints = int((~np.isfinite(pred).all(-1)).sum())
+        raise InputError(f"pred must be finite, got NaN or infinity in {num_joints} joints: predict every joint")
     if np.isinf(true).any():
         raise InputError("true must be finite, or NaN where a joint has no label; got infinity")
-    labeled = ~np.isnan(true).any(-1)
+    is_labeled = ~np.isnan(true).any(-1)
     if visible is not None:
-        labeled &= as_flags("visible", visible, labeled.shape)
+        is_labeled &= as_flags("visible", visible, is_labeled.shape)
     shape = (int(np.prod(pred.shape[: -len(trailing)])), *pred.shape[-len(trailing) :])
-    return pred.reshape(shape), true.reshape(shape), labeled.reshape(shape[:-1])
+    return pred.reshape(shape), true.reshape(shape), is_labeled.reshape(shape[:-1])

@@ -33,8 +33,8 @@ def oks_sigmas(of: Skeleton | str = WAYMO14) -> np.ndarray:
     of = as_skeleton(of)
     sigmas = [SIGMAS.get(name.removeprefix("left_").removeprefix("right_")) for name in of.joints]
     if None in sigmas:
-        missing = ", ".join(name for name, sigma in zip(of.joints, sigmas, strict=True) if sigma is None)
-        raise InputError(f"Waymo has no sigma for {missing} of {of.name}: pick waymo14's joints, or give sigmas")
+        missing_names = ", ".join(name for name, sigma in zip(of.joints, sigmas, strict=True) if sigma is None)
+        raise InputError(f"Waymo has no sigma for {missing_names} of {of.name}: pick waymo14's joints, or give sigmas")
     return np.array(sigmas)
 
 
@@ -90,9 +90,9 @@ def oks(
             raise InputError(f"OKS of {error.shape[1]} joints needs sigmas, such as oks_sigmas(skeleton)")
         sigmas = oks_sigmas()
     spread = _box_scale(size, len(error)) * _checked_sigmas(sigmas, error.shape[1])
-    labeled = ~np.isnan(error)
-    similarity = np.where(labeled, np.exp(-(np.where(labeled, error, 0) ** 2) / (2 * spread**2)), 0)
-    count = labeled.sum(1)
+    is_labeled = ~np.isnan(error)
+    similarity = np.where(is_labeled, np.exp(-(np.where(is_labeled, error, 0) ** 2) / (2 * spread**2)), 0)
+    count = is_labeled.sum(1)
     return np.where(count > 0, similarity.sum(1) / np.maximum(count, 1), np.nan)
 
 
@@ -101,8 +101,8 @@ def oks_hits(similarity: ArrayLike, thresholds: ArrayLike = OKS_THRESHOLDS) -> n
     similarity, thresholds = as_numbers("similarity", similarity), np.atleast_1d(as_numbers("thresholds", thresholds))
     if similarity.ndim != 1 or not thresholds.size:
         raise InputError(f"similarity must be (people,) and thresholds one or more, got {similarity.shape}")
-    above = 100.0 * (np.nan_to_num(similarity)[:, None] > thresholds).mean(1)
-    return np.where(np.isnan(similarity), np.nan, above)
+    percent = 100.0 * (np.nan_to_num(similarity)[:, None] > thresholds).mean(1)
+    return np.where(np.isnan(similarity), np.nan, percent)
 
 
 def oks_ap(
@@ -213,8 +213,10 @@ def _frame_totals(pred, true, boxes, visible, predicted, penalty: float) -> np.n
     pred, true = pred.reshape(-1, joints, 3), true.reshape(-1, joints, 3)
     checked_poses(pred, pred, None)
     _, true, labeled = checked_poses(np.zeros_like(true), true, visible if len(true) else None)
-    claimed = np.ones(pred.shape[:2], bool)
-    predicted = claimed if predicted is None or not len(pred) else as_flags("predicted", predicted, claimed.shape)
+    all_predicted = np.ones(pred.shape[:2], bool)
+    predicted = (
+        all_predicted if predicted is None or not len(pred) else as_flags("predicted", predicted, all_predicted.shape)
+    )
     boxes = as_numbers("boxes", boxes)
     boxes = boxes.reshape(0, 7) if not boxes.size else boxes
     if boxes.shape != (len(true), 7) or not np.isfinite(boxes).all() or not (boxes[:, 3:6] > 0).all():
@@ -224,10 +226,10 @@ def _frame_totals(pred, true, boxes, visible, predicted, penalty: float) -> np.n
     matches = match_people(pred, true, boxes, predicted, labeled, penalty=penalty)
     g, p = matches.pairs.T
     cost = keypoint_costs(pred[p], true[g], predicted[p], labeled[g], penalty)
-    both = predicted[p] & labeled[g]
+    is_matched = predicted[p] & labeled[g]
     missed = (labeled[g] & ~predicted[p]).sum() + labeled[matches.missed].sum()
     extra = (predicted[p] & ~labeled[g]).sum() + predicted[matches.extra].sum()
-    return np.array([cost[both].sum(), both.sum(), missed, extra, *map(len, astuple(matches))])
+    return np.array([cost[is_matched].sum(), is_matched.sum(), missed, extra, *map(len, astuple(matches))])
 
 
 def _people(name: str, value: ArrayLike) -> np.ndarray:
@@ -271,15 +273,15 @@ def match_people(
     has_label = np.any(labeled, axis=1)
     distance = np.where(predicted[None], distance_to_boxes(pred, boxes), np.inf)
     # (G, P, J)
-    near = np.linalg.norm(pred[None] - np.where(labeled[..., None], true, np.inf)[:, None], axis=-1) < penalty
-    near_label = (near & predicted[None]).any((0, 2))
-    inside = np.where(~has_label[:, None] & ~near_label, (distance < _WITHIN).sum(-1), 0)
-    rows, columns = assign_plain(-inside)
-    excused = columns[inside[rows, columns] > 0]
+    is_near = np.linalg.norm(pred[None] - np.where(labeled[..., None], true, np.inf)[:, None], axis=-1) < penalty
+    is_near_label = (is_near & predicted[None]).any((0, 2))
+    num_inside = np.where(~has_label[:, None] & ~is_near_label, (distance < _WITHIN).sum(-1), 0)
+    rows, columns = assign_plain(-num_inside)
+    excused = columns[num_inside[rows, columns] > 0]
 
-    free = np.any(predicted, axis=1)
-    free[excused] = False
-    people, candidates = np.flatnonzero(has_label), np.flatnonzero(free)
+    is_free = np.any(predicted, axis=1)
+    is_free[excused] = False
+    people, candidates = np.flatnonzero(has_label), np.flatnonzero(is_free)
     cost = keypoint_costs(
         pred[None, candidates], true[people, None], predicted[None, candidates], labeled[people, None], penalty
     )
@@ -287,8 +289,8 @@ def match_people(
     total = np.nan_to_num(cost).mean(-1)
     total[distance[np.ix_(people, candidates)].min(-1, initial=np.inf) > penalty] = penalty
     rows, columns = assign_plain(total)
-    near_enough = total[rows, columns] < penalty
-    pairs = np.stack([people[rows[near_enough]], candidates[columns[near_enough]]], -1)
+    is_match = total[rows, columns] < penalty
+    pairs = np.stack([people[rows[is_match]], candidates[columns[is_match]]], -1)
     missed, extra = np.setdiff1d(people, pairs[:, 0]), np.setdiff1d(candidates, pairs[:, 1])
     return Matches(pairs, missed, extra, np.sort(excused))
 
@@ -299,8 +301,8 @@ def keypoint_costs(
     """(..., J) m: a joint's distance, at most `penalty`, where it is labeled and predicted; `penalty` where it is only
     one of both; NaN where it is neither. The arguments broadcast."""
     offset = np.where(labeled[..., None], pred - np.where(labeled[..., None], true, 0), 0)
-    near = np.minimum(np.linalg.norm(offset, axis=-1), penalty)
-    return np.where(predicted & labeled, near, np.where(predicted | labeled, penalty, np.nan))
+    distance = np.minimum(np.linalg.norm(offset, axis=-1), penalty)
+    return np.where(predicted & labeled, distance, np.where(predicted | labeled, penalty, np.nan))
 
 
 def distance_to_boxes(points: np.ndarray, boxes: np.ndarray) -> np.ndarray:

@@ -68,44 +68,48 @@ def open_source(
     """
     if columns is not None:
         columns = check_int("columns", columns, least=3, hint=" (x y z first)")
-    named = [path for given in listed(paths) for path in _matches(given)]
-    if not named:
+    matched_paths = [path for path_or_pattern in listed(paths) for path in _matches(path_or_pattern)]
+    if not matched_paths:
         raise file_error("source", "expected files, folders or recordings, got none")
-    name = str(named[0]) if len(named) == 1 else os.path.commonpath([os.path.abspath(path) for path in named])
-    where = None if meta is None else Path(meta)
-    how = ReadingOptions(columns=columns, topic=topic, meta=where, name_times=rate is None)
-    return FrameSource(_open_all(name, named, how), rate=rate, start=start, end=end, every=every)
+    name = (
+        str(matched_paths[0])
+        if len(matched_paths) == 1
+        else os.path.commonpath([os.path.abspath(path) for path in matched_paths])
+    )
+    meta_path = None if meta is None else Path(meta)
+    options = ReadingOptions(columns=columns, topic=topic, meta=meta_path, name_times=rate is None)
+    return FrameSource(_open_all(name, matched_paths, options), rate=rate, start=start, end=end, every=every)
 
 
 def is_single_scan(paths: str | os.PathLike | Sequence[str | os.PathLike]) -> bool:
     """Whether that is one plain point file, or a name of none: one scan, not frames."""
-    given = listed(paths)
-    if len(given) != 1 or os.path.isdir(given[0]):
+    path_list = listed(paths)
+    if len(path_list) != 1 or os.path.isdir(path_list[0]):
         return False
-    is_pattern = glob.has_magic(os.fspath(given[0])) and not os.path.exists(given[0])
-    return not is_pattern and Path(given[0]).suffix.lower() not in RECORDINGS
+    is_pattern = glob.has_magic(os.fspath(path_list[0])) and not os.path.exists(path_list[0])
+    return not is_pattern and Path(path_list[0]).suffix.lower() not in RECORDINGS
 
 
-def _matches(given: str | os.PathLike) -> list[Path]:
+def _matches(path: str | os.PathLike) -> list[Path]:
     """The paths that a path or pattern names, in natural order."""
-    if os.path.exists(given):
-        return [Path(given)]
-    pattern = os.fspath(given)
+    if os.path.exists(path):
+        return [Path(path)]
+    pattern = os.fspath(path)
     paths = sorted(map(Path, glob.glob(pattern, recursive=True)), key=natural_key)
     if not paths:
         problem = "no file has such a name" if glob.has_magic(pattern) else "no such file or folder"
-        raise file_error(given, f"{problem}; expected point files, a folder of them or a recording: check the path")
+        raise file_error(path, f"{problem}; expected point files, a folder of them or a recording: check the path")
     return paths
 
 
-def _open_all(name: str, paths: Sequence[Path], how: ReadingOptions) -> Recording:
+def _open_all(name: str, paths: Sequence[Path], options: ReadingOptions) -> Recording:
     """Files of points are one recording together, anything else is one of its own."""
     files = [path for path in paths if path.is_file() and path.suffix.lower() not in RECORDINGS]
-    parts: list[Recording] = [open_files(name, files, how)] if files else []
+    parts: list[Recording] = [open_files(name, files, options)] if files else []
     problems: list[InputError] = []
     for path in sorted(set(paths) - set(files), key=natural_key):
         try:
-            parts.append(_open_folder(path, how) if path.is_dir() else _open_recording(path, how))
+            parts.append(_open_folder(path, options) if path.is_dir() else _open_recording(path, options))
         except InputError as problem:
             problems.append(problem)
     if not parts:
@@ -115,21 +119,21 @@ def _open_all(name: str, paths: Sequence[Path], how: ReadingOptions) -> Recordin
     return ChainedRecording(name, parts, [f"left out: {problem}" for problem in problems])
 
 
-def _open_folder(folder: Path, how: ReadingOptions) -> Recording:
+def _open_folder(folder: Path, options: ReadingOptions) -> Recording:
     # what rosbag2 writes
     if (folder / "metadata.yaml").exists():
-        return _open_recording(folder, how, "rosbag")
-    dataset = open_kitti(folder) or open_nuscenes(folder, how)
+        return _open_recording(folder, options, "rosbag")
+    dataset = open_kitti(folder) or open_nuscenes(folder, options)
     if dataset is not None:
         return dataset
     files, warnings = scan_files(folder, RECORDINGS)
     if files[0].suffix.lower() in RECORDINGS:
-        return _open_all(str(folder), files, how)
-    recording = open_files(str(folder), files, how)
+        return _open_all(str(folder), files, options)
+    recording = open_files(str(folder), files, options)
     recording.warnings += warnings
     return recording
 
 
-def _open_recording(path: Path, how: ReadingOptions, reader: str | None = None) -> Recording:
+def _open_recording(path: Path, options: ReadingOptions, reader: str | None = None) -> Recording:
     module = import_module(f"lidarpose.io.sources.{reader or _READERS[path.suffix.lower()]}")
-    return module.open_recording(path, how)
+    return module.open_recording(path, options)

@@ -154,13 +154,13 @@ class RecordFile(ABC):
             elif channel in channels:
                 yield kind, channels[channel], *content
 
-    def _unpacked(self, stream: _Bytes, compression: str, size: int, unpacked: int) -> Iterator[tuple]:
+    def _unpacked(self, stream: _Bytes, compression: str, size: int, unpacked_size: int) -> Iterator[tuple]:
         """The records of a compressed chunk. One that cannot be unpacked costs itself."""
         is_cut = size > stream.left
-        packed = stream.take(min(size, stream.left))
+        packed_data = stream.take(min(size, stream.left))
         try:
-            check_unpacked(len(packed), unpacked)
-            content = unpack(packed, compression, unpacked)
+            check_unpacked(len(packed_data), unpacked_size)
+            content = unpack(packed_data, compression, unpacked_size)
             yield from self._records(_Bytes(BytesIO(content), len(content)), is_chunk=True)
         except FormatError as problem:
             if not is_cut:
@@ -192,15 +192,15 @@ class McapFile(RecordFile):
     def _records(self, stream, is_chunk=False):
         while stream.left:
             op, size = stream.number("B"), stream.number("Q")
-            left = stream.left - size
+            bytes_after = stream.left - size
             if op in (self._FOOTER, self._DATA_END):
                 return
             if op == self._CHUNK and not is_chunk:
-                *_, unpacked, _ = struct.unpack("<QQQI", stream.take(28))
+                *_, unpacked_size, _ = struct.unpack("<QQQI", stream.take(28))
                 compression, size = stream.text(), stream.number("Q")
                 # records of a chunk that is not compressed follow as others do
                 if compression:
-                    yield from self._unpacked(stream, compression, size, unpacked)
+                    yield from self._unpacked(stream, compression, size, unpacked_size)
                 continue
             if op == self._SCHEMA:
                 number = stream.number("H")
@@ -215,7 +215,7 @@ class McapFile(RecordFile):
             elif op == self._MESSAGE:
                 channel, _, time, _ = struct.unpack("<HIQQ", stream.take(22))
                 yield "message", channel, time, size - 22, stream
-            stream.skip(stream.left - left)
+            stream.skip(stream.left - bytes_after)
         if not is_chunk:
             raise FormatError(_CUT_OFF)
 
@@ -232,14 +232,14 @@ class Ros1File(RecordFile):
     def _records(self, stream, is_chunk=False):
         while stream.left:
             header, size = _fields(stream.take(stream.number("I"))), stream.number("I")
-            left = stream.left - size
+            bytes_after = stream.left - size
             op, channel = header.get(b"op", b"\0")[0], header.get(b"conn")
             if op == self._CHUNK and not is_chunk:
                 # records of a chunk that is not compressed follow as others do
                 compression = _text(header.get(b"compression", b"none"))
                 if compression != "none":
-                    unpacked = int.from_bytes(header.get(b"size", b""), "little")
-                    yield from self._unpacked(stream, compression, size, unpacked)
+                    unpacked_size = int.from_bytes(header.get(b"size", b""), "little")
+                    yield from self._unpacked(stream, compression, size, unpacked_size)
                 continue
             if op == self._CONNECTION:
                 type_ = _fields(stream.take(size)).get(b"type", b"no type")
@@ -250,7 +250,7 @@ class Ros1File(RecordFile):
             elif op == self._MESSAGE:
                 seconds, nanoseconds = struct.unpack("<II", header.get(b"time", b"")[:8].ljust(8, b"\0"))
                 yield "message", channel, seconds * 10**9 + nanoseconds, size, stream
-            stream.skip(stream.left - left)
+            stream.skip(stream.left - bytes_after)
 
 
 def _text(data: bytes) -> str:
@@ -302,8 +302,8 @@ class SqliteFile:
         return connection
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
-        marks = ", ".join("?" * len(topics))
-        query = f"SELECT name, timestamp, data FROM {_MESSAGES} WHERE name IN ({marks}) ORDER BY messages.id"
+        placeholders = ", ".join("?" * len(topics))
+        query = f"SELECT name, timestamp, data FROM {_MESSAGES} WHERE name IN ({placeholders}) ORDER BY messages.id"
         try:
             with closing(self._connect()) as connection:
                 for name, time, data in connection.execute(query, tuple(topics)):

@@ -54,10 +54,10 @@ def scan_files(folder: Path, other: Sequence[str] = ()) -> tuple[list[Path], lis
         raise file_error(folder, f"expected point files ({' '.join((*SUFFIXES, *other))}), got {describe(entries)}")
     if files is not groups[2] and len({scan_id(path) for path in files}) == len(files):
         return files, []
-    (suffix, count), *left_out = Counter(suffixes[path] for path in files).most_common()
-    names = " and ".join(f"{count} {suffix}" for suffix, count in left_out)
+    (suffix, count), *other_counts = Counter(suffixes[path] for path in files).most_common()
+    names = " and ".join(f"{count} {suffix}" for suffix, count in other_counts)
     warning = f"only its {count} {suffix} files are read, not {names}: name those by a pattern"
-    return [path for path in files if suffixes[path] == suffix], [warning] if left_out else []
+    return [path for path in files if suffixes[path] == suffix], [warning] if other_counts else []
 
 
 def describe(entries: Sequence[Path]) -> str:
@@ -84,8 +84,8 @@ def open_files(name: str, paths: Sequence[Path], how: ReadingOptions) -> Indexed
         warnings += notes
     ids = [scan_id(path) for path in paths]
     if len(set(ids)) < len(ids):
-        common = os.path.commonpath([path.parent for path in paths])
-        ids = [os.path.relpath(path, common) for path in paths]
+        common_folder = os.path.commonpath([path.parent for path in paths])
+        ids = [os.path.relpath(path, common_folder) for path in paths]
 
     def read(i: int) -> Sweep:
         cloud = read_points(paths[i], columns=columns)
@@ -101,24 +101,24 @@ def scan_id(path: Path) -> str:
 
 def in_order(paths: Sequence[Path]) -> tuple[list[Path], list[float] | None]:
     """Paths in natural order, and None; or in that of times, in s since 1970, where the names are plainly such."""
-    natural = sorted(paths, key=natural_key)
-    matches = [_TIME.fullmatch(scan_id(path)) for path in natural]
+    sorted_paths = sorted(paths, key=natural_key)
+    matches = [_TIME.fullmatch(scan_id(path)) for path in sorted_paths]
     parts = [match.groups() for match in matches if match]
     # of 1700000000_5 and 1700000000_10 nobody knows whether nanoseconds or tenths follow
-    if len(parts) < len(natural) or len({len(part) for *_, mark, part in parts if mark == "_"}) > 1:
-        return natural, None
-    seconds = [_seconds(whole, part or "") for _, whole, _, part in parts]
+    if len(parts) < len(sorted_paths) or len({len(part) for *_, mark, part in parts if mark == "_"}) > 1:
+        return sorted_paths, None
+    seconds = [_seconds(digits, part or "") for _, digits, _, part in parts]
     # 1700000000.5 is later than 1700000000.25, though 5 is before 25
-    rows = sorted(range(len(natural)), key=lambda row: (natural_key(parts[row][0]), seconds[row]))
+    rows = sorted(range(len(sorted_paths)), key=lambda row: (natural_key(parts[row][0]), seconds[row]))
     times = [seconds[row] for row in rows]
-    rising = all(earlier < later for earlier, later in zip(times, times[1:], strict=False))
-    if not rising or not _FIRST_TIME <= times[0] <= times[-1] <= _LAST_TIME:
-        return natural, None
-    return [natural[row] for row in rows], times
+    is_rising = all(earlier < later for earlier, later in zip(times, times[1:], strict=False))
+    if not is_rising or not _FIRST_TIME <= times[0] <= times[-1] <= _LAST_TIME:
+        return sorted_paths, None
+    return [sorted_paths[row] for row in rows], times
 
 
-def _seconds(whole: str, fraction: str) -> float:
-    return float(f"{whole[:10]}.{whole[10:]}{fraction}")
+def _seconds(digits: str, fraction: str) -> float:
+    return float(f"{digits[:10]}.{digits[10:]}{fraction}")
 
 
 def _columns_of(paths: Sequence[Path]) -> tuple[int | None, list[str]]:

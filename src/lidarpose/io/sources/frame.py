@@ -150,8 +150,8 @@ class ChainedRecording:
         self.name = name
         self.parts = parts
         self._warnings = warnings
-        firsts = [next(self._frames(part), None) for part in parts]
-        self._has_times = all(first is None or first.time is not None for first in firsts)
+        first_frames = [next(self._frames(part), None) for part in parts]
+        self._has_times = all(frame is None or frame.time is not None for frame in first_frames)
 
     @property
     def warnings(self) -> list[str]:
@@ -221,14 +221,14 @@ class FrameSource:
         self.rate = rate or DEFAULT_RATE
         self.start, self.end = start, end
         self.every = check_int("every", every, least=1)
-        first = next(recording.lazy_frames(), None)
-        if first is None:
+        first_frame = next(recording.lazy_frames(), None)
+        if first_frame is None:
             raise file_error(recording.name, "has no frames; expected at least one: was it recorded completely?")
-        self._first_time = first.time
+        self._first_time = first_frame.time
         self._notes: list[str] = []
-        if first.time is None and recording.count != 1 and rate is None:
-            another = "rate, on the command line --rate, for another"
-            self._notes.append(f"has no times: taken as {DEFAULT_RATE:g} frames a second ({another})")
+        if first_frame.time is None and recording.count != 1 and rate is None:
+            rate_hint = "rate, on the command line --rate, for another"
+            self._notes.append(f"has no times: taken as {DEFAULT_RATE:g} frames a second ({rate_hint})")
         self._num_back = 0
 
     @property
@@ -240,26 +240,28 @@ class FrameSource:
         times = np.arange(count) / self.rate if self._first_time is None else getattr(self.recording, "times", None)
         if times is None:
             return None
-        chosen = [self._place(time) for time in times]
+        places = [self._place(time) for time in times]
         # the first frame past the end ends the source
-        chosen = chosen[: chosen.index(1) if 1 in chosen else None]
-        return chosen[:: self.every].count(0)
+        places = places[: places.index(1) if 1 in places else None]
+        return places[:: self.every].count(0)
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Lines about the source as a whole, as far as it was read."""
-        back = [f"time jumps back {self._num_back} times: the order of the recording is kept"] if self._num_back else []
-        return (*self.recording.warnings, *self._notes, *back)
+        jump_notes = (
+            [f"time jumps back {self._num_back} times: the order of the recording is kept"] if self._num_back else []
+        )
+        return (*self.recording.warnings, *self._notes, *jump_notes)
 
     def __iter__(self) -> Iterator[Frame | DamagedFrame]:
         return self.frames()
 
     def _place(self, time: float) -> int:
         """-1 before the span of time that is read, 0 in it, 1 after it."""
-        since = time - (self._first_time or 0.0)
-        if self.end is not None and since > self.end + _ROUNDING:
+        elapsed = time - (self._first_time or 0.0)
+        if self.end is not None and elapsed > self.end + _ROUNDING:
             return 1
-        return -1 if self.start is not None and since < self.start - _ROUNDING else 0
+        return -1 if self.start is not None and elapsed < self.start - _ROUNDING else 0
 
     def frames(self, first: int = 0) -> Iterator[Frame | DamagedFrame]:
         """The frames from index `first` on."""
@@ -267,8 +269,8 @@ class FrameSource:
         last_time = -np.inf
         index = first - 1
         try:
-            for index, lazy in enumerate(self.recording.lazy_frames(first), first):
-                time = index / self.rate if self._first_time is None else lazy.time
+            for index, lazy_frame in enumerate(self.recording.lazy_frames(first), first):
+                time = index / self.rate if self._first_time is None else lazy_frame.time
                 if time is not None:
                     self._num_back += time < last_time
                     last_time = time
@@ -277,26 +279,26 @@ class FrameSource:
                     if place < 0:
                         continue
                 if index % self.every == 0:
-                    yield _read(lazy, index, time)
+                    yield _read(lazy_frame, index, time)
         except LidarPoseError as error:
             if index < 0 or isinstance(error, MissingExtra):
                 raise
             yield DamagedFrame(index=index + 1, id="", error=f"the recording ends here: {error}")
 
 
-def _read(lazy: LazyFrame, index: int, time: float | None) -> Frame | DamagedFrame:
+def _read(lazy_frame: LazyFrame, index: int, time: float | None) -> Frame | DamagedFrame:
     try:
-        sweep = lazy.read()
+        sweep = lazy_frame.read()
     except MissingExtra:
         raise
     except Exception as error:
         is_explained = isinstance(error, LidarPoseError | FormatError)
         reason = str(error) if is_explained else f"cannot be read ({shorten(f'{type(error).__name__}: {error}')})"
-        return DamagedFrame(index=index, id=lazy.id, time=time, error=one_line(reason))
+        return DamagedFrame(index=index, id=lazy_frame.id, time=time, error=one_line(reason))
     points = np.asarray(sweep.points, np.float64)
     # finite, and not 0, 0, 0
-    reach = np.abs(points) @ np.ones(3)
-    is_return = (reach > 0) & (reach < np.inf)
+    distance = np.abs(points) @ np.ones(3)
+    is_return = (distance > 0) & (distance < np.inf)
     ring = None if sweep.ring is None else sweep.ring[is_return]
     returns = vars(sweep) | {"points": points[is_return], "ring": ring}
-    return Frame(**returns, index=index, id=lazy.id, time=time)
+    return Frame(**returns, index=index, id=lazy_frame.id, time=time)

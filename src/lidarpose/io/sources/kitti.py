@@ -43,11 +43,11 @@ def _open_drive(drive: Path) -> IndexedRecording:
     rows = _numbers(files)
     stamps = _timestamps(drive / "velodyne_points" / "timestamps.txt")
     times = _chosen(stamps, rows, "velodyne_points/timestamps.txt", notes)
-    calib = next((path for path in (drive, drive.parent) if (path / "calib_imu_to_velo.txt").is_file()), drive)
-    keys = _calibration(calib / "calib_imu_to_velo.txt")
+    calib_folder = next((path for path in (drive, drive.parent) if (path / "calib_imu_to_velo.txt").is_file()), drive)
+    entries = _calibration(calib_folder / "calib_imu_to_velo.txt")
     poses = None
-    if [len(keys.get(key, ())) for key in "RT"] == [9, 3]:
-        T_velo_imu = rigid_transform(keys["R"].reshape(3, 3), keys["T"])
+    if [len(entries.get(key, ())) for key in "RT"] == [9, 3]:
+        T_velo_imu = rigid_transform(entries["R"].reshape(3, 3), entries["T"])
         poses = _Oxts(drive / "oxts", inverse_transform(T_velo_imu), stamps)
     if poses is None or not poses.is_there:
         poses = None
@@ -94,17 +94,19 @@ class _Oxts:
         self.folder = folder
         self.T_imu_velo = T_imu_velo
         self.stamps = stamps
-        own = _timestamps(folder / "timestamps.txt")
+        imu_stamps = _timestamps(folder / "timestamps.txt")
         # of drives that are not synchronized, by the nearest time
-        self.own = own if own is not None and stamps is not None and len(own) != len(stamps) else None
+        self.own = (
+            imu_stamps if imu_stamps is not None and stamps is not None and len(imu_stamps) != len(stamps) else None
+        )
         files = sorted((folder / "data").glob("[0-9]*.txt"))
-        first = _table(files[0], 30) if files else None
-        self.is_there = first is not None
-        if first is not None:
+        first_values = _table(files[0], 30) if files else None
+        self.is_there = first_values is not None
+        if first_values is not None:
             self.digits = len(files[0].stem)
             # Mercator's projection with the scale of the first latitude
-            self.scale = np.cos(np.radians(first[0, 0]))
-            self.start = self._position(first[0])
+            self.scale = np.cos(np.radians(first_values[0, 0]))
+            self.start = self._position(first_values[0])
 
     def _position(self, values: np.ndarray) -> np.ndarray:
         latitude, longitude = np.radians(values[:2])
@@ -165,7 +167,7 @@ def _table(path: Path, columns: int) -> np.ndarray | None:
 
 def _calibration(path: Path) -> dict[str, np.ndarray]:
     """Lines "KEY: numbers"."""
-    keys = {}
+    entries = {}
     for line in (_text(path) or "").splitlines():
         key, _, values = line.partition(":")
         try:
@@ -173,8 +175,8 @@ def _calibration(path: Path) -> dict[str, np.ndarray]:
         except ValueError:
             continue
         if np.isfinite(numbers).all():
-            keys[key.strip()] = numbers
-    return keys
+            entries[key.strip()] = numbers
+    return entries
 
 
 def _transform(values: np.ndarray) -> np.ndarray:

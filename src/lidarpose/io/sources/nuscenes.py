@@ -40,21 +40,25 @@ def open_nuscenes(folder: Path, how: ReadingOptions) -> IndexedRecording | None:
         raise
     except (LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
         raise file_error(versions[0], f"its tables are not nuScenes' ({shorten(str(error))}): download again") from None
-    there = {f"{part}/{_CHANNEL}": _names(root / part / _CHANNEL) for part in ("samples", "sweeps")}
-    kept = [sweep for sweep in sweeps if sweep["file"].name in there.get(sweep["file"].parent.as_posix(), ())]
-    if not kept:
+    file_names = {f"{part}/{_CHANNEL}": _names(root / part / _CHANNEL) for part in ("samples", "sweeps")}
+    present_sweeps = [
+        sweep for sweep in sweeps if sweep["file"].name in file_names.get(sweep["file"].parent.as_posix(), ())
+    ]
+    if not present_sweeps:
         raise file_error(root, f"holds none of the {len(sweeps)} sweeps in {versions[0].name}: unpack its files there")
-    lost = len(sweeps) - len(kept)
-    notes = [f"{lost} of {len(sweeps)} sweeps in its tables are not on the disk"] if lost else []
+    num_missing = len(sweeps) - len(present_sweeps)
+    notes = [f"{num_missing} of {len(sweeps)} sweeps in its tables are not on the disk"] if num_missing else []
 
     def read(i: int) -> Sweep:
-        if kept[i]["T_world_sensor"] is None:
-            raise file_error(kept[i]["file"], "its pose in the tables is damaged: download them again")
-        rows = _rows(root / kept[i]["file"])
+        if present_sweeps[i]["T_world_sensor"] is None:
+            raise file_error(present_sweeps[i]["file"], "its pose in the tables is damaged: download them again")
+        rows = _rows(root / present_sweeps[i]["file"])
         ring = rows[:, 4].astype(int) if np.isfinite(rows[:, 4]).all() else None
-        return Sweep(points=rows[:, :3], ring=ring, T_world_sensor=kept[i]["T_world_sensor"], origin=np.zeros(3))
+        return Sweep(
+            points=rows[:, :3], ring=ring, T_world_sensor=present_sweeps[i]["T_world_sensor"], origin=np.zeros(3)
+        )
 
-    ids, times = ([sweep[name] for sweep in kept] for name in ("id", "time"))
+    ids, times = ([sweep[name] for sweep in present_sweeps] for name in ("id", "time"))
     return IndexedRecording(name=str(root), ids=ids, times=times, read=read, warnings=notes)
 
 
@@ -80,10 +84,10 @@ def _sweeps(version: Path, scene: str | None) -> list[dict[str, Any]]:
     if not sweeps:
         raise file_error(version, f"expected sweeps of {_CHANNEL} in sample_data.json, got none: download it again")
     # scenes may overlap where two cars drove at once
-    begin: dict[str, float] = {}
+    scene_starts: dict[str, float] = {}
     for sweep in sweeps:
-        begin[sweep["scene"]] = min(sweep["time"], begin.get(sweep["scene"], np.inf))
-    return sorted(sweeps, key=lambda sweep: (begin[sweep["scene"]], sweep["scene"], sweep["time"]))
+        scene_starts[sweep["scene"]] = min(sweep["time"], scene_starts.get(sweep["scene"], np.inf))
+    return sorted(sweeps, key=lambda sweep: (scene_starts[sweep["scene"]], sweep["scene"], sweep["time"]))
 
 
 def _pose(*rows: Any) -> np.ndarray | None:

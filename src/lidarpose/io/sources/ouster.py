@@ -92,8 +92,8 @@ class OusterFormat:
         self.columns_per_packet = _whole(metadata, "columns_per_packet", _MAX_COLUMNS, _COLUMNS_PER_PACKET)
         pixels = _whole(metadata, "pixels_per_column", _MAX_BEAMS, self.beams)
         if not len(altitude) == len(azimuth) == pixels:
-            came = f"{len(altitude)} altitudes and {len(azimuth)} azimuths"
-            raise FormatError(f"beam angles of {pixels} beams", came, "save the sensor's metadata anew")
+            actual = f"{len(altitude)} altitudes and {len(azimuth)} azimuths"
+            raise FormatError(f"beam angles of {pixels} beams", actual, "save the sensor's metadata anew")
         first, last = metadata.get("column_window") or (0, self.columns - 1)
         self.window = min(max(int(first), 0), self.columns - 1), min(max(int(last), 0), self.columns - 1)
         self.port, self.serial = metadata.get("udp_port_lidar"), metadata.get("prod_sn")
@@ -126,25 +126,35 @@ class OusterFormat:
         """Directions (columns, beams, 3) and starts (columns, 3) m of the beams in the sensor's frame; a range counts
         from `reach` mm in front of its start."""
         beam_to_lidar = _numbers(metadata, "beam_to_lidar_transform", np.eye(4)).reshape(4, 4)
-        along, up = beam_to_lidar[0, 3], beam_to_lidar[2, 3]
+        radial_offset, vertical_offset = beam_to_lidar[0, 3], beam_to_lidar[2, 3]
         if "beam_to_lidar_transform" not in metadata:
-            along = float(_numbers(metadata, "lidar_origin_to_beam_origin_mm", 0.0))
-        self.reach = float(np.hypot(along, up))
+            radial_offset = float(_numbers(metadata, "lidar_origin_to_beam_origin_mm", 0.0))
+        self.reach = float(np.hypot(radial_offset, vertical_offset))
         T_sensor_lidar = _numbers(metadata, "lidar_to_sensor_transform", _LIDAR_TO_SENSOR).reshape(4, 4)
         R, self.origin = T_sensor_lidar[:3, :3], T_sensor_lidar[:3, 3] / 1000
         encoder = 2 * np.pi * (1 - np.arange(self.columns) / self.columns)
         heading = encoder[:, None] - azimuth
-        level = np.cos(altitude)
-        rays = [np.cos(heading) * level, np.sin(heading) * level, np.broadcast_to(np.sin(altitude), heading.shape)]
+        cos_altitude = np.cos(altitude)
+        rays = [
+            np.cos(heading) * cos_altitude,
+            np.sin(heading) * cos_altitude,
+            np.broadcast_to(np.sin(altitude), heading.shape),
+        ]
         self.directions = np.stack(rays, axis=-1) @ R.T / 1000
-        starts = [along * np.cos(encoder), along * np.sin(encoder), np.full(self.columns, up)]
+        starts = [
+            radial_offset * np.cos(encoder),
+            radial_offset * np.sin(encoder),
+            np.full(self.columns, vertical_offset),
+        ]
         self.starts = np.stack(starts, axis=-1) @ R.T / 1000 + self.origin
 
     def header(self, packet: bytes) -> tuple[int, int | None]:
         """A packet's frame id, and the sensor's serial number where it holds it."""
-        at, size, serial = (10, 2, None) if self.is_legacy else (4, 4, 11) if self.is_fusa else (2, 2, 7)
-        frame_id = int.from_bytes(packet[at : at + size], "little")
-        return frame_id, None if serial is None else int.from_bytes(packet[serial : serial + 5], "little")
+        id_offset, size, serial_offset = (10, 2, None) if self.is_legacy else (4, 4, 11) if self.is_fusa else (2, 2, 7)
+        frame_id = int.from_bytes(packet[id_offset : id_offset + size], "little")
+        return frame_id, None if serial_offset is None else int.from_bytes(
+            packet[serial_offset : serial_offset + 5], "little"
+        )
 
     def num_sent(self, step: int = 1) -> int:
         """Columns that a whole turn is sent in, or groups of `step` of them."""
@@ -157,15 +167,15 @@ class OusterFormat:
         columns = np.frombuffer(b"".join(packets), self.packet)["columns"].reshape(-1)
         columns = columns[(columns["status"] & 1 == 1) & (columns["id"] < self.columns)]
         # of packets that came twice, once
-        ids, first = np.unique(columns["id"], return_index=True)
-        ranges = (columns["pixels"]["range"][first] & self.mask).astype(np.int64) * self.unit
+        ids, first_indices = np.unique(columns["id"], return_index=True)
+        ranges = (columns["pixels"]["range"][first_indices] & self.mask).astype(np.int64) * self.unit
         (returns,) = np.nonzero(ranges.ravel())
         column, beam = np.divmod(returns, self.beams)
         points = self.directions[ids[column], beam]
         points *= (ranges.ravel()[returns] - self.reach)[:, None]
         points += self.starts[ids[column]]
-        lost = self.num_sent() - len(ids)
-        warnings = (f"{lost} of {self.num_sent()} columns are missing",) if lost > 0 else ()
+        num_missing = self.num_sent() - len(ids)
+        warnings = (f"{num_missing} of {self.num_sent()} columns are missing",) if num_missing > 0 else ()
         return Sweep(points=points, origin=self.origin, ring=beam, warnings=warnings)
 
 
@@ -202,8 +212,8 @@ class OusterRecording(PacketRecording):
         if flow is None:
             size = f"lidar packets of {self.packet_bytes} bytes"
             expected = f"{size} ({self.format.profile}, {self.format.beams} beams, says {self.metadata})"
-            came = ", ".join(f"{count} of {size}" for size, count in sorted(sizes.items())[:5]) or "no UDP packets"
-            raise file_error(self.name, f"expected {expected}, got {came}: is that the metadata of this recording?")
+            actual = ", ".join(f"{count} of {size}" for size, count in sorted(sizes.items())[:5]) or "no UDP packets"
+            raise file_error(self.name, f"expected {expected}, got {actual}: is that the metadata of this recording?")
         return flow
 
     @property
@@ -219,47 +229,47 @@ class OusterRecording(PacketRecording):
 
     def turns(self) -> Iterator[tuple[float, Callable[[], Sweep]]]:
         has_clock = None
-        for captured, packets in self._packets_of_turns():
+        for capture_time, packets in self._packets_of_turns():
             clock = np.frombuffer(packets[0], self.format.packet)["columns"]["time"]
             clock = clock[clock > 0]
             has_clock = bool(len(clock)) if has_clock is None else has_clock
-            time = float(clock[0]) / 1e9 if has_clock and len(clock) else captured
+            time = float(clock[0]) / 1e9 if has_clock and len(clock) else capture_time
             yield time, partial(self.format.decode, packets)
 
     def _packets_of_turns(self) -> Iterator[tuple[float, list[bytes]]]:
         """(time of capture, packets) of each turn of the sensor."""
         self._num_lost = self._num_sent = 0
-        most = self.format.num_sent(self.format.columns_per_packet)
+        packets_per_turn = self.format.num_sent(self.format.columns_per_packet)
         packets: list[bytes] = []
-        current = previous = None
-        started, num_turns = 0.0, 0
+        current_id = previous_id = None
+        start_time, num_turns = 0.0, 0
         for datagram in self.packets():
             frame_id, self._serial = self.format.header(datagram.payload)
             # late, of the turn before, which counts it as lost
-            if frame_id == previous:
+            if frame_id == previous_id:
                 continue
-            if packets and (frame_id != current or len(packets) >= 2 * most):
+            if packets and (frame_id != current_id or len(packets) >= 2 * packets_per_turn):
                 # the first turn and the last one began or ended outside of the capture
                 if num_turns:
-                    self._num_sent += most
-                    self._num_lost += max(most - len(packets), 0)
-                yield started, packets
+                    self._num_sent += packets_per_turn
+                    self._num_lost += max(packets_per_turn - len(packets), 0)
+                yield start_time, packets
                 num_turns += 1
-                previous = current if frame_id != current else None
+                previous_id = current_id if frame_id != current_id else None
                 packets = []
             if not packets:
-                started = datagram.time
-            current = frame_id
+                start_time = datagram.time
+            current_id = frame_id
             packets.append(datagram.payload)
         if packets:
-            yield started, packets
+            yield start_time, packets
 
 
 def _flat(metadata: dict[str, Any]) -> dict[str, Any]:
     """Keys of all sections as one; newer sensors sort into sections what older ones hold at the top."""
     sections = [_flat(value) for value in metadata.values() if isinstance(value, dict)]
-    plain = {key: value for key, value in metadata.items() if not isinstance(value, dict)}
-    return {key: value for section in (*sections, plain) for key, value in section.items()}
+    top_level = {key: value for key, value in metadata.items() if not isinstance(value, dict)}
+    return {key: value for section in (*sections, top_level) for key, value in section.items()}
 
 
 def _numbers(metadata: dict[str, Any], key: str, default: Any = None) -> np.ndarray:
@@ -271,8 +281,8 @@ def _numbers(metadata: dict[str, Any], key: str, default: Any = None) -> np.ndar
     return values
 
 
-def _whole(metadata: dict[str, Any], key: str, most: int, default: Any) -> int:
+def _whole(metadata: dict[str, Any], key: str, maximum: int, default: Any) -> int:
     value = int(metadata.get(key, default))
-    if not 1 <= value <= most:
-        raise FormatError(f"{key} from 1 to {most}", value, "save the sensor's metadata anew")
+    if not 1 <= value <= maximum:
+        raise FormatError(f"{key} from 1 to {maximum}", value, "save the sensor's metadata anew")
     return value

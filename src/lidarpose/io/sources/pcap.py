@@ -108,8 +108,8 @@ class Capture:
             # the oldest one never comes, or fragments overlap
             pending.pop(key if size > _MAX_DATAGRAM else next(iter(pending)))
             self.num_cut += 1
-        last = max(parts)
-        if parts[last][1] or last + len(parts[last][0]) != size:
+        last_offset = max(parts)
+        if parts[last_offset][1] or last_offset + len(parts[last_offset][0]) != size:
             return b""
         pending.pop(key, None)
         return b"".join(parts[offset][0] for offset in sorted(parts))
@@ -157,12 +157,12 @@ class PacketRecording(ABC):
             "packets are captured in part only, and are left out": self.capture.num_cut,
             "lidar packets of another sensor are left out": self.num_other,
         }
-        return [f"{count} {what}" for what, count in counts.items() if count]
+        return [f"{count} {problem}" for problem, count in counts.items() if count]
 
     def lazy_frames(self, first: int = 0) -> Iterator[LazyFrame]:
-        for index, (time, read) in enumerate(self.turns()):
+        for index, (time, decode) in enumerate(self.turns()):
             if index >= first:
-                yield LazyFrame(f"{index:06d}", time, read)
+                yield LazyFrame(f"{index:06d}", time, decode)
         if self._damage is not None:
             raise self._damage
 
@@ -214,13 +214,13 @@ def _read_pcapng(file: BinaryIO) -> Iterator[tuple[float, int, bytes]]:
 
 def _ticks(options: bytes, order: str) -> float:
     """Ticks a second of an interface, from its options."""
-    at = 0
-    while at + 5 <= len(options):
-        code, size = struct.unpack_from(order + "HH", options, at)
+    offset = 0
+    while offset + 5 <= len(options):
+        code, size = struct.unpack_from(order + "HH", options, offset)
         if code == 9:
-            value = options[at + 4]
+            value = options[offset + 4]
             return 2.0 ** (value & 127) if value & 128 else 10.0**value
-        at += 4 + (size + 3) // 4 * 4
+        offset += 4 + (size + 3) // 4 * 4
     return 1e6
 
 
@@ -233,10 +233,10 @@ def _check_link(link: int) -> None:
 
 def _ip_packet(packet: bytes, link: int) -> memoryview:
     """The IP packet in one of a link; empty where it holds something else."""
-    type_at, start = _LINKS[link]
+    type_offset, start = _LINKS[link]
     view = memoryview(packet)
-    if type_at is not None:
-        kind = int.from_bytes(view[type_at : type_at + 2])
+    if type_offset is not None:
+        kind = int.from_bytes(view[type_offset : type_offset + 2])
         while link == _ETHERNET and kind in _VLAN:
             kind = int.from_bytes(view[start + 2 : start + 4])
             start += 4

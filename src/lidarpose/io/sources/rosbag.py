@@ -58,8 +58,8 @@ def open_recording(path: Path, how: ReadingOptions) -> "BagRecording":
     if path.is_dir():
         files = sorted((file for file in path.iterdir() if file.suffix.lower() in _FILES), key=natural_key)
         if not files:
-            packed = next(path.glob("*.zstd"), None)
-            remedy = f"; unpack {packed.name} first (unzstd)" if packed else "; was it copied completely?"
+            packed_file = next(path.glob("*.zstd"), None)
+            remedy = f"; unpack {packed_file.name} first (unzstd)" if packed_file else "; was it copied completely?"
             raise file_error(path, f"expected a recording's {' or '.join(_FILES)} files in this folder{remedy}")
     return BagRecording(str(path), [_open_file(file) for file in files], how.topic)
 
@@ -128,8 +128,8 @@ class BagRecording:
         if not self._has_stamps:
             lines.append("clouds without a time in their header: the times when they were recorded are taken")
         if 0 < self._num_posed < self._num_frames:
-            lost = f"{self._num_frames - self._num_posed} of {self._num_frames} clouds"
-            lines.append(f"{lost} have no sensor pose in the frame {self._world}")
+            unposed_clouds = f"{self._num_frames - self._num_posed} of {self._num_frames} clouds"
+            lines.append(f"{unposed_clouds} have no sensor pose in the frame {self._world}")
         for file in self.files:
             if file.num_damaged:
                 lines.append(f"{file.path.name}: {file.num_damaged} chunks are left out: one {file.damage}")
@@ -139,23 +139,23 @@ class BagRecording:
         self._num_frames = self._num_posed = 0
         transforms = TransformTree()
         # clouds that wait for the pose of their sensor
-        waiting: deque[_Cloud] = deque()
+        pending_clouds: deque[_Cloud] = deque()
         index = 0
         for message in self._messages():
             if message.topic == self.topic:
                 if index >= first:
-                    waiting.append(_Cloud(index, message, self._decode(message)))
+                    pending_clouds.append(_Cloud(index, message, self._decode(message)))
                 index += 1
             else:
                 transforms.add(self._decode(message), is_static=message.topic.endswith("_static"))
-            while waiting:
-                is_late = len(waiting) > _MAX_WAITING or message.time - waiting[0].recorded > _MAX_WAIT
+            while pending_clouds:
+                is_late = len(pending_clouds) > _MAX_WAITING or message.time - pending_clouds[0].recorded > _MAX_WAIT
                 is_last = is_late or not self._transforms
-                T_world_sensor = self._pose(transforms, waiting[0], is_last)
+                T_world_sensor = self._pose(transforms, pending_clouds[0], is_last)
                 if T_world_sensor is None and not is_last:
                     break
-                yield self._frame(waiting.popleft(), T_world_sensor)
-        for cloud in waiting:
+                yield self._frame(pending_clouds.popleft(), T_world_sensor)
+        for cloud in pending_clouds:
             yield self._frame(cloud, self._pose(transforms, cloud, True))
         if self._damage is not None:
             raise self._damage
@@ -183,9 +183,9 @@ class BagRecording:
         """T_world_sensor at a cloud's time. The world is chosen once: the first of `_WORLDS`, or, at last, another."""
         poses = transforms.poses(cloud.frame_id, cloud.stamp)
         if self._world is None:
-            known = [world for world in _WORLDS if world in poses]
-            if known and (is_last or known[0] == _WORLDS[0]):
-                self._world = known[0]
+            available_worlds = [world for world in _WORLDS if world in poses]
+            if available_worlds and (is_last or available_worlds[0] == _WORLDS[0]):
+                self._world = available_worlds[0]
         return poses.get(self._world or "")
 
     def _frame(self, cloud: "_Cloud", T_world_sensor: np.ndarray | None) -> LazyFrame:
@@ -239,24 +239,24 @@ def decode_cloud(cloud: Any) -> tuple[np.ndarray, np.ndarray | None]:
     """
     names = {field.name.lower(): field for field in reversed(cloud.fields)}
     ring = next((name for name in _RING if name in names), None)
-    wanted = ["x", "y", "z", *([ring] if ring else [])]
+    field_names = ["x", "y", "z", *([ring] if ring else [])]
     if not {"x", "y", "z"} <= names.keys():
-        came = shorten(", ".join(names)) or "none"
-        raise FormatError("fields x, y, z in a PointCloud2", came, "choose another topic")
+        actual = shorten(", ".join(names)) or "none"
+        raise FormatError("fields x, y, z in a PointCloud2", actual, "choose another topic")
     order = ">" if cloud.is_bigendian else "<"
-    for name in wanted:
+    for name in field_names:
         field = names[name]
         size = np.dtype(_DATATYPES.get(field.datatype, "f8")).itemsize
         if field.datatype not in _DATATYPES or field.offset + size > cloud.point_step:
-            where = f"datatype {field.datatype} at byte {field.offset} of {cloud.point_step}"
-            raise FormatError(f"the field {name} within a point", where, "record it anew")
-    formats = [order + _DATATYPES[names[name].datatype] for name in wanted]
-    offsets = [names[name].offset for name in wanted]
-    point = np.dtype({"names": wanted, "formats": formats, "offsets": offsets, "itemsize": cloud.point_step})
+            actual = f"datatype {field.datatype} at byte {field.offset} of {cloud.point_step}"
+            raise FormatError(f"the field {name} within a point", actual, "record it anew")
+    formats = [order + _DATATYPES[names[name].datatype] for name in field_names]
+    offsets = [names[name].offset for name in field_names]
+    point = np.dtype({"names": field_names, "formats": formats, "offsets": offsets, "itemsize": cloud.point_step})
     # of a single row the step is often left out
     row_step = cloud.row_step if cloud.height > 1 else cloud.width * cloud.point_step
-    needed = row_step * (cloud.height - 1) + cloud.width * cloud.point_step
-    if row_step < cloud.width * cloud.point_step or needed > len(cloud.data):
+    required_bytes = row_step * (cloud.height - 1) + cloud.width * cloud.point_step
+    if row_step < cloud.width * cloud.point_step or required_bytes > len(cloud.data):
         layout = f"{cloud.height} rows of {cloud.width} points of {cloud.point_step} bytes"
         raise FormatError(layout, f"{len(cloud.data)} bytes", "the cloud is cut off")
     shape, strides = (cloud.height, cloud.width), (row_step, cloud.point_step)
@@ -277,23 +277,23 @@ class TransformTree:
 
     def add(self, message: Any, *, is_static: bool) -> None:
         """Takes a TFMessage; what is no transform in it is left out."""
-        for stamped in getattr(message, "transforms", ()):
-            child, parent = stamped.child_frame_id.lstrip("/"), stamped.header.frame_id.lstrip("/")
-            t, q = stamped.transform.translation, stamped.transform.rotation
-            placed = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w])
+        for transform_stamped in getattr(message, "transforms", ()):
+            child, parent = transform_stamped.child_frame_id.lstrip("/"), transform_stamped.header.frame_id.lstrip("/")
+            t, q = transform_stamped.transform.translation, transform_stamped.transform.rotation
+            placement = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w])
             # NaN is not below
-            is_plausible = np.abs(placed).max() < _MAX_PLAUSIBLE and np.linalg.norm(placed[3:]) > _MIN_NORM
+            is_plausible = np.abs(placement).max() < _MAX_PLAUSIBLE and np.linalg.norm(placement[3:]) > _MIN_NORM
             if not is_plausible or child == parent:
                 continue
-            placed[3:] /= np.linalg.norm(placed[3:])
-            time = stamped.header.stamp.sec * 10**9 + stamped.header.stamp.nanosec
-            known, times, placements = self._edges.get(child, (parent, [], []))
-            if is_static or known != parent or not times:
+            placement[3:] /= np.linalg.norm(placement[3:])
+            time = transform_stamped.header.stamp.sec * 10**9 + transform_stamped.header.stamp.nanosec
+            known_parent, times, placements = self._edges.get(child, (parent, [], []))
+            if is_static or known_parent != parent or not times:
                 times, placements = [], []
             k = bisect_left(times, time)
             if not is_static:
                 times.insert(k, time)
-            placements.insert(k, placed)
+            placements.insert(k, placement)
             self._edges[child] = parent, times[-_MAX_KEPT:], placements[-_MAX_KEPT:]
 
     def poses(self, frame: str, time: int) -> dict[str, np.ndarray]:
@@ -321,12 +321,12 @@ def _between(times: list[int], placements: list[np.ndarray], time: int) -> np.nd
     if not 0 < k < len(times) or times[k] - times[k - 1] > _MAX_GAP:
         return None
     share = (time - times[k - 1]) / (times[k] - times[k - 1])
-    before, after = placements[k - 1], placements[k].copy()
+    previous, following = placements[k - 1], placements[k].copy()
     # q and -q are the same rotation; over so short a time the chord is the arc
-    after[3:] *= np.sign(before[3:] @ after[3:]) or 1.0
-    return _matrix((1 - share) * before + share * after)
+    following[3:] *= np.sign(previous[3:] @ following[3:]) or 1.0
+    return _matrix((1 - share) * previous + share * following)
 
 
-def _matrix(placed: np.ndarray) -> np.ndarray:
+def _matrix(placement: np.ndarray) -> np.ndarray:
     """(4, 4) of a translation and a quaternion x y z w, of any length."""
-    return rigid_transform(quaternion_to_matrix(np.roll(placed[3:], 1)), placed[:3])
+    return rigid_transform(quaternion_to_matrix(np.roll(placement[3:], 1)), placement[:3])

@@ -64,7 +64,7 @@ class VelodyneRecording(PacketRecording):
             "packets are not of the sensor's model, and are left out": self._num_damaged,
             f"turns cannot be decoded: {self._reason}": self._num_lost,
         }
-        return [f"{count} {what}" for what, count in counts.items() if count] + super().warnings
+        return [f"{count} {problem}" for problem, count in counts.items() if count] + super().warnings
 
     def _model(self) -> tuple[Any, bytes]:
         """The library's configuration, and the last bytes of each packet where they are the model's number."""

@@ -40,8 +40,8 @@ class BaselineConfig(Config):
         super().__post_init__()
         check_joints(self.joints)
         if self.width_divisor not in DIVISORS:
-            known = ", ".join(map(str, DIVISORS))
-            raise InputError(f"width_divisor must be one of {known}, got {self.width_divisor!r}")
+            divisors = ", ".join(map(str, DIVISORS))
+            raise InputError(f"width_divisor must be one of {divisors}, got {self.width_divisor!r}")
 
     @property
     def name(self) -> str:
@@ -105,24 +105,24 @@ def pad_clouds(
         middle (B, 3) float32 m in the person's frame; center (B, 3) float32 m: the middle from the sensor, 0 where its
         place is not known.
     """
-    chosen, middles, most_points = [], [], config.most_points
+    centered_clouds, middles, most_points = [], [], config.most_points
     for cloud, seed in zip(clouds, seeds, strict=True):
-        near = _near(cloud, WINDOW)
+        crop = _near(cloud, WINDOW)
         rng = np.random.default_rng(seed)
-        middles.append((near.min(0) + near.max(0)) / 2)
+        middles.append((crop.min(0) + crop.max(0)) / 2)
         if config.resample_with_replacement:
-            extra = rng.integers(len(near), size=most_points - len(near) * (len(near) <= most_points))
-            rows = extra if len(near) > most_points else np.concatenate([np.arange(len(near)), extra])
-            near = near[rows]
-        elif len(near) > most_points:
-            near = near[rng.choice(len(near), most_points, replace=False)]
-        chosen.append(near - middles[-1])
+            extra_rows = rng.integers(len(crop), size=most_points - len(crop) * (len(crop) <= most_points))
+            rows = extra_rows if len(crop) > most_points else np.concatenate([np.arange(len(crop)), extra_rows])
+            crop = crop[rows]
+        elif len(crop) > most_points:
+            crop = crop[rng.choice(len(crop), most_points, replace=False)]
+        centered_clouds.append(crop - middles[-1])
     middle = np.stack(middles)
-    toward, distance, known = view[:, :3], np.exp(view[:, 3:4]), view[:, 4:] > 0
-    points, valid = _padded(chosen)
-    center = np.where(known, middle - toward * distance, 0)
-    places = {"middle": middle.astype(np.float32), "center": center.astype(np.float32)}
-    return {"points": points, "valid": valid, **places}
+    direction, distance, has_sensor = view[:, :3], np.exp(view[:, 3:4]), view[:, 4:] > 0
+    points, valid = _padded(centered_clouds)
+    center = np.where(has_sensor, middle - direction * distance, 0)
+    centers = {"middle": middle.astype(np.float32), "center": center.astype(np.float32)}
+    return {"points": points, "valid": valid, **centers}
 
 
 # ---- networks of clips
@@ -185,20 +185,20 @@ def pad_frames(
     Returns:
         Points (F, N, 3) float32 m and valid (F, N) bool, False for padding.
     """
-    chosen, most, again = [], config.most_points, config.resample_with_replacement
+    frame_clouds, most_points, with_replacement = [], config.most_points, config.resample_with_replacement
     for cloud, seed in zip(clouds, seeds, strict=True):
-        near = _near(cloud, window)
-        if len(near) > most:
-            near = near[np.random.default_rng(seed).choice(len(near), most, replace=again)]
+        crop = _near(cloud, window)
+        if len(crop) > most_points:
+            crop = crop[np.random.default_rng(seed).choice(len(crop), most_points, replace=with_replacement)]
         # fewer are repeated from the first on
-        chosen.append(np.resize(near, (most, 3)) if again else near)
-    return _padded(chosen)
+        frame_clouds.append(np.resize(crop, (most_points, 3)) if with_replacement else crop)
+    return _padded(frame_clouds)
 
 
 def _near(cloud: np.ndarray, window: float) -> np.ndarray:
     """The points (n, 3) within `window` m of the origin along each axis; the origin itself where there is none."""
-    near = cloud[(np.abs(cloud) < window).all(1)]
-    return near if len(near) else np.zeros((1, 3))
+    points = cloud[(np.abs(cloud) < window).all(1)]
+    return points if len(points) else np.zeros((1, 3))
 
 
 def _padded(clouds: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:

@@ -117,15 +117,15 @@ class SetAbstraction(nn.Module):
     def forward(self, points: Tensor, valid: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         # of fewer points centers would repeat, which changes no maximum
         count = self.centers if self.as_published else min(self.centers, points.shape[1])
-        chosen = farthest_points(points, valid, count, as_published=self.as_published)
-        centers = gather_points(points, chosen)
+        center_index = farthest_points(points, valid, count, as_published=self.as_published)
+        centers = gather_points(points, center_index)
         index = ball_query(centers, points, valid, self.radius, 32, as_published=self.as_published)
         offsets = gather_points(points, index) - centers[:, :, None]
         rows = torch.cat([offsets, gather_points(features, index)], -1)
         shape = rows.shape[:3]
-        pooled = self.layers(rows.flatten(0, 2)).unflatten(0, shape).amax(2)
+        center_features = self.layers(rows.flatten(0, 2)).unflatten(0, shape).amax(2)
         # centers that were chosen twice do not change a maximum, so all count from here on
-        return centers, torch.ones_like(chosen, dtype=torch.bool), pooled
+        return centers, torch.ones_like(center_index, dtype=torch.bool), center_features
 
 
 class StGcn(nn.Module):
@@ -135,9 +135,7 @@ class StGcn(nn.Module):
         super().__init__()
         self.norm = nn.BatchNorm1d(channels * len(SMPL24))
         widths = (channels, 256 // divisor, 128 // divisor, 64 // divisor)
-        self.layers = nn.ModuleList(
-            GraphLayer(widths[k], widths[k + 1], residual=k > 0) for k in range(len(widths) - 1)
-        )
+        self.layers = nn.ModuleList(GraphLayer(widths[k], widths[k + 1], first=k == 0) for k in range(len(widths) - 1))
         self.output = nn.Conv2d(widths[-1], 6, 1)
         if not stock_initialization:
             # near no rotation, as most joints are near it: from any other, learning takes several times as long
@@ -145,19 +143,19 @@ class StGcn(nn.Module):
 
     def forward(self, joints: Tensor, features: Tensor) -> Tensor:
         """joints (B, T, J, 3), features (B, T, C) -> (B, T, J, 3, 3)."""
-        number = joints.shape[2]
-        x = torch.cat([joints, features[:, :, None].expand(-1, -1, number, -1)], -1)
+        joint_count = joints.shape[2]
+        x = torch.cat([joints, features[:, :, None].expand(-1, -1, joint_count, -1)], -1)
         # joints and their channels are the channels of the norm, joint by joint
-        x = self.norm(x.flatten(2).transpose(1, 2)).unflatten(1, (number, -1)).permute(0, 2, 3, 1)
+        x = self.norm(x.flatten(2).transpose(1, 2)).unflatten(1, (joint_count, -1)).permute(0, 2, 3, 1)
         for layer in self.layers:
             x = layer(x)
         return rotations_from_6d(self.output(x).permute(0, 2, 3, 1))
 
 
 class GraphLayer(nn.Module):
-    """(B, C, T, J) -> (B, C', T, J)."""
+    """(B, C, T, J) -> (B, C', T, J). first: nothing is dropped, nothing added to what is read."""
 
-    def __init__(self, in_channels: int, out_channels: int, *, residual: bool):
+    def __init__(self, in_channels: int, out_channels: int, *, first: bool):
         super().__init__()
         graph = tree_partition(SMPL24.parents)
         self.graph: Tensor
@@ -169,15 +167,15 @@ class GraphLayer(nn.Module):
             nn.ReLU(),
             nn.Conv2d(out_channels, out_channels, (TIME_KERNEL, 1), padding=(TIME_KERNEL // 2, 0)),
             nn.BatchNorm2d(out_channels),
-            nn.Dropout(0.5),
+            nn.Dropout(0.0 if first else 0.5),
         )
         self.residual = (
-            nn.Sequential(nn.Conv2d(in_channels, out_channels, 1), nn.BatchNorm2d(out_channels)) if residual else None
+            None if first else nn.Sequential(nn.Conv2d(in_channels, out_channels, 1), nn.BatchNorm2d(out_channels))
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        mixed = self.space(x).unflatten(1, (len(self.graph), -1))
-        y = self.time(torch.einsum("bkctv,kvw->bctw", mixed, self.graph * self.edge))
+        features = self.space(x).unflatten(1, (len(self.graph), -1))
+        y = self.time(torch.einsum("bkctv,kvw->bctw", features, self.graph * self.edge))
         return (y if self.residual is None else y + self.residual(x)).relu()
 
 
@@ -212,21 +210,21 @@ def rest_offsets() -> Tensor:
 def forward_kinematics(rotations: Tensor, offsets: Tensor, parents: tuple[int, ...]) -> Tensor:
     """rotations (..., J, 3, 3), offsets (J, 3) m of each joint from its parent at rest -> joints (..., J, 3) m, the
     first one at 0."""
-    world: list[Tensor] = []
+    world_rotations: list[Tensor] = []
     joints: list[Tensor] = []
     for joint, parent in enumerate(parents):
-        own = rotations[..., joint, :, :]
+        rotation = rotations[..., joint, :, :]
         if parent < 0:
-            world.append(own)
-            joints.append(torch.zeros_like(own[..., 0]))
+            world_rotations.append(rotation)
+            joints.append(torch.zeros_like(rotation[..., 0]))
         else:
-            joints.append(joints[parent] + world[parent] @ offsets[joint])
-            world.append(world[parent] @ own)
+            joints.append(joints[parent] + world_rotations[parent] @ offsets[joint])
+            world_rotations.append(world_rotations[parent] @ rotation)
     return torch.stack(joints, -2)
 
 
 def _perceptron(channels: tuple[int, ...]) -> nn.Sequential:
     layers: list[nn.Module] = []
-    for before, after in zip(channels, channels[1:], strict=False):
-        layers += [nn.Linear(before, after, bias=False), nn.BatchNorm1d(after), nn.ReLU()]
+    for in_channels, out_channels in zip(channels, channels[1:], strict=False):
+        layers += [nn.Linear(in_channels, out_channels, bias=False), nn.BatchNorm1d(out_channels), nn.ReLU()]
     return nn.Sequential(*layers)

@@ -48,7 +48,7 @@ class Lpformer(nn.Module):
         self.xy, self.z, self.visible = (
             nn.Sequential(nn.Linear(width, 16), nn.ReLU(), nn.Linear(16, 8), nn.Linear(8, size)) for size in (2, 1, 2)
         )
-        self.parts = nn.Sequential(nn.Linear(width, width), nn.Linear(width, 16), nn.ReLU(), nn.Linear(16, joints + 1))
+        self.parts = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 16), nn.Linear(16, joints + 1))
 
     def forward(self, points: Tensor, valid: Tensor, center: Tensor | None = None) -> LpformerOutputs:
         """points (B, N, 3) m about the middle of their extent, valid (B, N) bool; center (B, 3) m: the middle from the
@@ -56,21 +56,21 @@ class Lpformer(nn.Module):
         volume = self.volume(self.occupancy(points, valid))
         # grid_sample wants x last in the volume and first in the places
         place = points.clamp(-REACH, REACH)[:, :, None, None]
-        local = F.grid_sample(volume, place, align_corners=False)[..., 0, 0].transpose(1, 2)
-        absolute = points
+        local_features = F.grid_sample(volume, place, align_corners=False)[..., 0, 0].transpose(1, 2)
+        absolute_points = points
         if self.config.sensor_position and center is not None:
-            absolute = points + center[:, None]
-        tokens = self.token(torch.cat([absolute, points, local], -1))
+            absolute_points = points + center[:, None]
+        tokens = self.token(torch.cat([absolute_points, points, local_features], -1))
         joints = self.joint.expand(len(points), -1, -1)
         tokens = torch.cat([joints, tokens], 1)
         mask = torch.cat([valid.new_ones(joints.shape[:2]), valid], 1)
         for layer in self.attention:
             tokens = layer(tokens, mask)
-        queries, points_out = tokens[:, : joints.shape[1]], tokens[:, joints.shape[1] :]
+        joint_tokens, point_tokens = tokens[:, : joints.shape[1]], tokens[:, joints.shape[1] :]
         return LpformerOutputs(
-            joints=torch.cat([self.xy(queries), self.z(queries)], -1),
-            visible=self.visible(queries),
-            parts=self.parts(points_out),
+            joints=torch.cat([self.xy(joint_tokens), self.z(joint_tokens)], -1),
+            visible=self.visible(joint_tokens),
+            parts=self.parts(point_tokens),
         )
 
     def occupancy(self, points: Tensor, valid: Tensor) -> Tensor:
@@ -118,8 +118,8 @@ class V2V(nn.Module):
 class Residual(nn.Module):
     def __init__(self, in_channels: int, out_channels: int):
         super().__init__()
-        last = [nn.Conv3d(out_channels, out_channels, 3, padding=1), nn.BatchNorm3d(out_channels)]
-        self.branch = nn.Sequential(_conv(in_channels, out_channels, 3), *last)
+        last_layers = [nn.Conv3d(out_channels, out_channels, 3, padding=1), nn.BatchNorm3d(out_channels)]
+        self.branch = nn.Sequential(_conv(in_channels, out_channels, 3), *last_layers)
         self.skip: nn.Module = nn.Identity()
         if in_channels != out_channels:
             self.skip = nn.Sequential(nn.Conv3d(in_channels, out_channels, 1), nn.BatchNorm3d(out_channels))

@@ -35,22 +35,22 @@ class Ne(nn.Module):
     def __init__(self, config: NeConfig):
         super().__init__()
         self.config = config
-        by_order = config.order_dependent_neighbors
+        as_published = config.order_dependent_neighbors
         divisor = config.width_divisor
         width, hidden = WIDTH // divisor, HIDDEN // divisor
-        self.encoders = nn.ModuleDict({name: PointNet2(width, divisor, as_published=by_order) for name in CLOUDS})
-        stock = config.stock_initialization
-        self.neighbors = _transformer(width, hidden, stock_initialization=stock)
+        self.encoders = nn.ModuleDict({name: PointNet2(width, divisor, as_published=as_published) for name in CLOUDS})
+        stock_initialization = config.stock_initialization
+        self.neighbors = _transformer(width, hidden, stock_initialization=stock_initialization)
         self.exchange = Exchange(width, hidden)
-        self.norm = nn.LayerNorm(3 * width)
-        self.clip = _transformer(3 * width, hidden, stock_initialization=stock)
+        self.norm = nn.LayerNorm(3 * width, eps=1e-6)
+        self.clip = _transformer(3 * width, hidden, stock_initialization=stock_initialization)
         self.joints = nn.Linear(3 * width, 3 * len(SMPL24))
         self.shrink = nn.Linear(3 * width, hidden, bias=False)
         # frames are its channels: clips have 16
         self.frame_norm = nn.BatchNorm1d(CLIP_FRAMES)
         self.widen = nn.Linear(hidden, hidden)
-        self.rotations = StGcn(3 + hidden, divisor, stock_initialization=stock)
-        if not stock:
+        self.rotations = StGcn(3 + hidden, divisor, stock_initialization=stock_initialization)
+        if not stock_initialization:
             # joints begin near those of a person who stands: steps that bring them there from elsewhere are the same
             # for all frames, and bring all frames to one answer
             nn.init.constant_(self.clip.layers[-1].norm2.weight, 0.1)
@@ -66,15 +66,15 @@ class Ne(nn.Module):
 
     def decode(self, features: dict[str, Tensor]) -> ClipOutputs:
         """features (B, 16, C)."""
-        everything = torch.cat([features[name] for name in CLOUDS], -1)
+        all_features = torch.cat([features[name] for name in CLOUDS], -1)
         person, background = features["person"], features["background"]
         neighbors = self.neighbors(features["neighbors"])
         if self.config.exchange_across_batch:
-            mixed = self.exchange(*(x.transpose(0, 1) for x in (person, background, neighbors))).transpose(0, 1)
+            context = self.exchange(*(x.transpose(0, 1) for x in (person, background, neighbors))).transpose(0, 1)
         else:
-            mixed = self.exchange(person, background, neighbors)
-        joints = self.joints(self.clip(self.norm(mixed))).unflatten(-1, (-1, 3))
-        hidden = F.dropout(self.frame_norm(self.shrink(everything)).relu(), 0.5, self.training)
+            context = self.exchange(person, background, neighbors)
+        joints = self.joints(self.clip(self.norm(context))).unflatten(-1, (-1, 3))
+        hidden = F.dropout(self.frame_norm(self.shrink(all_features)).relu(), 0.5, self.training)
         return ClipOutputs(joints=joints, rotations=self.rotations(joints, self.widen(hidden)))
 
 
@@ -87,9 +87,11 @@ class Exchange(nn.Module):
         self.norms: Any = nn.ModuleList(
             nn.ModuleList(nn.LayerNorm(width, eps=1e-6) for _ in range(3)) for _ in range(3)
         )
-        self.attention = nn.ModuleList(nn.MultiheadAttention(width, 8, dropout=0.1, batch_first=True) for _ in range(3))
+        self.attention = nn.ModuleList(nn.MultiheadAttention(width, 8, batch_first=True) for _ in range(3))
         self.norm = nn.LayerNorm(3 * width, eps=1e-6)
-        self.mlp = nn.Sequential(nn.Linear(3 * width, hidden), nn.GELU(), nn.Linear(hidden, 3 * width))
+        self.mlp = nn.Sequential(
+            nn.Linear(3 * width, hidden), nn.GELU(), nn.Dropout(0.1), nn.Linear(hidden, 3 * width), nn.Dropout(0.1)
+        )
 
     def forward(self, person: Tensor, background: Tensor, neighbors: Tensor) -> Tensor:
         person = person + self._attend(0, neighbors, background, person)
@@ -100,22 +102,23 @@ class Exchange(nn.Module):
 
     def _attend(self, number: int, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
         query, key, value = (norm(x) for norm, x in zip(self.norms[number], (query, key, value), strict=True))
-        return drop_path(self.attention[number](query, key, value, need_weights=False)[0], 0.2, self.training)
+        output = self.attention[number](query, key, value, need_weights=False)[0]
+        return drop_path(F.dropout(output, 0.1, self.training), 0.2, self.training)
 
 
 def drop_path(branch: Tensor, rate: float, training: bool) -> Tensor:
     """A residual branch (B, ...), left out for some of B in training."""
     if not training:
         return branch
-    keep = torch.rand(len(branch), *(1,) * (branch.dim() - 1), device=branch.device) >= rate
-    return branch * keep / (1 - rate)
+    keep_mask = torch.rand(len(branch), *(1,) * (branch.dim() - 1), device=branch.device) >= rate
+    return branch * keep_mask / (1 - rate)
 
 
 def _heights() -> Tensor:
     """(72,) m: x, y = 0 and z of the mean adult's joints, standing, about the pelvis."""
-    standing = forward_kinematics(torch.eye(3).expand(len(SMPL24), 3, 3), rest_offsets(), SMPL24.parents)
+    rest_joints = forward_kinematics(torch.eye(3).expand(len(SMPL24), 3, 3), rest_offsets(), SMPL24.parents)
     # of SMPL's frame, y up
-    return F.pad(standing[:, 1:2], (2, 0)).flatten()
+    return F.pad(rest_joints[:, 1:2], (2, 0)).flatten()
 
 
 def _transformer(width: int, hidden: int, *, stock_initialization: bool) -> nn.TransformerEncoder:
@@ -129,10 +132,10 @@ def _transformer(width: int, hidden: int, *, stock_initialization: bool) -> nn.T
     if stock_initialization:
         return encoder
     encoder.layers = nn.ModuleList(layer() for _ in range(LAYERS))
-    for own in encoder.layers:
-        attention: Any = own.self_attn
+    for encoder_layer in encoder.layers:
+        attention: Any = encoder_layer.self_attn
         nn.init.zeros_(attention.out_proj.weight)
-        nn.init.zeros_(own.linear2.weight)
+        nn.init.zeros_(encoder_layer.linear2.weight)
         # of frames that are all zero, as without neighbors, a norm's gradient would be 300 times as large in each layer
         nn.init.uniform_(attention.out_proj.bias, -(width**-0.5), width**-0.5)
     return encoder

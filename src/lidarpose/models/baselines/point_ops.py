@@ -13,8 +13,8 @@ _FAR = 1e10
 
 def gather_points(values: Tensor, index: Tensor) -> Tensor:
     """values (B, N, C), index (B, ...) -> (B, ..., C): rows of each cloud."""
-    flat = index.flatten(1)
-    rows = values.gather(1, flat[..., None].expand(-1, -1, values.shape[-1]))
+    flat_index = index.flatten(1)
+    rows = values.gather(1, flat_index[..., None].expand(-1, -1, values.shape[-1]))
     return rows.unflatten(1, index.shape[1:])
 
 
@@ -30,28 +30,28 @@ def farthest_points(points: Tensor, valid: Tensor, count: int, *, as_published: 
     Args:
         points: (B, N, 3) m.
         valid: (B, N); a cloud of fewer points than `count` repeats its first choice.
-        count: how many; as many as N: all points, in their order.
+        count: how many; as many as N, and not `as_published`: all points, in their order.
         as_published: begin at point 0 and never choose a point within 3.2 cm of the origin, as the CUDA kernel of
             PointNet++ does; else begin at the point farthest from the mean, whatever the order of the points.
     """
-    points, own = points.detach(), torch.arange(len(points), device=points.device)
-    usable = valid & (points.square().sum(-1) > 1e-3) if as_published else valid
+    points, cloud = points.detach(), torch.arange(len(points), device=points.device)
+    is_candidate = valid & (points.square().sum(-1) > 1e-3) if as_published else valid
     if as_published:
-        chosen = torch.zeros(len(points), dtype=torch.long, device=points.device)
+        index = torch.zeros(len(points), dtype=torch.long, device=points.device)
     else:
         weight = valid[..., None].to(points.dtype)
         mean = (points * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True).clamp(min=1)
-        chosen = _masked(square_distances(points, mean)[..., 0], usable).argmax(1)
+        index = _masked(square_distances(points, mean)[..., 0], is_candidate).argmax(1)
         if count == points.shape[1]:
-            return torch.where(valid, torch.arange(count, device=points.device), chosen[:, None])
-    nearest = torch.full(valid.shape, _FAR, dtype=points.dtype, device=points.device)
-    nearest = _masked(nearest, usable)
-    indices = [chosen]
+            return torch.where(valid, torch.arange(count, device=points.device), index[:, None])
+    nearest_distance = torch.full(valid.shape, _FAR, dtype=points.dtype, device=points.device)
+    nearest_distance = _masked(nearest_distance, is_candidate)
+    indices = [index]
     for _ in range(count - 1):
-        nearest = torch.minimum(nearest, (points - points[own, chosen][:, None]).square().sum(-1))
+        nearest_distance = torch.minimum(nearest_distance, (points - points[cloud, index][:, None]).square().sum(-1))
         # rows of padding are below every distance; once every point is chosen, the first one again
-        chosen = torch.where(nearest.amax(1) > 0, nearest.argmax(1), indices[0])
-        indices.append(chosen)
+        index = torch.where(nearest_distance.amax(1) > 0, nearest_distance.argmax(1), indices[0])
+        indices.append(index)
     return torch.stack(indices, 1)
 
 
@@ -63,22 +63,22 @@ def ball_query(
     as_published: the first ones in the order of the points, repeating the first, as the CUDA kernel does.
     """
     distance = square_distances(centers, points)
-    inside = (distance < radius * radius) & valid[:, None]
+    is_inside = (distance < radius * radius) & valid[:, None]
     if as_published:
-        number = torch.arange(points.shape[1], device=points.device, dtype=points.dtype)
-        distance = number.expand_as(distance)
-    value, index = distance.masked_fill(~inside, _FAR).topk(min(count, points.shape[1]), largest=False)
-    index = torch.where(value < _FAR, index, index[..., :1])
+        point_number = torch.arange(points.shape[1], device=points.device, dtype=points.dtype)
+        distance = point_number.expand_as(distance)
+    nearest_distance, index = distance.masked_fill(~is_inside, _FAR).topk(min(count, points.shape[1]), largest=False)
+    index = torch.where(nearest_distance < _FAR, index, index[..., :1])
     return torch.cat([index, index[..., :1].expand(*index.shape[:-1], count - index.shape[-1])], -1)
 
 
 def nearest_neighbors(points: Tensor, valid: Tensor, count: int) -> Tensor:
     """(B, N, count) indices of each point's nearest points, itself among them; -1 where a cloud has fewer."""
     distance = square_distances(points, points).masked_fill(~valid[:, None], _FAR)
-    value, index = distance.topk(min(count, points.shape[1]), largest=False)
-    index = index.masked_fill((value >= _FAR) | ~valid[..., None], -1)
+    nearest_distance, index = distance.topk(min(count, points.shape[1]), largest=False)
+    index = index.masked_fill((nearest_distance >= _FAR) | ~valid[..., None], -1)
     return torch.cat([index, index.new_full((*index.shape[:-1], count - index.shape[-1]), -1)], -1)
 
 
-def _masked(values: Tensor, usable: Tensor) -> Tensor:
-    return values.masked_fill(~usable, -1.0)
+def _masked(values: Tensor, is_candidate: Tensor) -> Tensor:
+    return values.masked_fill(~is_candidate, -1.0)

@@ -56,8 +56,8 @@ class Rows:
 
 def segment_reduce(values: Tensor, segment: Tensor, segments: int, reduce: str) -> Tensor:
     """values (M, C) of rows of `segment` (M,) -> (segments, C); 0 for a segment without rows."""
-    empty = values.new_zeros(segments, values.shape[1])
-    return empty.scatter_reduce(0, segment[:, None].expand_as(values), values, reduce, include_self=False)
+    zeros = values.new_zeros(segments, values.shape[1])
+    return zeros.scatter_reduce(0, segment[:, None].expand_as(values), values, reduce, include_self=False)
 
 
 def linear_norm(in_channels: int, out_channels: int, *, bias: bool) -> nn.Sequential:
@@ -77,8 +77,8 @@ class PointTransformerV2(nn.Module):
         self.down = nn.ModuleList(linear_norm(widths[s], widths[s + 1], bias=False) for s in range(len(GRID)))
         self.encoder = _stages(encoder, ENCODER_GROUPS, ENCODER_DEPTH)
         coarse = (*decoder[1:], encoder[-1])
-        self.up = nn.ModuleList(linear_norm(c, own, bias=True) for c, own in zip(coarse, decoder, strict=True))
-        self.skip = nn.ModuleList(linear_norm(s, own, bias=True) for s, own in zip(widths, decoder, strict=False))
+        self.up = nn.ModuleList(linear_norm(c, width, bias=True) for c, width in zip(coarse, decoder, strict=True))
+        self.skip = nn.ModuleList(linear_norm(s, width, bias=True) for s, width in zip(widths, decoder, strict=False))
         self.decoder = _stages(decoder, DECODER_GROUPS, DECODER_DEPTH)
 
     def forward(self, rows: Rows) -> Tensor:
@@ -119,8 +119,8 @@ class Block(nn.Module):
         self.last = nn.Sequential(nn.Linear(channels, channels, bias=False), nn.BatchNorm1d(channels))
 
     def forward(self, x: Tensor, xyz: Tensor, neighbors: Tensor) -> Tensor:
-        attended = self.attention(self.first(x), xyz, neighbors)
-        return (x + self.last(self.norm(attended).relu())).relu()
+        output = self.attention(self.first(x), xyz, neighbors)
+        return (x + self.last(self.norm(output).relu())).relu()
 
 
 class GroupedVectorAttention(nn.Module):
@@ -133,22 +133,22 @@ class GroupedVectorAttention(nn.Module):
         self.key = linear_norm(channels, channels, bias=True)
         self.value = nn.Linear(channels, channels)
         self.position = nn.ModuleList([linear_norm(3, channels, bias=True), nn.Linear(channels, channels)])
-        self.group_weight = nn.Parameter(torch.empty(channels).uniform_(-1, 1) / (channels // groups) ** 0.5)
+        self.group_weight = nn.Parameter(torch.empty(channels).uniform_(-1, 1) / channels**0.5)
         self.weight = nn.Sequential(nn.BatchNorm1d(groups), nn.ReLU(), nn.Linear(groups, groups))
 
     def forward(self, x: Tensor, xyz: Tensor, neighbors: Tensor) -> Tensor:
         """x (M, C), xyz (M, 3), neighbors (M, k), -1 for none -> (M, C)."""
         # rows of neighbors that exist, all in one list: batch norms see no others
-        own, slot = (neighbors >= 0).nonzero(as_tuple=True)
-        other = neighbors[own, slot]
-        bias = self.position[1](self.position[0](xyz[other] - xyz[own]))
+        row, slot = (neighbors >= 0).nonzero(as_tuple=True)
+        neighbor = neighbors[row, slot]
+        bias = self.position[1](self.position[0](xyz[neighbor] - xyz[row]))
         # of relation = key - query + bias, summed within groups: keys and queries before they are copied to neighbors
         key, query = self._summed(self.key(x)), self._summed(self.query(x))
-        scores = self.weight(key[other] - query[own] + self._summed(bias))
-        weight = scores.new_full((*neighbors.shape, self.groups), -torch.inf).index_put((own, slot), scores).softmax(1)
-        value = (self.value(x)[other] + bias).unflatten(1, (self.groups, -1))
-        weighted = (value * weight[own, slot][..., None]).flatten(1)
-        return torch.zeros_like(x).index_add(0, own, weighted)
+        scores = self.weight(key[neighbor] - query[row] + self._summed(bias))
+        weight = scores.new_full((*neighbors.shape, self.groups), -torch.inf).index_put((row, slot), scores).softmax(1)
+        value = (self.value(x)[neighbor] + bias).unflatten(1, (self.groups, -1))
+        weighted_values = (value * weight[row, slot][..., None]).flatten(1)
+        return torch.zeros_like(x).index_add(0, row, weighted_values)
 
     def _summed(self, values: Tensor) -> Tensor:
         """(..., C) -> (..., G): weighted sums within each group, as a product with a block-diagonal matrix."""

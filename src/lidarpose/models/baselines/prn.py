@@ -59,14 +59,14 @@ class Prn(nn.Module):
         rows = Rows(xyz=points[valid], person=person, count=valid.sum(1))
         features = self.backbone(rows)
         voted, parts, offsets = self.vote(features, rows)
-        own = torch.cat([voted, self.joint.weight.expand(len(voted), -1, -1)], -1)
-        tokens = torch.cat([voted, self.embed(own)], -1)
+        joint_features = torch.cat([voted, self.joint.weight.expand(len(voted), -1, -1)], -1)
+        tokens = torch.cat([voted, self.embed(joint_features)], -1)
         context = points.new_zeros(*valid.shape, tokens.shape[-1])
         context[valid] = torch.cat([rows.xyz, features], -1)
         tokens = torch.cat([tokens, context], 1)
         mask = torch.cat([valid.new_ones(voted.shape[:2]), valid], 1)
-        first, last = self.attention
-        tokens = last(first(tokens, mask), mask, queries=voted.shape[1])
+        first_layer, last_layer = self.attention
+        tokens = last_layer(first_layer(tokens, mask), mask, queries=voted.shape[1])
         return PrnOutputs(joints=self.output(tokens), voted=voted, parts=parts, offsets=offsets)
 
 
@@ -82,21 +82,21 @@ class VoteHead(nn.Module):
 
     def forward(self, features: Tensor, rows: Rows) -> tuple[Tensor, Tensor, Tensor]:
         people = len(rows.count)
-        shared = [segment_reduce(features, rows.person, people, kind)[rows.person] for kind in ("amax", "mean")]
-        context = torch.cat([features, *shared], 1)
+        summary = [segment_reduce(features, rows.person, people, kind)[rows.person] for kind in ("amax", "mean")]
+        context = torch.cat([features, *summary], 1)
         parts, offsets = self.parts(context), self.offsets(context)
         # in half precision too votes are summed in single
-        share = parts.float().softmax(1)
-        background = share[:, self.background]
-        joint = torch.cat([share[:, : self.background], share[:, self.background + 1 :]], 1)
-        voting = (background < VOTES) & (share.amax(1) > VOTES)
-        weight = joint * voting[:, None]
+        probability = parts.float().softmax(1)
+        background = probability[:, self.background]
+        joint_probability = torch.cat([probability[:, : self.background], probability[:, self.background + 1 :]], 1)
+        is_voting = (background < VOTES) & (probability.amax(1) > VOTES)
+        weight = joint_probability * is_voting[:, None]
         target = rows.xyz + offsets
-        total = weight.new_zeros(people, joint.shape[1]).index_add(0, rows.person, weight)
-        summed = weight.new_zeros(people, joint.shape[1], 3).index_add(
+        weight_sum = weight.new_zeros(people, joint_probability.shape[1]).index_add(0, rows.person, weight)
+        vote_sum = weight.new_zeros(people, joint_probability.shape[1], 3).index_add(
             0, rows.person, weight[..., None] * target[:, None]
         )
-        return summed / (total[..., None] + 1e-8), parts, offsets
+        return vote_sum / (weight_sum[..., None] + 1e-8), parts, offsets
 
 
 class BareAttention(nn.Module):
@@ -109,14 +109,14 @@ class BareAttention(nn.Module):
 
     def forward(self, x: Tensor, valid: Tensor, queries: int | None = None) -> Tensor:
         """x (B, N, C), valid (B, N): rows that may be attended to -> (B, N, C), or the first `queries` rows of it."""
-        own = x[:, :queries]
+        query_rows = x[:, :queries]
         query, key, value = (
             layer(rows).unflatten(-1, (self.heads, -1)).transpose(1, 2)
-            for layer, rows in ((self.query, own), (self.key, x), (self.value, x))
+            for layer, rows in ((self.query, query_rows), (self.key, x), (self.value, x))
         )
         dropout = self.dropout if self.training else 0.0
-        attended = attend(query, key, value, valid[:, None, None], dropout=dropout)
-        return own + attended.transpose(1, 2).flatten(2)
+        output = attend(query, key, value, valid[:, None, None], dropout=dropout)
+        return query_rows + output.transpose(1, 2).flatten(2)
 
 
 class PrnNeck(nn.Module):
@@ -138,9 +138,9 @@ class PrnNeck(nn.Module):
 
     def forward(self, features: Tensor, rows: Rows) -> PrnOutputs:
         voted, parts, offsets = self.vote(features, rows)
-        own = self.embed(torch.cat([voted, self.joint.expand(len(voted), -1, -1)], -1))
+        joint_features = self.embed(torch.cat([voted, self.joint.expand(len(voted), -1, -1)], -1))
         slots, valid = rows.padded()
-        tokens = torch.cat([torch.cat([voted, own], -1), torch.cat([rows.xyz, features], -1)[slots]], 1)
+        tokens = torch.cat([torch.cat([voted, joint_features], -1), torch.cat([rows.xyz, features], -1)[slots]], 1)
         mask = torch.cat([valid.new_ones(voted.shape[:2]), valid], 1)
         tokens = self.norm(self.layers(self.token(tokens), src_key_padding_mask=~mask))
         return PrnOutputs(joints=self.output(tokens[:, : voted.shape[1]]), voted=voted, parts=parts, offsets=offsets)

@@ -84,10 +84,12 @@ class DaptConfig(Config):
             object.__setattr__(self, name, counts)
         if not set(self.strides) <= {2, 4, 8} or np.prod(self.strides, dtype=float) > 1 << CELL_BITS:
             raise InputError(f"strides must be 2, 4 or 8 each and {1 << CELL_BITS} in all at most, got {self.strides}")
-        for widths, heads in (("encoder", "encoder"), ("decoder", "decoder"), ("decoder", "anchor")):
-            of, by = f"{widths}_channels", f"{heads}_heads"
-            if np.any(np.array(getattr(self, of)) % getattr(self, by)):
-                raise InputError(f"{of} must divide by {by}, got {getattr(self, of)} and {getattr(self, by)}")
+        for module, head_module in (("encoder", "encoder"), ("decoder", "decoder"), ("decoder", "anchor")):
+            channels, heads = f"{module}_channels", f"{head_module}_heads"
+            if np.any(np.array(getattr(self, channels)) % getattr(self, heads)):
+                raise InputError(
+                    f"{channels} must divide by {heads}, got {getattr(self, channels)} and {getattr(self, heads)}"
+                )
         if not self.orders:
             raise InputError(f"orders must name at least one curve of {', '.join(CURVES)}, got none")
         for order in self.orders:
@@ -106,8 +108,8 @@ class DaptConfig(Config):
         if self.parts == 1:
             raise InputError(f"parts must be 0 (no part head) or from 2 to {MOST}, got 1")
         if self.neck == "prn" and (self.bins or self.parts or not self.coordinates):
-            own = "the neck prn has joints and parts of its own"
-            raise InputError(f"{own}: leave bins, ranges and parts empty and set coordinates=True")
+            reason = "the neck prn has joints and parts of its own"
+            raise InputError(f"{reason}: leave bins, ranges and parts empty and set coordinates=True")
 
     @property
     def layers(self) -> int:
@@ -154,12 +156,12 @@ class DaptConfig(Config):
         """
         if "enc_depths" in entries:
             entries = _from_reference(entries)
-        known = [field.name for field in fields(cls)]
+        setting_names = [field.name for field in fields(cls)]
         for entry in entries:
-            check_name("setting of the network", entry, known)
-        for needed in ("name", "joints"):
-            if needed not in entries:
-                raise InputError(f"a configuration needs the entry {needed!r}, got only {', '.join(entries) or 'none'}")
+            check_name("setting of the network", entry, setting_names)
+        for entry in ("name", "joints"):
+            if entry not in entries:
+                raise InputError(f"a configuration needs the entry {entry!r}, got only {', '.join(entries) or 'none'}")
         return cls(**entries)
 
 
@@ -189,7 +191,7 @@ def _from_reference(entries: dict) -> dict:
     patches = {patch for size in sizes for patch in (size if isinstance(size, list | tuple) else [size])}
     if len(patches) != 1:
         raise InputError(f"enc_patch_size and dec_patch_size must be one number throughout, got {sorted(patches)}")
-    settings = {ours: entries[theirs] for theirs, ours in _REFERENCE.items() if theirs in entries}
+    settings = {setting: entries[argument] for argument, setting in _REFERENCE.items() if argument in entries}
     count = entries.get("num_keypoints", 14)
     joints = entries.get("joints", next((names for names in _JOINTS if len(names) == count), None))
     if not isinstance(count, int) or joints is None:
@@ -204,14 +206,14 @@ def _from_reference(entries: dict) -> dict:
         except (KeyError, TypeError):
             raise InputError(f"grid must be {{'size': ..., 'range': ...}} of the heatmaps, got {heatmaps!r}") from None
     # what their arguments do not say
-    ours = ("name", "parts", "coordinates", "auxiliary", "legacy")
-    return settings | {name: entries[name] for name in ours if name in entries}
+    extra_names = ("name", "parts", "coordinates", "auxiliary", "legacy")
+    return settings | {name: entries[name] for name in extra_names if name in entries}
 
 
-def _released(name: str, joints: tuple[str, ...], bins: tuple[int, int], reach: Range) -> DaptConfig:
+def _released(name: str, joints: tuple[str, ...], bins: tuple[int, int], half_widths: Range) -> DaptConfig:
     """bins and half widths in meters of (x and y, z)."""
-    across, up = ((-r, r) for r in reach)
-    ranges = (across, across, up)
+    xy_range, z_range = ((-r, r) for r in half_widths)
+    ranges = (xy_range, xy_range, z_range)
     return DaptConfig(name=name, joints=joints, bins=(bins[0], *bins), ranges=ranges, auxiliary=True, legacy=True)
 
 

@@ -184,14 +184,14 @@ class DaptNet(nn.Module):
         self.eval()
         try:
             with torch.inference_mode():
-                out = self(batch)
+                results = self(batch)
         finally:
             self.train(was_training)
         names = ("anchors", "logits_x", "logits_y", "logits_z", "inter", "coordinates", "voted")
-        outputs = {name: value[: len(clouds)] for name in names if (value := getattr(out, name)) is not None}
-        outputs["point_feat_last"] = out.points[batch.point_voxel]
-        if out.parts is not None:
-            outputs["parts"] = out.parts[batch.point_voxel]
+        outputs = {name: value[: len(clouds)] for name in names if (value := getattr(results, name)) is not None}
+        outputs["point_feat_last"] = results.points[batch.point_voxel]
+        if results.parts is not None:
+            outputs["parts"] = results.parts[batch.point_voxel]
         return {name: value.float().cpu().numpy() for name, value in outputs.items()}
 
 
@@ -212,18 +212,18 @@ class _Backbone(nn.Module):
                 f"enc{s}", Stage(widths[s], config.encoder_heads[s], config.mlp_ratio, drops, finer=finer)
             )
 
-        wide = (*config.decoder_channels, widths[-1])
+        up_widths = (*config.decoder_channels, widths[-1])
         stages: list[Stage] = []
         necks: dict[int, nn.Module] = {}
         for s, drops in enumerate(_drop_rates(config.decoder_depths, config.drop_path)):
-            coarser = wide[s + 1], widths[s]
+            coarser = up_widths[s + 1], widths[s]
             # within a stage the first block drops most
-            stages.append(Stage(wide[s], config.decoder_heads[s], config.mlp_ratio, drops[::-1], coarser=coarser))
+            stages.append(Stage(up_widths[s], config.decoder_heads[s], config.mlp_ratio, drops[::-1], coarser=coarser))
             anchor_in, anchor_out = config.anchor_channels[s + 1], config.anchor_channels[s]
             if self.neck == "mde":
-                necks[s] = Exchange(anchor_in, wide[s], anchor_out, config.anchor_heads, config.anchor_dropout)
+                necks[s] = Exchange(anchor_in, up_widths[s], anchor_out, config.anchor_heads, config.anchor_dropout)
             elif self.neck == "finest" and s == 0:
-                necks[s] = FinestNeck(wide[0], config.anchor_heads, config.anchor_dropout)
+                necks[s] = FinestNeck(up_widths[0], config.anchor_heads, config.anchor_dropout)
         self.dec = nn.Module()
         for s in reversed(range(len(stages))):
             self.dec.add_module(f"dec{s}", stages[s])
@@ -231,7 +231,7 @@ class _Backbone(nn.Module):
                 self.dec.add_module(f"dec_ke{s}", necks[s])
         if necks:
             # small random numbers where the released code begins at zero
-            width = config.anchor_channels[-1] if self.neck == "mde" else wide[0]
+            width = config.anchor_channels[-1] if self.neck == "mde" else up_widths[0]
             self.keypoint_embedding = nn.Parameter(torch.randn(len(config.joints), width) * 0.02)
 
     def forward(self, batch: Tables[Tensor]) -> tuple[Tensor | None, Tensor, Tensor]:
@@ -284,9 +284,9 @@ def part_head(channels: int, parts: int) -> nn.Sequential:
     return nn.Sequential(OrderedDict(fc=layers))
 
 
-def _drop_rates(depths: tuple[int, ...], largest: float) -> list[list[float]]:
-    """Of each stage those of its blocks, rising from 0 to `largest` over all stages."""
-    rates = np.linspace(0, largest, sum(depths))
+def _drop_rates(depths: tuple[int, ...], max_rate: float) -> list[list[float]]:
+    """Of each stage those of its blocks, rising from 0 to `max_rate` over all stages."""
+    rates = np.linspace(0, max_rate, sum(depths))
     return [stage.tolist() for stage in np.split(rates, np.cumsum(depths)[:-1])]
 
 

@@ -45,12 +45,12 @@ def import_dapt(path: str | os.PathLike, config: DaptConfig | dict | str | None 
     remedy = f"name the configuration that it was trained with ({', '.join(CONFIGS)})"
     network = file.network(config, source=f"the configuration {config.name}", remedy=remedy)
     # the released heatmap head carries its ranges: they must be those that its logits will be read with
-    stored = network.state_dict().get("heads.query.coord_range")
-    if stored is not None and not torch.allclose(stored, torch.tensor(config.ranges), atol=1e-4):
+    ranges = network.state_dict().get("heads.query.coord_range")
+    if ranges is not None and not torch.allclose(ranges, torch.tensor(config.ranges), atol=1e-4):
         raise file_error(
             path,
-            f"tensor heads.query.coord_range says {stored.double().round(decimals=4).tolist()} m, the configuration "
-            f"{config.name} {[list(reach) for reach in config.ranges]}: {remedy}",
+            f"tensor heads.query.coord_range says {ranges.double().round(decimals=4).tolist()} m, the configuration "
+            f"{config.name} {[list(bounds) for bounds in config.ranges]}: {remedy}",
         )
     return network
 
@@ -63,9 +63,9 @@ def import_released(source: str | os.PathLike, out: str | os.PathLike, *, config
     check_suffix(out, ".safetensors")
     check_apart(out, source)
     network = import_dapt(source, config)
-    named = "" if config is None else f" --config {config}"
+    option = "" if config is None else f" --config {config}"
     card = {
-        "command": f"lidarpose import {Path(source).name}{named}",
+        "command": f"lidarpose import {Path(source).name}{option}",
         "note": "released DAPT weights; confidence and spread are read off its heatmaps and not calibrated",
     }
     save_checkpoint(out, network, card=card)
@@ -77,19 +77,19 @@ def _config(path: Path, metadata: dict[str, str], config: DaptConfig | dict | st
         return config
     if isinstance(config, str):
         return named_config(config)
-    where, known = "the configuration given", f"name one of {', '.join(CONFIGS)}"
+    source, remedy = "the configuration given", f"name one of {', '.join(CONFIGS)}"
     if config is None:
-        where = "its header's configuration"
+        source = "its header's configuration"
         try:
             config = json.loads(metadata["config"])
         except KeyError:
-            raise file_error(path, f"its header has no configuration: {known} (config=...)") from None
+            raise file_error(path, f"its header has no configuration: {remedy} (config=...)") from None
         except (ValueError, RecursionError) as error:
-            raise file_error(path, f"{where} is not JSON ({error}): {known}") from None
+            raise file_error(path, f"{source} is not JSON ({error}): {remedy}") from None
     if not isinstance(config, dict):
-        raise file_error(path, f"{where} should be a dict, a name or a DaptConfig, got {type(config).__name__}")
+        raise file_error(path, f"{source} should be a dict, a name or a DaptConfig, got {type(config).__name__}")
     try:
         return DaptConfig.from_dict({"legacy": True} | config)
     # TypeError: lists and dicts where numbers and names belong
     except (InputError, TypeError) as error:
-        raise file_error(path, f"{where} does not fit: {error}") from None
+        raise file_error(path, f"{source} does not fit: {error}") from None

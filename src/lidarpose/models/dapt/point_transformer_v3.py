@@ -39,8 +39,8 @@ class DropPath(nn.Module):
     def forward(self, rows: Tensor) -> Tensor:
         if not self.training or self.probability == 0:
             return rows
-        keep = 1 - self.probability
-        return rows * (torch.rand_like(rows[:, :1]) < keep) / keep
+        keep_probability = 1 - self.probability
+        return rows * (torch.rand_like(rows[:, :1]) < keep_probability) / keep_probability
 
 
 class SubmanifoldConvolution(nn.Module):
@@ -63,8 +63,8 @@ class SubmanifoldConvolution(nn.Module):
         out = F.linear(rows, weights[len(weights) // 2], self.bias)
         if near.table is not None:
             # the row after the last is zero: an empty cell; the table has none for the middle tap, done above
-            read = F.pad(rows, (0, 0, 0, 1))[near.table.flatten()].view(rows.shape[0], -1)
-            return out + F.linear(read, self.weight.flatten(1))
+            neighbor_rows = F.pad(rows, (0, 0, 0, 1))[near.table.flatten()].view(rows.shape[0], -1)
+            return out + F.linear(neighbor_rows, self.weight.flatten(1))
         # all set where there is no table
         all_sources, all_targets, pairs = cast("tuple[Tensor, Tensor, Tensor]", (near.source, near.target, near.counts))
         counts = pairs.tolist()
@@ -91,18 +91,18 @@ class PatchAttention(nn.Module):
             blocks = qkv[level.patch_slots[order]].unflatten(-1, (3, self.heads, -1))
             # set with the slots
             place = cast("Tensor", level.patch_place)[order]
-            mixed = self._attend(blocks, level.patch_valid).flatten(0, 1)[place]
-            return self.proj(mixed)
+            output = self._attend(blocks, level.patch_valid).flatten(0, 1)[place]
+            return self.proj(output)
         sequence = level.sequence[order % level.sequence.shape[0]]
         # one curve alone: rows already stand patch after patch
         is_sorted = level.sequence.shape[0] == 1
         qkv = (qkv if is_sorted else qkv[sequence]).unflatten(-1, (3, self.heads, -1))
         lengths = level.patch_lengths.tolist()
         if len(set(lengths)) == 1:
-            mixed = self._attend(qkv.unflatten(0, (len(lengths), -1)), None).flatten(0, 1)
+            output = self._attend(qkv.unflatten(0, (len(lengths), -1)), None).flatten(0, 1)
         else:
-            mixed = torch.cat([self._attend(patch[None], None)[0] for patch in qkv.split(lengths)])
-        return self.proj(mixed if is_sorted else torch.empty_like(mixed).index_copy(0, sequence, mixed))
+            output = torch.cat([self._attend(patch[None], None)[0] for patch in qkv.split(lengths)])
+        return self.proj(output if is_sorted else torch.empty_like(output).index_copy(0, sequence, output))
 
     @staticmethod
     def _attend(qkv: Tensor, mask: Tensor | None) -> Tensor:

@@ -102,59 +102,59 @@ def build_tables(
     check_name("layout", layout, LAYOUTS)
     if not 1 <= len(clouds) < _MOST_PEOPLE:
         raise InputError(f"a batch holds 1 to {_MOST_PEOPLE - 1} people, got {len(clouds)}: split it")
-    filled = [len(cloud) > 0 for cloud in clouds]
+    has_points = [len(cloud) > 0 for cloud in clouds]
     # a stand-in: a voxel that no neighbor or parent can tell from a real one
     clouds = [np.asarray(cloud, np.float32) if len(cloud) else np.zeros((1, 3), np.float32) for cloud in clouds]
     lengths = np.array([len(cloud) for cloud in clouds], np.int64)
     points, person = np.concatenate(clouds), np.repeat(np.arange(len(clouds)), lengths)
-    is_point = np.repeat(filled, lengths)
+    is_point = np.repeat(has_points, lengths)
     cells = _cells(points, lengths, config)
     key = person << (3 * _WIDE) | z_order(cells)
 
-    kept, point_voxel = _one_a_voxel(key, points, config.grid, rng)
-    key, cells = key[kept], cells[kept]
+    rows, point_voxel = _one_a_voxel(key, points, config.grid, rng)
+    key, cells = key[rows], cells[rows]
     levels: list[Level[np.ndarray]] = []
     stem = _neighbors(key, cells, 2, 0, layout)
     bits = 0
     # the last level has no next one
     for stride in (*config.strides, 1):
         shift = stride.bit_length() - 1
-        parent_key, first, parent = _grouped(key >> (3 * shift))
-        last = len(levels) == len(config.strides)
+        parent_key, starts, parent = _grouped(key >> (3 * shift))
+        is_last = len(levels) == len(config.strides)
         levels.append(
             Level(
                 near=_neighbors(key, cells, 1, bits, layout),
-                parent=None if last else parent,
-                children=None if last else _spread(first, len(key)),
+                parent=None if is_last else parent,
+                children=None if is_last else _spread(starts, len(key)),
                 **_people(key >> (3 * (_WIDE - bits)), len(clouds), cells, config, layout, rng),
             )
         )
-        key, cells, bits = parent_key, cells[first] >> shift, bits + shift
+        key, cells, bits = parent_key, cells[starts] >> shift, bits + shift
     return Tables(
-        features=points[kept],
+        features=points[rows],
         stem=stem,
         levels=tuple(levels),
-        kept=np.where(is_point, np.cumsum(is_point) - 1, -1)[kept],
+        kept=np.where(is_point, np.cumsum(is_point) - 1, -1)[rows],
         point_voxel=point_voxel[is_point],
     )
 
 
 def _cells(points: np.ndarray, lengths: np.ndarray, config: DaptConfig) -> np.ndarray:
     """(M, 3) int64 in [0, 2**CELL_BITS)."""
-    scaled = np.floor(points / config.grid)
-    if not np.isfinite(scaled).all():
+    cells = np.floor(points / config.grid)
+    if not np.isfinite(cells).all():
         raise InputError("points must be finite numbers of meters, got NaN or infinity: drop those points first")
     middle = 1 << (CELL_BITS - 1)
     if config.legacy:
-        low = np.minimum.reduceat(scaled, np.cumsum(lengths) - lengths)
-        scaled = scaled - np.repeat(low, lengths, axis=0)
+        low = np.minimum.reduceat(cells, np.cumsum(lengths) - lengths)
+        cells = cells - np.repeat(low, lengths, axis=0)
     else:
-        scaled = scaled + middle
-    if not (scaled.min() >= 0 and scaled.max() < 2 * middle):
+        cells = cells + middle
+    if not (cells.min() >= 0 and cells.max() < 2 * middle):
         reach = middle * config.grid
         limit = f"span {2 * reach:.0f} m at most" if config.legacy else f"lie within {reach:.0f} m of their person"
         raise InputError(f"points must {limit}, got some beyond: crop to one person")
-    return scaled.astype(np.int64)
+    return cells.astype(np.int64)
 
 
 def _one_a_voxel(
@@ -162,67 +162,67 @@ def _one_a_voxel(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Indices (M,) of one point a voxel, in order of the keys, and each point's voxel."""
     order = np.argsort(key, kind="stable")
-    _, first, voxel = _grouped(key[order])
-    if len(first) < len(key):
+    _, starts, voxel = _grouped(key[order])
+    if len(starts) < len(key):
         # of several points the random or the nearest one comes first; coordinates settle ties, whatever the input order
         if rng is not None:
             order = np.lexsort((rng.random(len(key)), key))
         else:
-            off = (points / grid - np.floor(points / grid) - 0.5).astype(np.float64)
-            order = np.lexsort((*points.T, (off**2).sum(1), key))
+            offset = (points / grid - np.floor(points / grid) - 0.5).astype(np.float64)
+            order = np.lexsort((*points.T, (offset**2).sum(1), key))
     point_voxel = np.empty(len(key), np.int64)
     point_voxel[order] = voxel
-    return order[first], point_voxel
+    return order[starts], point_voxel
 
 
 def _grouped(key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sorted keys (n,) -> the distinct ones (m,), where each begins (m,), and which one each is (n,)."""
-    begins = np.diff(key, prepend=-1) > 0
-    first = np.flatnonzero(begins)
-    return key[first], first, np.cumsum(begins) - 1
+    is_start = np.diff(key, prepend=-1) > 0
+    starts = np.flatnonzero(is_start)
+    return key[starts], starts, np.cumsum(is_start) - 1
 
 
-def _spread(first: np.ndarray, rows: int) -> np.ndarray:
-    """(m, W) rows of groups that begin at `first` and end where the next begins, the first row repeated."""
-    lengths = np.diff(first, append=rows)
+def _spread(starts: np.ndarray, rows: int) -> np.ndarray:
+    """(m, W) rows of groups that begin at `starts` and end where the next begins, the first row repeated."""
+    lengths = np.diff(starts, append=rows)
     column = np.arange(lengths.max())
-    return first[:, None] + np.where(column < lengths[:, None], column, 0)
+    return starts[:, None] + np.where(column < lengths[:, None], column, 0)
 
 
 def _neighbors(key: np.ndarray, cells: np.ndarray, reach: int, bits: int, layout: str) -> Neighbors:
     """Neighbors within `reach` cells an axis of rows whose sorted `key` has lost `bits` bits an axis."""
     side = 2 * reach + 1
     taps, rows = side**3, len(key)
-    wide = _WIDE - bits
+    axis_bits = _WIDE - bits
     # of each axis, one after the other: its bits for every step, in the places of the code
     x, y, z = (
-        np.stack([dilated(cells[:, k] + step & (1 << wide) - 1) << 2 - k for step in range(-reach, reach + 1)])
+        np.stack([dilated(cells[:, k] + step & (1 << axis_bits) - 1) << 2 - k for step in range(-reach, reach + 1)])
         for k in range(3)
     )
-    half = np.arange(taps // 2)
-    codes: np.ndarray = x[half // side**2] | y[half // side % side] | z[half % side]
-    codes |= key >> (3 * wide) << (3 * wide)
-    nearest = np.searchsorted(key, codes.ravel())
-    nearest[nearest == rows] = 0
-    occupied = np.flatnonzero(key[nearest] == codes.ravel())
+    half_taps = np.arange(taps // 2)
+    codes: np.ndarray = x[half_taps // side**2] | y[half_taps // side % side] | z[half_taps % side]
+    codes |= key >> (3 * axis_bits) << (3 * axis_bits)
+    candidate_rows = np.searchsorted(key, codes.ravel())
+    candidate_rows[candidate_rows == rows] = 0
+    pairs = np.flatnonzero(key[candidate_rows] == codes.ravel())
     # the second half of the taps is the first one mirrored, seen from the neighbor
-    tap, target, source = occupied // rows, occupied % rows, nearest[occupied]
+    tap, target, source = pairs // rows, pairs % rows, candidate_rows[pairs]
     if layout == "padded":
         table = np.full((rows, taps), rows)
         table[target, tap] = source
         table[source, taps - 1 - tap] = target
         return Neighbors(table=table)
     counts = np.bincount(tap, minlength=taps // 2)
-    mirrored = np.argsort(-tap, kind="stable")
+    mirror_order = np.argsort(-tap, kind="stable")
     return Neighbors(
-        source=np.concatenate([source, target[mirrored]]),
-        target=np.concatenate([target, source[mirrored]]),
+        source=np.concatenate([source, target[mirror_order]]),
+        target=np.concatenate([target, source[mirror_order]]),
         counts=np.concatenate([counts, [0], counts[::-1]]),
     )
 
 
 def _people(
-    owner: np.ndarray,
+    person: np.ndarray,
     people: int,
     cells: np.ndarray,
     config: DaptConfig,
@@ -230,27 +230,27 @@ def _people(
     rng: np.random.Generator | None,
 ) -> dict[str, Any]:
     """The entries of a `Level` about whose rows are whose, and which attend to each other."""
-    lengths = np.bincount(owner, minlength=people)
-    first = np.cumsum(lengths) - lengths
-    slots = _spread(first, len(owner))
-    out = {"lengths": lengths, "slots": slots, "valid": np.arange(slots.shape[1]) < lengths[:, None]}
+    lengths = np.bincount(person, minlength=people)
+    starts = np.cumsum(lengths) - lengths
+    slots = _spread(starts, len(person))
+    entries = {"lengths": lengths, "slots": slots, "valid": np.arange(slots.shape[1]) < lengths[:, None]}
     if lengths.max() <= config.patch:
-        sequence, patch_lengths = np.arange(len(owner))[None], lengths
+        sequence, patch_lengths = np.arange(len(person))[None], lengths
     else:
         orders = list(config.orders) if rng is None else rng.permutation(config.orders)
-        sequence = np.stack([np.lexsort((curve(str(order), cells), owner)) for order in orders])
+        sequence = np.stack([np.lexsort((curve(str(order), cells), person)) for order in orders])
         # full patches of each person, and what is left
         ends = [np.append(np.arange(config.patch, n, config.patch), n) for n in lengths]
         patch_lengths = np.concatenate([np.diff(end, prepend=0) for end in ends])
-    out |= {"sequence": sequence, "patch_lengths": patch_lengths}
+    entries |= {"sequence": sequence, "patch_lengths": patch_lengths}
     if layout == "ragged":
-        return out
-    begins = np.cumsum(patch_lengths) - patch_lengths
-    places = _spread(begins, len(owner))
+        return entries
+    patch_starts = np.cumsum(patch_lengths) - patch_lengths
+    places = _spread(patch_starts, len(person))
     valid = np.arange(places.shape[1]) < patch_lengths[:, None]
     place = np.empty_like(sequence)
     np.put_along_axis(place, sequence, np.flatnonzero(valid)[None], 1)
-    return out | {
+    return entries | {
         "patch_slots": sequence[:, places],
         "patch_valid": None if valid.all() else valid,
         "patch_place": place,
@@ -277,14 +277,14 @@ def hilbert(cells: np.ndarray, bits: int = CELL_BITS) -> np.ndarray:
     """
     axes = list(cells.T)
     for bit in range(bits - 1, 0, -1):
-        low = (1 << bit) - 1
+        mask = (1 << bit) - 1
         for k in range(3):
             # where the bit is set the lower bits of x are inverted, elsewhere exchanged with those of axis k
             is_set = (axes[k] >> bit & 1).astype(bool)
-            exchanged = np.where(is_set, 0, (axes[0] ^ axes[k]) & low)
-            axes[0] = axes[0] ^ np.where(is_set, low, exchanged)
+            swap_bits = np.where(is_set, 0, (axes[0] ^ axes[k]) & mask)
+            axes[0] = axes[0] ^ np.where(is_set, mask, swap_bits)
             # for k = 0 nothing is exchanged: x ^ x is 0
-            axes[k] = axes[k] ^ exchanged
+            axes[k] = axes[k] ^ swap_bits
     axes[1] = axes[1] ^ axes[0]
     axes[2] = axes[2] ^ axes[1]
     flip = np.zeros_like(axes[0])

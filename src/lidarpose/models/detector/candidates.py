@@ -61,8 +61,8 @@ class Candidates:
         """Some of them."""
         ends = np.cumsum(self.sizes)
         columns = [np.zeros(0, int), *(np.arange(ends[k] - self.sizes[k], ends[k]) for k in rows)]
-        own = {name: values[rows] for name, values in vars(self).items() if name != "xyz"}
-        return Candidates(**own, xyz=self.xyz[:, np.concatenate(columns)])
+        arrays = {name: values[rows] for name, values in vars(self).items() if name != "xyz"}
+        return Candidates(**arrays, xyz=self.xyz[:, np.concatenate(columns)])
 
 
 class SceneIndex:
@@ -91,17 +91,17 @@ class SceneIndex:
         # relative to the corner, float32 holds millimeters of the widest map
         x, y = ((columns[i] - self._corner[i]).astype(np.float32) for i in (0, 1))
         row, column = ((values * np.float32(1 / self._cell)).astype(np.int32) for values in (x, y))
-        flat = row * self._shape[1] + column
-        self._maps = _draw_maps(flat, heights, self._shape)
+        all_cells = row * self._shape[1] + column
+        self._maps = _draw_maps(all_cells, heights, self._shape)
         # what lies high above everybody is context alone
-        used = np.flatnonzero((heights > _USED[0]) & (heights < _USED[1]))
+        used_rows = np.flatnonzero((heights > _USED[0]) & (heights < _USED[1]))
         z = columns[2].astype(np.float32)
         # in an order of their own: thinned in the file's, beam after beam, whole beams would go
-        used = used[np.argsort(_scrambled(x[used], y[used], z[used]), kind="stable")]
-        cells = flat[used]
+        used_rows = used_rows[np.argsort(_scrambled(x[used_rows], y[used_rows], z[used_rows]), kind="stable")]
+        cells = all_cells[used_rows]
         # very dense cells are thinned, so that no candidate costs more than so much
-        chosen, count = _thinned(np.bincount(cells, minlength=self._shape[0] * self._shape[1]), _MOST_IN_CELL)
-        self._order = used[_order(cells)][chosen]
+        selection, count = _thinned(np.bincount(cells, minlength=self._shape[0] * self._shape[1]), _MOST_IN_CELL)
+        self._order = used_rows[_order(cells)][selection]
         self._x, self._y, self._z = x[self._order], y[self._order], z[self._order]
         self._start = np.concatenate([[0], np.cumsum(count)])
         self._image = None if self.origin is None else RangeImage(points, self.origin)
@@ -110,14 +110,14 @@ class SceneIndex:
         """Of each of centers (K, 2 or 3) m the rows of the scan's points at a person's heights within `radius` m."""
         if not len(centers):
             return []
-        near, _, count = self._near(np.asarray(centers, float), radius)
-        return np.split(self._order[near], np.cumsum(count)[:-1])
+        sorted_rows, _, count = self._near(np.asarray(centers, float), radius)
+        return np.split(self._order[sorted_rows], np.cumsum(count)[:-1])
 
     def candidates(self, centers: np.ndarray) -> Candidates:
         """Those at centers (K, 3) m: x, y, and z of the ground there."""
         parts = list(self.pieces(centers, MARGIN)) or [self._cut(np.zeros((0, 3)), MARGIN)]
         columns = {name: [vars(part)[name] for part in parts] for name in vars(parts[0])}
-        return Candidates(**{name: np.concatenate(own, axis=int(name == "xyz")) for name, own in columns.items()})
+        return Candidates(**{name: np.concatenate(arrays, axis=int(name == "xyz")) for name, arrays in columns.items()})
 
     def pieces(self, centers: np.ndarray, margin: int = 0) -> Iterator[Candidates]:
         """Those at centers (K, 3) m, at most `CHUNK` at a time, which have no more than so many points to look at
@@ -125,9 +125,9 @@ class SceneIndex:
         centers = np.asarray(centers, float)
         for start in range(0, len(centers), CHUNK):
             piece = centers[start : start + CHUNK]
-            number = self._runs(piece[:, :2] - self._corner, RADIUS)[2].sum()
-            for own in np.array_split(piece, min(len(piece), 1 + 2 * number // _MOST_AT_ONCE)):
-                yield self._cut(own, margin)
+            point_count = self._runs(piece[:, :2] - self._corner, RADIUS)[2].sum()
+            for part in np.array_split(piece, min(len(piece), 1 + 2 * point_count // _MOST_AT_ONCE)):
+                yield self._cut(part, margin)
 
     def yaws(self, centers: np.ndarray) -> np.ndarray:
         """Of the view frames' x at centers (K, 2 or 3) m, (K,) rad."""
@@ -137,14 +137,14 @@ class SceneIndex:
 
     def _cut(self, centers: np.ndarray, margin: int) -> Candidates:
         yaw, distance, sensor_height = self.yaws(centers), np.zeros(len(centers)), np.zeros(len(centers))
-        ranges = np.zeros((len(centers), RANGE_CHANNELS, SLICES + 2 * margin, SIDE + 2 * margin), np.uint8)
+        range_views = np.zeros((len(centers), RANGE_CHANNELS, SLICES + 2 * margin, SIDE + 2 * margin), np.uint8)
         if self._image is not None and self.origin is not None:
-            away = centers - self.origin
-            distance, sensor_height = np.maximum(np.hypot(away[:, 0], away[:, 1]), _LEAST_DISTANCE), -away[:, 2]
-            ranges = self._image.views(away, yaw, distance, margin)
+            offset = centers - self.origin
+            distance, sensor_height = np.maximum(np.hypot(offset[:, 0], offset[:, 1]), _LEAST_DISTANCE), -offset[:, 2]
+            range_views = self._image.views(offset, yaw, distance, margin)
         _, (x, y, z), count = self._near(centers, RADIUS, (BOTTOM - _ROOM, BOTTOM + SLICES * CELL + _ROOM))
-        chosen, sizes = _thinned(count, _MOST_POINTS)
-        x, y, z = x[chosen], y[chosen], z[chosen]
+        selection, sizes = _thinned(count, _MOST_POINTS)
+        x, y, z = x[selection], y[selection], z[selection]
         c, s = (np.repeat(values.astype(np.float32), sizes) for values in (np.cos(yaw), np.sin(yaw)))
         xyz = np.stack([x * c + y * s, y * c - x * s, z])
         xyz *= np.float32(1 / UNIT)
@@ -156,7 +156,7 @@ class SceneIndex:
             count=count,
             sizes=sizes,
             xyz=np.rint(xyz, out=xyz).astype(np.int16),
-            range_views=ranges,
+            range_views=range_views,
             contexts=self._context(centers, yaw),
         )
 
@@ -171,16 +171,19 @@ class SceneIndex:
         owner, start, size = self._runs(centers[:, :2] - self._corner, radius)
         row = np.arange(size.sum()) + np.repeat(start - (np.cumsum(size) - size), size)
         sizes = np.bincount(owner, size, minlength=len(centers)).astype(np.int64)
-        middle = (centers - [*self._corner, 0.0][: centers.shape[1]]).astype(np.float32).T
-        x, y = (values[row] - np.repeat(own, sizes) for values, own in zip((self._x, self._y), middle, strict=False))
-        inside = np.flatnonzero(x * x + y * y < np.float32(radius**2))
-        local = [x, y]
+        center_axes = (centers - [*self._corner, 0.0][: centers.shape[1]]).astype(np.float32).T
+        x, y = (
+            values[row] - np.repeat(center, sizes)
+            for values, center in zip((self._x, self._y), center_axes, strict=False)
+        )
+        inside_index = np.flatnonzero(x * x + y * y < np.float32(radius**2))
+        offsets = [x, y]
         if heights is not None:
-            z = self._z[row[inside]] - np.repeat(middle[2], sizes)[inside]
-            between = (z > heights[0]) & (z < heights[1])
-            inside, local = inside[between], [x, y, z[between]]
-        local[:2] = x[inside], y[inside]
-        return row[inside], local, np.diff(np.searchsorted(inside, np.cumsum(sizes)), prepend=0)
+            z = self._z[row[inside_index]] - np.repeat(center_axes[2], sizes)[inside_index]
+            is_between = (z > heights[0]) & (z < heights[1])
+            inside_index, offsets = inside_index[is_between], [x, y, z[is_between]]
+        offsets[:2] = x[inside_index], y[inside_index]
+        return row[inside_index], offsets, np.diff(np.searchsorted(inside_index, np.cumsum(sizes)), prepend=0)
 
     def _runs(self, place: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Runs of sorted rows in the cells around places (K, 2) m from the corner: (owner, first row, length)."""
@@ -188,11 +191,11 @@ class SceneIndex:
         high = np.floor((place + radius) / self._cell).astype(np.int64)
         low, high = np.maximum(low, 0), np.minimum(high, np.array(self._shape) - 1)
         # one for each row of the square of cells: its points lie one after the other
-        lines = np.maximum(high[:, 0] - low[:, 0] + 1, 0)
-        lines[(high < low).any(1)] = 0
-        owner = np.repeat(np.arange(len(place)), lines)
-        line = np.arange(len(owner)) - np.repeat(np.cumsum(lines) - lines, lines)
-        base = (low[owner, 0] + line) * self._shape[1]
+        row_counts = np.maximum(high[:, 0] - low[:, 0] + 1, 0)
+        row_counts[(high < low).any(1)] = 0
+        owner = np.repeat(np.arange(len(place)), row_counts)
+        row = np.arange(len(owner)) - np.repeat(np.cumsum(row_counts) - row_counts, row_counts)
+        base = (low[owner, 0] + row) * self._shape[1]
         start, end = self._start[base + low[owner, 1]], self._start[base + high[owner, 1] + 1]
         return owner, start, end - start
 
@@ -204,32 +207,32 @@ class SceneIndex:
         place = centers[:, :2] - self._corner
         i = np.floor((place[:, :1] + c * x - s * y) / self._cell).astype(np.int64)
         j = np.floor((place[:, 1:] + s * x + c * y) / self._cell).astype(np.int64)
-        inside = (i >= 0) & (j >= 0) & (i < self._shape[0]) & (j < self._shape[1])
+        is_inside = (i >= 0) & (j >= 0) & (i < self._shape[0]) & (j < self._shape[1])
         # outside is the cell after the last, which is empty
-        cells = self._maps[np.where(inside, i * self._shape[1] + j, len(self._maps) - 1)]
-        values = np.moveaxis(cells.view(np.uint8).reshape(*inside.shape, CONTEXT_CHANNELS), -1, 1)
+        cells = self._maps[np.where(is_inside, i * self._shape[1] + j, len(self._maps) - 1)]
+        values = np.moveaxis(cells.view(np.uint8).reshape(*is_inside.shape, CONTEXT_CHANNELS), -1, 1)
         return np.ascontiguousarray(values).reshape(-1, CONTEXT_CHANNELS, CONTEXT_SIDE, CONTEXT_SIDE)
 
 
-def _thinned(count: np.ndarray, most: int) -> tuple[slice | np.ndarray, np.ndarray]:
-    """Which rows stay where groups of `count` (K,) rows, one after the other, keep `most` each; how many each keeps.
+def _thinned(count: np.ndarray, limit: int) -> tuple[slice | np.ndarray, np.ndarray]:
+    """Which rows stay where groups of `count` (K,) rows, one after the other, keep `limit` each; how many each keeps.
 
     Every so manieth row stays of a group that has too many.
     """
-    if count.max(initial=0) <= most:
+    if count.max(initial=0) <= limit:
         return slice(None), count
-    number = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    share = np.repeat(np.minimum(1.0, most / np.maximum(count, 1)), count)
-    chosen = np.floor((number + 1) * share) > np.floor(number * share)
-    ends = np.concatenate([[0], np.cumsum(chosen)])[np.cumsum(count)]
-    return np.flatnonzero(chosen), np.diff(ends, prepend=0)
+    rank = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    share = np.repeat(np.minimum(1.0, limit / np.maximum(count, 1)), count)
+    is_kept = np.floor((rank + 1) * share) > np.floor(rank * share)
+    ends = np.concatenate([[0], np.cumsum(is_kept)])[np.cumsum(count)]
+    return np.flatnonzero(is_kept), np.diff(ends, prepend=0)
 
 
 def _scrambled(*columns: np.ndarray) -> np.ndarray:
     """(n,) uint16 without pattern, of each row of columns (n,) float32 the same wherever it stands."""
     factors = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)
-    mixed = sum(values.view(np.uint32) * np.uint32(factor) for values, factor in zip(columns, factors, strict=True))
-    return (np.asarray(mixed) >> 16).astype(np.uint16)
+    hashes = sum(values.view(np.uint32) * np.uint32(factor) for values, factor in zip(columns, factors, strict=True))
+    return (np.asarray(hashes) >> 16).astype(np.uint16)
 
 
 def _order(cells: np.ndarray) -> np.ndarray:
@@ -243,18 +246,18 @@ def _order(cells: np.ndarray) -> np.ndarray:
 def _draw_maps(cells: np.ndarray, heights: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """The context's channels of points in flat cells (n,), heights (n,) m: four bytes (cells + 1,) each, the last 0."""
     size = shape[0] * shape[1]
-    highest, count, near = np.zeros((3, size + 1), np.float32)
-    filled = np.zeros(size + 1, np.uint8)
+    highest, count, near_count = np.zeros((3, size + 1), np.float32)
+    slice_bits = np.zeros(size + 1, np.uint8)
     np.maximum.at(highest, cells, heights)
     np.add.at(count, cells, np.float32(1))
-    np.add.at(near, cells[np.abs(heights) < _NEAR_GROUND], np.float32(1))
+    np.add.at(near_count, cells[np.abs(heights) < _NEAR_GROUND], np.float32(1))
     band = np.flatnonzero((heights > _BAND[0]) & (heights < _BAND[1]))
     level = ((heights[band] - _BAND[0]) * (_BAND_SLICES / (_BAND[1] - _BAND[0]))).astype(np.uint8)
-    np.bitwise_or.at(filled, cells[band], np.left_shift(np.uint8(1), np.minimum(level, _BAND_SLICES - 1)))
+    np.bitwise_or.at(slice_bits, cells[band], np.left_shift(np.uint8(1), np.minimum(level, _BAND_SLICES - 1)))
     maps = np.empty((size + 1, CONTEXT_CHANNELS), np.uint8)
     maps[:, 0] = np.minimum(highest * (255 / _TALL), 255)
-    maps[:, 1] = np.bitwise_count(filled) * (255 / _BAND_SLICES)
-    maps[:, 2], maps[:, 3] = log_bytes(count), log_bytes(near)
+    maps[:, 1] = np.bitwise_count(slice_bits) * (255 / _BAND_SLICES)
+    maps[:, 2], maps[:, 3] = log_bytes(count), log_bytes(near_count)
     return maps.view(np.uint32).ravel()
 
 
@@ -271,9 +274,9 @@ def suppress_near(centers: np.ndarray, strength: np.ndarray, radius: float) -> n
 
 def _that_stay(count: int, pairs: np.ndarray) -> np.ndarray:
     """(count,) bool, by falling strength: who is in no pair (P, 2), ascending, with a stronger one that stays."""
-    stays = np.ones(count, bool)
+    is_kept = np.ones(count, bool)
     # in the order of the stronger one: whether it stays is known when its pairs come
     for stronger, weaker in pairs.tolist():
-        if stays[stronger]:
-            stays[weaker] = False
-    return stays
+        if is_kept[stronger]:
+            is_kept[weaker] = False
+    return is_kept

@@ -101,10 +101,9 @@ class Detector:
             All candidates after suppression, whatever their score.
         """
         columns = list(np.asarray(points).T)
-        rows = np.arange(len(points))
         if origin is not None and max_range is not None:
-            squared = (columns[0] - origin[0]) ** 2 + (columns[1] - origin[1]) ** 2
-            rows = np.flatnonzero(squared < (max_range + _BEYOND) ** 2)
+            square_distance = (columns[0] - origin[0]) ** 2 + (columns[1] - origin[1]) ** 2
+            rows = np.flatnonzero(square_distance < (max_range + _BEYOND) ** 2)
         else:
             rows = np.flatnonzero(_is_near_others(columns[0]) & _is_near_others(columns[1]))
         if len(rows) < len(points):
@@ -115,8 +114,8 @@ class Detector:
         has_ground = ground is not None
         ground = ground or without_ground(points, origin)
         heights = heights_above(points, ground)
-        searched = slice(None) if moving is None else np.asarray(moving, bool)[rows]
-        centers = propose(points[searched], ground, heights=heights[searched])
+        selection = slice(None) if moving is None else np.asarray(moving, bool)[rows]
+        centers = propose(points[selection], ground, heights=heights[selection])
         if origin is not None and max_range is not None:
             centers = centers[np.hypot(centers[:, 0] - origin[0], centers[:, 1] - origin[1]) < max_range]
         scene = SceneIndex(points, ground, origin, heights=heights)
@@ -132,17 +131,17 @@ class Detector:
         outputs = np.concatenate([np.zeros((0, 6)), *scores])
         centers, heights = predicted_boxes(places, scene.yaws(places), outputs)
         logit = outputs[:, 0]
-        kept = suppress_near(centers, logit, SAME)[:limit]
-        mounted = sigmoid(outputs[kept, 5])
+        indices = suppress_near(centers, logit, SAME)[:limit]
+        mounted = sigmoid(outputs[indices, 5])
         side = np.where(mounted > 0.5, _MOUNTED_SIDE, _SIDE)
         return Detections(
-            centers=centers[kept],
-            sizes=np.stack([side, side, heights[kept] + _ROOM], 1),
-            yaws=np.zeros(len(kept)),
-            logit=logit[kept],
-            score=self.probability(logit[kept]),
+            centers=centers[indices],
+            sizes=np.stack([side, side, heights[indices] + _ROOM], 1),
+            yaws=np.zeros(len(indices)),
+            logit=logit[indices],
+            score=self.probability(logit[indices]),
             mounted=mounted,
-            rows=[scan_rows[own] for own in scene.rows(centers[kept], _OWN_RADIUS)],
+            rows=[scan_rows[rows] for rows in scene.rows(centers[indices], _OWN_RADIUS)],
             has_ground=has_ground,
         )
 
@@ -173,9 +172,9 @@ def _is_near_others(values: np.ndarray) -> np.ndarray:
     if not len(values):
         return np.zeros(0, bool)
     # enough of them tell
-    some = values[:: -(-len(values) // 20_000)]
-    low = np.percentile(some, _NEARLY_ALL[0], method="higher")
-    high = np.percentile(some, _NEARLY_ALL[1], method="lower")
+    sample = values[:: -(-len(values) // 20_000)]
+    low = np.percentile(sample, _NEARLY_ALL[0], method="higher")
+    high = np.percentile(sample, _NEARLY_ALL[1], method="lower")
     return (values > low - _STRAY) & (values < high + _STRAY)
 
 

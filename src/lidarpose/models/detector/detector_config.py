@@ -40,5 +40,5 @@ class DetectorConfig(Config):
 
     def shapes(self, candidates: int) -> dict[str, tuple[int, ...]]:
         """The shape of each of `INPUTS` for so many candidates."""
-        own = (self.fine, self.range_view, self.context, (self.scalars,))
-        return {name: (candidates, *shape) for name, shape in zip(INPUTS, own, strict=True)}
+        input_shapes = (self.fine, self.range_view, self.context, (self.scalars,))
+        return {name: (candidates, *shape) for name, shape in zip(INPUTS, input_shapes, strict=True)}

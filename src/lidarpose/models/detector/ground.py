@@ -27,8 +27,9 @@ _SUPPORT, _SUPPORT_ROOM, _SUPPORT_SLOPE = 3, 0.1, 0.15
 _NEAR_PLANE = 0.25
 # slopes of the plane: the steepest, and the width of the bins in which the commonest is looked for
 _STEEPEST, _SLOPE_BIN = 0.9, 0.06
-# cells within so many m count most for the plane, which must lie so far below the sensor, m
-_NEAR, _LEAST_BELOW = 10.0, 0.2
+# cells within so many m count most for the plane; its cells must lie so far below the sensor, m, and the plane that is
+# fitted to them may lie no farther than that above it
+_NEAR, _BELOW_SENSOR = 10.0, 0.1
 # how many of the commonest slopes are tried, and the slope that is half as likely as none
 _SLOPES, _COMMON_SLOPE = 6, 0.5
 # a tilt is believed where so many cells and such a share lie on its plane, and no more than this below it
@@ -55,17 +56,17 @@ class Ground:
     def at(self, xy: np.ndarray) -> np.ndarray:
         """Height (n,) float32 m of the ground at xy (n, 2) m: bilinear, outside as at the border."""
         (rows, columns), xy = self.heights.shape, np.asarray(xy)
-        at_x, at_y = (
+        x, y = (
             np.clip((xy[:, i] - (self.corner[i] + self.cell / 2)) / self.cell, 0, count - 1).astype(np.float32)
             for i, count in enumerate((rows, columns))
         )
-        i, j = (np.minimum(at.astype(np.int32), max(n - 2, 0)) for at, n in ((at_x, rows), (at_y, columns)))
-        u, v = at_x - i, at_y - j
-        flat = self.heights.ravel()
-        first = i * columns + j
-        down, right = (columns if rows > 1 else 0), (1 if columns > 1 else 0)
-        near = flat[first] * (1 - v) + flat[first + right] * v
-        far = flat[first + down] * (1 - v) + flat[first + down + right] * v
+        i, j = (np.minimum(position.astype(np.int32), max(n - 2, 0)) for position, n in ((x, rows), (y, columns)))
+        u, v = x - i, y - j
+        flat_heights = self.heights.ravel()
+        index = i * columns + j
+        row_step, column_step = (columns if rows > 1 else 0), (1 if columns > 1 else 0)
+        near = flat_heights[index] * (1 - v) + flat_heights[index + column_step] * v
+        far = flat_heights[index + row_step] * (1 - v) + flat_heights[index + row_step + column_step] * v
         return near * (1 - u) + far * u
 
 
@@ -103,29 +104,29 @@ def estimate_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Gro
     if np.abs(slope).max() > _SLOPE_BIN:
         # the lowest points of a cell lie at its lower side: look again along the plane
         points = np.asarray(points)
-        flat = np.column_stack([points[:, :2], points[:, 2] - points[:, :2] @ slope])
-        floors = _lowest(flat, origin) or floors
+        leveled_points = np.column_stack([points[:, :2], points[:, 2] - points[:, :2] @ slope])
+        floors = _lowest(leveled_points, origin) or floors
     else:
         x, y = floors.positions()
         floors = replace(floors, heights=floors.heights - (slope[0] * x + slope[1] * y))
-    rest = floors.heights - height
-    is_floor = _is_supported(rest) | (np.abs(rest) < _NEAR_PLANE)
+    residual = floors.heights - height
+    is_floor = _is_supported(residual) | (np.abs(residual) < _NEAR_PLANE)
     x, y = floors.positions()
-    is_floor &= _is_low(np.where(is_floor, rest, np.nan), _CONE_SLOPE)
+    is_floor &= _is_low(np.where(is_floor, residual, np.nan), _CONE_SLOPE)
     if origin is not None:
         # what carries the sensor has a hole around it, in which a steeper cone reaches over hood and roof
-        near = np.hypot(x - origin[0], y - origin[1]) < _OWN_REACH
-        is_floor &= ~near | _is_low(np.where(is_floor, rest, np.nan), _OWN_SLOPE)
-    is_seen = np.isfinite(rest) & ((rest < _TALL) if origin is None else (floors.heights < origin[2]))
+        is_near = np.hypot(x - origin[0], y - origin[1]) < _OWN_REACH
+        is_floor &= ~is_near | _is_low(np.where(is_floor, residual, np.nan), _OWN_SLOPE)
+    is_seen = np.isfinite(residual) & ((residual < _TALL) if origin is None else (floors.heights < origin[2]))
     if is_floor.sum() < max(_LEAST_CELLS, _LEAST_SHARE * is_seen.sum()):
         return None
-    rest = np.where(is_floor, rest, np.nan)
-    surface = _fill(rest)
+    residual = np.where(is_floor, residual, np.nan)
+    surface = _fill(residual)
     # nothing stands below the ground: somebody's feet where no ground is seen
     depth = surface - (floors.heights - height)
     is_lower = ~is_floor & (depth > _LEAST_DEPTH) & (depth < _MOST_DEPTH) & (floors.counts >= _SOLID)
     if is_lower.any():
-        surface = _fill(np.where(is_lower, floors.heights - height, rest))
+        surface = _fill(np.where(is_lower, floors.heights - height, residual))
     heights = surface + (slope[0] * x + slope[1] * y + height)
     return Ground(corner=floors.corner, heights=heights.astype(np.float32))
 
@@ -137,8 +138,8 @@ def without_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Grou
         return Ground(corner=np.zeros(2), heights=np.zeros((1, 1), np.float32))
     heights = np.where(np.isnan(floors.heights), np.inf, floors.heights)
     heights = _spread_minimum(heights, 0.0, 2)
-    middle = np.median(heights[np.isfinite(heights)])
-    heights = _fill(np.where(np.isfinite(heights), heights - middle, np.nan)) + middle
+    median = np.median(heights[np.isfinite(heights)])
+    heights = _fill(np.where(np.isfinite(heights), heights - median, np.nan)) + median
     return Ground(corner=floors.corner, heights=heights.astype(np.float32))
 
 
@@ -149,32 +150,32 @@ def estimate_up(points: np.ndarray, origin: np.ndarray | None = None) -> np.ndar
     points (n, 3) m, z about up. None too where there is no ground to tell by.
     """
     upright = np.array([0.0, 0.0, 1.0])
-    up, rest, R_level_input = upright, np.zeros(0), np.eye(3)
+    up, residual, R_level_input = upright, np.zeros(0), np.eye(3)
     if not len(points):
         return None
     middle = np.median(points, axis=0) if origin is None else np.asarray(origin, float)
     center = None if origin is None else np.zeros(3)
-    own = np.stack([points[:, i] - middle[i] for i in range(3)])
-    leveled = own
+    centered_points = np.stack([points[:, i] - middle[i] for i in range(3)])
+    leveled_points = centered_points
     for _ in range(3):
-        floors = _lowest(leveled.T, center)
+        floors = _lowest(leveled_points.T, center)
         plane = None if floors is None else _common_plane(floors, center)
         if floors is None or plane is None:
             return None
         x, y = floors.positions()
-        rest = (floors.heights - (plane[0] * x + plane[1] * y + plane[2]))[np.hypot(x, y) < 2 * _NEAR]
+        residual = (floors.heights - (plane[0] * x + plane[1] * y + plane[2]))[np.hypot(x, y) < 2 * _NEAR]
         normal = np.array([-plane[0], -plane[1], 1.0]) @ R_level_input
         normal /= np.linalg.norm(normal)
-        moved, up = np.arccos(np.clip(normal @ up, -1, 1)), normal
+        angle, up = np.arccos(np.clip(normal @ up, -1, 1)), normal
         if np.arccos(np.clip(up[2], -1, 1)) < np.radians(TILTED):
             return None
-        if moved < np.radians(2):
+        if angle < np.radians(2):
             break
         R_level_input = rotation_between(up, upright)
-        leveled = R_level_input @ own
-    rest = rest[np.isfinite(rest)]
-    on_it = np.count_nonzero(np.abs(rest) < _NEAR_PLANE)
-    if on_it < max(_TILT_CELLS, _TILT_SHARE * len(rest)) or np.mean(rest < -2 * _NEAR_PLANE) > _TILT_BELOW:
+        leveled_points = R_level_input @ centered_points
+    residual = residual[np.isfinite(residual)]
+    inliers = np.count_nonzero(np.abs(residual) < _NEAR_PLANE)
+    if inliers < max(_TILT_CELLS, _TILT_SHARE * len(residual)) or np.mean(residual < -2 * _NEAR_PLANE) > _TILT_BELOW:
         return None
     return up
 
@@ -186,12 +187,12 @@ def _lowest(points: np.ndarray, origin: np.ndarray | None, *, least: int = 2) ->
     x, y, z = (np.asarray(points)[:, i] for i in range(3))
     middle = np.array([np.median(x), np.median(y)]) if origin is None else np.asarray(origin, float)[:2]
     reach = _MOST_CELLS / 2 * CELL
-    inside = (np.abs(x - middle[0]) < reach) & (np.abs(y - middle[1]) < reach)
+    is_inside = (np.abs(x - middle[0]) < reach) & (np.abs(y - middle[1]) < reach)
     # heights that no ground around has
-    low, high = np.quantile(z[inside][:: max(1, len(z) // 20_000)], [0.002, 0.98]) if inside.any() else (0, 0)
-    inside &= (z >= low - 3) & (z <= high + 1)
-    if not inside.all():
-        x, y, z = x[inside], y[inside], z[inside]
+    low, high = np.quantile(z[is_inside][:: max(1, len(z) // 20_000)], [0.002, 0.98]) if is_inside.any() else (0, 0)
+    is_inside &= (z >= low - 3) & (z <= high + 1)
+    if not is_inside.all():
+        x, y, z = x[is_inside], y[is_inside], z[is_inside]
     if not len(x):
         return None
     corner = np.floor(np.array([x.min(), y.min()], float) / CELL) * CELL
@@ -202,17 +203,17 @@ def _lowest(points: np.ndarray, origin: np.ndarray | None, *, least: int = 2) ->
     for _ in range(_MOST_ALONE):
         lowest = np.full(heights.size, np.inf)
         np.minimum.at(lowest, cell, z)
-        above = z - lowest[cell]
-        number = np.bincount(cell[above < 2 * _BIN], minlength=heights.size)
-        has_floor = number >= least
-        first = (above < _BIN) & has_floor[cell]
-        total = np.bincount(cell[first], z[first], minlength=heights.size)
-        in_first = np.bincount(cell[first], minlength=heights.size)
-        heights[has_floor] = (total / np.maximum(in_first, 1))[has_floor]
-        counts[has_floor] = number[has_floor]
+        relative_z = z - lowest[cell]
+        point_counts = np.bincount(cell[relative_z < 2 * _BIN], minlength=heights.size)
+        has_floor = point_counts >= least
+        is_lowest = (relative_z < _BIN) & has_floor[cell]
+        z_sum = np.bincount(cell[is_lowest], z[is_lowest], minlength=heights.size)
+        lowest_counts = np.bincount(cell[is_lowest], minlength=heights.size)
+        heights[has_floor] = (z_sum / np.maximum(lowest_counts, 1))[has_floor]
+        counts[has_floor] = point_counts[has_floor]
         # what lies alone is left out, and the next higher points of its cell are tried
-        rest = ~has_floor[cell] & (above >= 2 * _BIN)
-        cell, z = cell[rest], z[rest]
+        is_higher = ~has_floor[cell] & (relative_z >= 2 * _BIN)
+        cell, z = cell[is_higher], z[is_higher]
         if not len(z):
             break
     if not counts.any():
@@ -223,14 +224,15 @@ def _lowest(points: np.ndarray, origin: np.ndarray | None, *, least: int = 2) ->
 def _common_plane(floors: _Floors, origin: np.ndarray | None) -> np.ndarray | None:
     """(a, b, c) of the plane z = a x + b y + c that most floors share, the nearer ones before all.
 
-    None where floors share none. A plane must pass below the sensor at `origin` (3,) m, where that is known.
+    None where floors share none. A plane passes below the sensor at `origin` (3,) m, where that is known, give or
+    take `_BELOW_SENSOR`.
     """
     h = floors.heights
     x, y = (np.broadcast_to(values, h.shape) for values in floors.positions())
     middle = np.array([np.nanmedian(np.where(np.isfinite(h), v, np.nan)) for v in (x, y)]) if origin is None else origin
     x, y = x - middle[0], y - middle[1]
     weight = 1 / (1 + (x**2 + y**2) / _NEAR**2)
-    highest = np.inf if origin is None else origin[2] - _LEAST_BELOW / 2
+    max_height = np.inf if origin is None else origin[2] - _BELOW_SENSOR
     planes, weights = [np.zeros((0, 3))], [np.zeros(0)]
     for lag in (2, 4):
         for sign_x, sign_y in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
@@ -240,9 +242,9 @@ def _common_plane(floors: _Floors, origin: np.ndarray | None) -> np.ndarray | No
             a, b = sign_x * a / (lag * CELL), sign_y * b / (lag * CELL)
             plane = np.stack([a, b, z[corner] - a * u[corner] - b * v[corner]], -1)
             # false too where a cell is unknown
-            fits = (np.abs(plane[..., :2]) < _STEEPEST).all(-1) & (plane[..., 2] < highest)
-            planes.append(plane[fits])
-            weights.append(w[corner][fits])
+            is_valid = (np.abs(plane[..., :2]) < _STEEPEST).all(-1) & (plane[..., 2] < max_height)
+            planes.append(plane[is_valid])
+            weights.append(w[corner][is_valid])
     planes_all, weights_all = np.concatenate(planes), np.concatenate(weights)
     if len(planes_all) < 3:
         return None
@@ -250,34 +252,36 @@ def _common_plane(floors: _Floors, origin: np.ndarray | None) -> np.ndarray | No
     # a sum may be rounded up to the last bin's end
     row, column = ((planes_all[:, :2] + _STEEPEST) * (bins / (2 * _STEEPEST))).astype(np.int64).clip(max=bins - 1).T
     counts = _box_sum(np.bincount(row * bins + column, weights_all, minlength=bins * bins).reshape(bins, bins), 1)
-    likeliest = np.argsort(-counts, axis=None)[: _SLOPES * 9 : 9]
-    peaks = np.stack(np.unravel_index(likeliest[counts.flat[likeliest] > 0], counts.shape), 1)
+    top_bins = np.argsort(-counts, axis=None)[: _SLOPES * 9 : 9]
+    peaks = np.stack(np.unravel_index(top_bins[counts.flat[top_bins] > 0], counts.shape), 1)
     slopes = np.concatenate([(peaks + 0.5) * (2 * _STEEPEST / bins) - _STEEPEST, np.zeros((1, 2))])
-    known = np.isfinite(h)
-    x, y, z, weight = x[known], y[known], h[known], weight[known]
+    is_known = np.isfinite(h)
+    x, y, z, weight = x[is_known], y[is_known], h[is_known], weight[is_known]
     basis = np.stack([x, y, np.ones_like(x)], 1)
-    scores, choices = [], []
+    scores, candidate_planes = [], []
     for slope in slopes:
-        rest = z - basis[:, :2] @ slope
-        below = rest < highest
-        if below.any():
-            choices.append(np.array([*slope, _lowest_mode(rest[below], weight[below])]))
-            rest = rest - choices[-1][2]
+        residual = z - basis[:, :2] @ slope
+        is_below = residual < max_height
+        if is_below.any():
+            candidate_planes.append(np.array([*slope, _lowest_mode(residual[is_below], weight[is_below])]))
+            residual = residual - candidate_planes[-1][2]
             # much that lies below says that it is no ground
-            scores.append(weight[np.abs(rest) < _NEAR_PLANE].sum() - weight[rest < -2 * _NEAR_PLANE].sum())
+            scores.append(weight[np.abs(residual) < _NEAR_PLANE].sum() - weight[residual < -2 * _NEAR_PLANE].sum())
             scores[-1] /= 1 + slope @ slope / _COMMON_SLOPE**2
     if not scores:
         return None
-    plane = choices[int(np.argmax(scores))]
-    for room in (0.6, 0.35, 0.25, 0.25):
-        rest = z - basis @ plane
-        own = np.where(np.abs(rest) < room, weight, 0.0)
-        if np.count_nonzero(own) < 4:
+    plane = candidate_planes[int(np.argmax(scores))]
+    for tolerance in (0.6, 0.35, 0.25, 0.25):
+        residual = z - basis @ plane
+        inlier_weight = np.where(np.abs(residual) < tolerance, weight, 0.0)
+        if np.count_nonzero(inlier_weight) < 4:
             return None
         # a weak pull to the plane so far where cells lie on a line
-        pull = np.diag([1.0, 1.0, 1e-6])
-        plane = plane + np.linalg.solve((basis * own[:, None]).T @ basis + pull, basis.T @ (own * rest))
-    if plane[2] > highest + _LEAST_BELOW:
+        ridge = np.diag([1.0, 1.0, 1e-6])
+        plane = plane + np.linalg.solve(
+            (basis * inlier_weight[:, None]).T @ basis + ridge, basis.T @ (inlier_weight * residual)
+        )
+    if plane[2] > max_height + 2 * _BELOW_SENSOR:
         return None
     return plane - [0, 0, plane[:2] @ middle[:2]]
 
@@ -287,8 +291,8 @@ def _lowest_mode(values: np.ndarray, weights: np.ndarray) -> float:
     step = 0.2
     start = values.min()
     counts = np.bincount(((values - start) / step).astype(np.int64), weights)
-    smooth = np.convolve(counts, [1, 1], "full")[1:] if len(counts) > 1 else counts
-    return float(start + step * (np.flatnonzero(smooth >= 0.6 * smooth.max())[0] + 1))
+    pair_counts = np.convolve(counts, [1, 1], "full")[1:] if len(counts) > 1 else counts
+    return float(start + step * (np.flatnonzero(pair_counts >= 0.6 * pair_counts.max())[0] + 1))
 
 
 def _is_supported(heights: np.ndarray) -> np.ndarray:
@@ -299,16 +303,16 @@ def _is_supported(heights: np.ndarray) -> np.ndarray:
     for i in range(-2, 3):
         for j in range(-2, 3):
             if i or j:
-                other = padded[2 + i : 2 + i + rows, 2 + j : 2 + j + columns]
-                support += np.abs(other - heights) < _SUPPORT_ROOM + _SUPPORT_SLOPE * CELL * np.hypot(i, j)
+                neighbor = padded[2 + i : 2 + i + rows, 2 + j : 2 + j + columns]
+                support += np.abs(neighbor - heights) < _SUPPORT_ROOM + _SUPPORT_SLOPE * CELL * np.hypot(i, j)
     return support >= _SUPPORT
 
 
 def _is_low(heights: np.ndarray, slope: float) -> np.ndarray:
     """Cells (X, Y) that no neighbor's cone lies below."""
-    known = np.where(np.isnan(heights), np.inf, heights)
-    cone = _spread_minimum(known, slope * CELL, _CONE_REACH)
-    return known <= cone + _CONE_ROOM
+    finite_heights = np.where(np.isnan(heights), np.inf, heights)
+    cone = _spread_minimum(finite_heights, slope * CELL, _CONE_REACH)
+    return finite_heights <= cone + _CONE_ROOM
 
 
 def _spread_minimum(heights: np.ndarray, rise: float, reach: int) -> np.ndarray:
@@ -319,28 +323,28 @@ def _spread_minimum(heights: np.ndarray, rise: float, reach: int) -> np.ndarray:
     lowest = heights.copy()
     step = 1
     while step <= reach:
-        before, straight, aslant = lowest.copy(), rise * step, rise * step * np.sqrt(2)
+        start_heights, straight, diagonal = lowest.copy(), rise * step, rise * step * np.sqrt(2)
         for i in (-step, 0, step):
             for j in (-step, 0, step):
-                to = tuple(np.s_[max(k, 0) : n + min(k, 0)] for k, n in zip((i, j), heights.shape, strict=True))
-                start = tuple(np.s_[max(-k, 0) : n + min(-k, 0)] for k, n in zip((i, j), heights.shape, strict=True))
+                dst = tuple(np.s_[max(k, 0) : n + min(k, 0)] for k, n in zip((i, j), heights.shape, strict=True))
+                src = tuple(np.s_[max(-k, 0) : n + min(-k, 0)] for k, n in zip((i, j), heights.shape, strict=True))
                 if step < min(heights.shape):
-                    np.minimum(lowest[to], before[start] + (aslant if i and j else straight), out=lowest[to])
+                    np.minimum(lowest[dst], start_heights[src] + (diagonal if i and j else straight), out=lowest[dst])
         step *= 2
     return lowest
 
 
 def _fill(heights: np.ndarray) -> np.ndarray:
     """Heights (X, Y) with NaN filled by means of ever larger squares around, in which 0 counts as one cell more."""
-    known = np.isfinite(heights)
-    values, weight = np.where(known, heights, 0.0), known.astype(float)
-    filled, reach = heights.copy(), 1
-    while np.isnan(filled).any():
+    is_known = np.isfinite(heights)
+    values, weight = np.where(is_known, heights, 0.0), is_known.astype(float)
+    filled_heights, reach = heights.copy(), 1
+    while np.isnan(filled_heights).any():
         count = _box_sum(weight, reach)
-        empty = np.isnan(filled) & (count > 0.5)
-        filled[empty] = _box_sum(values, reach)[empty] / (count[empty] + _PLANE_WEIGHT)
+        is_fillable = np.isnan(filled_heights) & (count > 0.5)
+        filled_heights[is_fillable] = _box_sum(values, reach)[is_fillable] / (count[is_fillable] + _PLANE_WEIGHT)
         reach *= 2
-    return filled
+    return filled_heights
 
 
 def _box_sum(values: np.ndarray, reach: int) -> np.ndarray:

@@ -17,11 +17,11 @@ _HEIGHT = 1.7
 class _Block(nn.Module):
     """A 3 x 3 convolution that halves the map, then a residual one that begins as the identity."""
 
-    def __init__(self, inside: int, outside: int):
+    def __init__(self, in_channels: int, out_channels: int):
         super().__init__()
-        self.down = nn.Conv2d(inside, outside, 3, stride=2, padding=1)
-        self.same = nn.Conv2d(outside, outside, 3, padding=1)
-        self.gain = nn.Parameter(torch.full((outside, 1, 1), 0.1))
+        self.down = nn.Conv2d(in_channels, out_channels, 3, stride=2, padding=1)
+        self.same = nn.Conv2d(out_channels, out_channels, 3, padding=1)
+        self.gain = nn.Parameter(torch.full((out_channels, 1, 1), 0.1))
 
     def forward(self, x: Tensor) -> Tensor:
         x = torch.relu(self.down(x))
@@ -33,18 +33,18 @@ class _Branch(nn.Module):
 
     def __init__(self, shape: tuple[int, int, int], stem: int, *levels: int):
         super().__init__()
-        inside, rows, columns = shape
+        in_channels, rows, columns = shape
         layers: list[nn.Module] = []
         if stem:
             # vertical structure first: rows of the input are channels
-            layers += [nn.Conv2d(inside, stem, 1), nn.ReLU()]
-            inside = stem
-        for outside in levels:
-            layers.append(_Block(inside, outside))
-            inside, rows, columns = outside, -(-rows // 2), -(-columns // 2)
+            layers += [nn.Conv2d(in_channels, stem, 1), nn.ReLU()]
+            in_channels = stem
+        for out_channels in levels:
+            layers.append(_Block(in_channels, out_channels))
+            in_channels, rows, columns = out_channels, -(-rows // 2), -(-columns // 2)
         self.layers = nn.Sequential(*layers)
-        self.placed = nn.Conv2d(inside, _PLACED, 1)
-        self.features = inside + _PLACED * rows * columns
+        self.placed = nn.Conv2d(in_channels, _PLACED, 1)
+        self.features = in_channels + _PLACED * rows * columns
 
     def forward(self, x: Tensor) -> Tensor:
         x = self.layers(x)

@@ -71,16 +71,16 @@ def columns(points: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.nda
     points (n, 3) m; heights (n,) m: theirs above the ground.
     """
     points = np.asarray(points)
-    band = np.flatnonzero((heights > LOW) & (heights < HIGH))
+    band_rows = np.flatnonzero((heights > LOW) & (heights < HIGH))
     # one after the other: numpy reduces long rows faster than pairs
-    x, y, heights = points[band, 0], points[band, 1], heights[band]
+    x, y, heights = points[band_rows, 0], points[band_rows, 1], heights[band_rows]
     places, features = [np.zeros((0, 2))], [np.zeros((0, FEATURES), np.float32)]
-    for corner, inner, rows in _tiles(x, y):
+    for corner, bounds, rows in _tiles(x, y):
         tile_places, tile_features = _peaks(x[rows] - corner[0], y[rows] - corner[1], heights[rows])
         tile_places = tile_places + corner
-        own = ((tile_places >= inner[0]) & (tile_places < inner[1])).all(1)
-        places.append(tile_places[own])
-        features.append(tile_features[own])
+        is_inside = ((tile_places >= bounds[0]) & (tile_places < bounds[1])).all(1)
+        places.append(tile_places[is_inside])
+        features.append(tile_features[is_inside])
     return np.concatenate(places), np.concatenate(features)
 
 
@@ -120,52 +120,52 @@ def _tiles(x: np.ndarray, y: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarra
     for i, j in np.unique(tile, axis=0):
         low = start + np.array([i, j]) * _TILE
         high = low + _TILE
-        inside = (x >= low[0] - _OVERLAP) & (x < high[0] + _OVERLAP)
-        inside &= (y >= low[1] - _OVERLAP) & (y < high[1] + _OVERLAP)
-        yield low - _OVERLAP, np.stack([low, high]), np.flatnonzero(inside)
+        is_inside = (x >= low[0] - _OVERLAP) & (x < high[0] + _OVERLAP)
+        is_inside &= (y >= low[1] - _OVERLAP) & (y < high[1] + _OVERLAP)
+        yield low - _OVERLAP, np.stack([low, high]), np.flatnonzero(is_inside)
 
 
 def _peaks(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Places (K, 2) m and features of a tile's columns. x, y (n,) m from its corner, heights (n,) m."""
     row, column = ((values * (1 / CELL)).astype(np.int32) + _MARGIN for values in (x, y))
     width = int(column.max()) + _MARGIN + 1
-    flat = row * width + column
+    point_cells = row * width + column
     # of each cell: points; the highest, and how far the lowest is below `_EMPTY`, m; what is looked at in turn
     count, top, depth, grid = _grids(4, (int(row.max()) + _MARGIN + 1) * width)
-    np.add.at(count, flat, np.float32(1))
-    np.maximum.at(top, flat, heights)
-    np.maximum.at(depth, flat, _EMPTY - heights)
+    np.add.at(count, point_cells, np.float32(1))
+    np.maximum.at(top, point_cells, heights)
+    np.maximum.at(depth, point_cells, _EMPTY - heights)
 
-    occupied = np.flatnonzero(count > 0)
-    _smooth(grid, occupied, count[occupied], width)
-    body = _shifted(_maxima(grid, width), count, width)
-    highest = top[occupied]
+    occupied_cells = np.flatnonzero(count > 0)
+    _smooth(grid, occupied_cells, count[occupied_cells], width)
+    body_centers = _shifted(_maxima(grid, width), count, width)
+    max_height = top[occupied_cells]
     for step in _disc(_COLUMN, width):
-        np.maximum(highest, top[occupied + step], out=highest)
+        np.maximum(max_height, top[occupied_cells + step], out=max_height)
     # nobody's head reaches through the band: a wall
-    highest[highest > _TALLEST] = np.inf
-    grid[occupied] = highest - _HEAD
-    is_head = heights > grid[flat]
+    max_height[max_height > _TALLEST] = np.inf
+    grid[occupied_cells] = max_height - _HEAD
+    is_head = heights > grid[point_cells]
     grid[:] = 0
-    np.add.at(grid, flat[is_head], np.float32(1))
-    occupied = occupied[grid[occupied] > 0]
-    heads = grid[occupied]
-    grid[occupied] = 0
-    _smooth(grid, occupied, heads, width)
-    head = _positions(_maxima(grid, width), width)
+    np.add.at(grid, point_cells[is_head], np.float32(1))
+    occupied_cells = occupied_cells[grid[occupied_cells] > 0]
+    head_counts = grid[occupied_cells]
+    grid[occupied_cells] = 0
+    _smooth(grid, occupied_cells, head_counts, width)
+    head_centers = _positions(_maxima(grid, width), width)
 
-    centers = np.concatenate([body, head])
-    around = _disc(_COLUMN, width)[:, None] + centers.astype(np.int32) @ [width, 1]
-    points, highest, lowest = count[around].sum(0), top[around].max(0), _EMPTY - depth[around].max(0)
-    is_tall = highest - lowest > _LEAST_EXTENT
-    is_tall |= (highest - lowest > _LEAST_HEAD) & (highest > _HEAD_TOP) & (points >= 2 * LEAST_POINTS)
-    enough = (points >= LEAST_POINTS) & (highest > _LEAST_TOP) & is_tall
+    centers = np.concatenate([body_centers, head_centers])
+    cells = _disc(_COLUMN, width)[:, None] + centers.astype(np.int32) @ [width, 1]
+    point_count, max_height, min_height = count[cells].sum(0), top[cells].max(0), _EMPTY - depth[cells].max(0)
+    is_tall = max_height - min_height > _LEAST_EXTENT
+    is_tall |= (max_height - min_height > _LEAST_HEAD) & (max_height > _HEAD_TOP) & (point_count >= 2 * LEAST_POINTS)
+    is_valid = (point_count >= LEAST_POINTS) & (max_height > _LEAST_TOP) & is_tall
     # cut off by the field of view
-    enough |= (points >= 6 * LEAST_POINTS) & (highest > _LEAST_PART) & (highest - lowest > _LEAST_HEAD)
-    is_body = np.arange(len(centers)) < len(body)
-    centers, points, is_body = centers[enough], points[enough], is_body[enough]
+    is_valid |= (point_count >= 6 * LEAST_POINTS) & (max_height > _LEAST_PART) & (max_height - min_height > _LEAST_HEAD)
+    is_body = np.arange(len(centers)) < len(body_centers)
+    centers, point_count, is_body = centers[is_valid], point_count[is_valid], is_body[is_valid]
     # where two are equally strong, the order of places: not that of the points
-    order = np.lexsort((centers[:, 1], centers[:, 0], -points, is_body))
+    order = np.lexsort((centers[:, 1], centers[:, 0], -point_count, is_body))
     grid[:] = 0
     order = order[_apart(centers[order], grid.view(bool).reshape(-1, 2 * width))]
     centers = centers[order]
@@ -184,25 +184,25 @@ def _grids(number: int, size: int) -> np.ndarray:
 def _features(cells: np.ndarray, count: np.ndarray, top: np.ndarray, depth: np.ndarray, width: int) -> np.ndarray:
     """What flat cells (K,) and the rings around them are like, of grids of counts, heights and depths."""
     offset = _offsets(_RINGS[-1])
-    squared = (offset**2).sum(1)
+    square_distance = (offset**2).sum(1)
     # the disc first, then ring after ring
-    order = np.argsort(squared, kind="stable")
-    ends = np.searchsorted(squared[order], [(radius + 0.3) ** 2 for radius in _RINGS])
+    order = np.argsort(square_distance, kind="stable")
+    ends = np.searchsorted(square_distance[order], [(radius + 0.3) ** 2 for radius in _RINGS])
     offset = offset[order[: ends[-1]]]
     rings = [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
-    around = (offset @ [width, 1])[:, None] + cells
-    number, highest = count[around], top[around]
-    filled = (number > 0).astype(np.float32)
-    features = [np.log1p(number[ring].sum(0)) for ring in rings]
-    features += [filled[ring].mean(0) for ring in rings]
-    features += [highest[ring].max(0) for ring in rings]
-    features += [_EMPTY - depth[around[ring]].max(0) for ring in rings[:2]]
+    ring_cells = (offset @ [width, 1])[:, None] + cells
+    cell_counts, cell_tops = count[ring_cells], top[ring_cells]
+    occupancy = (cell_counts > 0).astype(np.float32)
+    features = [np.log1p(cell_counts[ring].sum(0)) for ring in rings]
+    features += [occupancy[ring].mean(0) for ring in rings]
+    features += [cell_tops[ring].max(0) for ring in rings]
+    features += [_EMPTY - depth[ring_cells[ring]].max(0) for ring in rings[:2]]
     # how long and how wide what is filled is, cells
-    total = np.maximum(filled.sum(0), 1)
+    occupied_count = np.maximum(occupancy.sum(0), 1)
     x, y = offset.T.astype(np.float32)
-    mean_x, mean_y = x @ filled / total, y @ filled / total
-    xx, yy = (x * x) @ filled / total - mean_x**2, (y * y) @ filled / total - mean_y**2
-    xy = (x * y) @ filled / total - mean_x * mean_y
+    mean_x, mean_y = x @ occupancy / occupied_count, y @ occupancy / occupied_count
+    xx, yy = (x * x) @ occupancy / occupied_count - mean_x**2, (y * y) @ occupancy / occupied_count - mean_y**2
+    xy = (x * y) @ occupancy / occupied_count - mean_x * mean_y
     spread = np.sqrt((xx - yy) ** 2 / 4 + xy**2)
     features += [np.sqrt(np.maximum((xx + yy) / 2 + sign * spread, 0)) for sign in (1, -1)]
     return np.stack(features, 1).astype(np.float32)
@@ -229,13 +229,13 @@ def _shifted(cells: np.ndarray, count: np.ndarray, width: int) -> np.ndarray:
     steps = _square(_SHIFT, width)[:, None]
     for _ in range(_SHIFTS):
         start = position.astype(np.int32)
-        rest = start + np.float32(0.5) - position
-        x, y = offset[0] + rest[:, 0], offset[1] + rest[:, 1]
+        center_offset = start + np.float32(0.5) - position
+        x, y = offset[0] + center_offset[:, 0], offset[1] + center_offset[:, 1]
         weight = count[steps + (start[:, 0] * width + start[:, 1])]
         weight *= x * x + y * y < (_SHIFT + 0.5) ** 2
-        total = np.maximum(weight.sum(0), 1e-9)
-        position[:, 0] += (weight * x).sum(0) / total
-        position[:, 1] += (weight * y).sum(0) / total
+        weight_sum = np.maximum(weight.sum(0), 1e-9)
+        position[:, 0] += (weight * x).sum(0) / weight_sum
+        position[:, 1] += (weight * y).sum(0) / weight_sum
     return position
 
 
@@ -260,14 +260,14 @@ def _disc(reach: int, width: int) -> np.ndarray:
     return offset[(offset**2).sum(1) <= (reach + 0.3) ** 2] @ [width, 1]
 
 
-def _apart(centers: np.ndarray, taken: np.ndarray) -> np.ndarray:
-    """Rows of positions (K, 2) in cells, the strongest first, that have `_APART` to all earlier ones that stay; taken:
-    False for each half cell, which is exact enough."""
+def _apart(centers: np.ndarray, is_blocked: np.ndarray) -> np.ndarray:
+    """Rows of positions (K, 2) in cells, the strongest first, that have `_APART` to all earlier ones that stay;
+    is_blocked: False for each half cell, which is exact enough."""
     reach = round(2 * _APART / CELL)
     disc = (_offsets(reach) ** 2).sum(1).reshape(2 * reach + 1, -1) < reach**2
     rows = []
     for row, (i, j) in enumerate((centers * 2).astype(np.int64).tolist()):
-        if not taken[i, j]:
+        if not is_blocked[i, j]:
             rows.append(row)
-            taken[i - reach : i + reach + 1, j - reach : j + reach + 1] |= disc
+            is_blocked[i - reach : i + reach + 1, j - reach : j + reach + 1] |= disc
     return np.array(rows, np.int64)

@@ -28,51 +28,51 @@ class RangeImage:
     def __init__(self, points: np.ndarray, origin: np.ndarray):
         """points (n, 3) m, origin (3,) m: the sensor."""
         x, y, z = ((points[:, i] - origin[i]).astype(np.float32) for i in range(3))
-        level = np.sqrt(x * x + y * y)
+        distance = np.sqrt(x * x + y * y)
         column = ((np.arctan2(y, x) + np.float32(pi)) * np.float32(1 / _ANGLE)).astype(np.int32)
-        row = (np.arctan2(z, level) * np.float32(1 / _ANGLE) + np.float32(_ROWS // 2)).astype(np.int32)
+        row = (np.arctan2(z, distance) * np.float32(1 / _ANGLE) + np.float32(_ROWS // 2)).astype(np.int32)
         # rows that hold nothing above and below are left out, whole cells of the coarsest level
         coarsest = 2**_LEVELS
         self._first = int(row.min(initial=_ROWS)) // coarsest * coarsest
         self._rows = max(int(row.max(initial=0)) // coarsest * coarsest + coarsest - self._first, coarsest)
         self._columns = 2 * _ROWS
-        flat = (row - self._first) * self._columns + np.minimum(column, self._columns - 1)
+        cells = (row - self._first) * self._columns + np.minimum(column, self._columns - 1)
         # levels one after the other, and a cell in which nothing came back
         sizes = [self._rows * self._columns >> 2 * number for number in range(_LEVELS + 1)]
         self._starts = np.cumsum([0, *sizes], dtype=np.int32)
         size = self._starts[-1] + 1
         self._near, self._far = np.full(size, np.inf, np.float32), np.zeros(size, np.float32)
         count = np.zeros(size, np.int32)
-        np.minimum.at(self._near, flat, level)
-        np.maximum.at(self._far, flat, level)
-        np.add.at(count, flat, np.int32(1))
+        np.minimum.at(self._near, cells, distance)
+        np.maximum.at(self._far, cells, distance)
+        np.add.at(count, cells, np.int32(1))
         for image, reduce in ((self._near, np.minimum), (self._far, np.maximum), (count, np.add)):
             levels = np.split(image, self._starts[1:])
             for number, (fine, coarse) in enumerate(zip(levels[:-2], levels[1:-1], strict=True)):
-                lines = fine.reshape(-1, 2, self._columns >> number)
-                lines = reduce(lines[:, 0], lines[:, 1])
-                reduce(lines[:, ::2], lines[:, 1::2], out=coarse.reshape(len(lines), -1))
+                rows = fine.reshape(-1, 2, self._columns >> number)
+                rows = reduce(rows[:, 0], rows[:, 1])
+                reduce(rows[:, ::2], rows[:, 1::2], out=coarse.reshape(len(rows), -1))
         # more than 255 look like 255
         self._count = np.minimum(count, 255).astype(np.uint8)
 
     def views(self, centers: np.ndarray, yaw: np.ndarray, distance: np.ndarray, margin: int) -> np.ndarray:
-        """Pictures (K, 4, 28 + 2 margin, 24 + 2 margin) uint8 of centers (K, 3) m from the sensor; see `Candidate`."""
+        """Pictures (K, 4, 28 + 2 margin, 24 + 2 margin) uint8 of centers (K, 3) m from the sensor; see `Candidates`."""
         rows, columns = SLICES + 2 * margin, SIDE + 2 * margin
         height = (np.arange(rows) - margin + 0.5) * CELL + BOTTOM
         lateral = (np.arange(columns) - margin + 0.5) * CELL - SIDE * CELL / 2
-        turn = (yaw[:, None] + np.arctan2(lateral, distance[:, None]) + pi) % (2 * pi)
-        column = np.minimum((turn / _ANGLE).astype(np.int32), self._columns - 1)[:, None]
+        azimuth = (yaw[:, None] + np.arctan2(lateral, distance[:, None]) + pi) % (2 * pi)
+        column = np.minimum((azimuth / _ANGLE).astype(np.int32), self._columns - 1)[:, None]
         slant = np.sqrt(lateral**2 + distance[:, None] ** 2).astype(np.float32)[:, None]
         tangent = (centers[:, 2:] + height).astype(np.float32)[:, :, None] / slant
         row = (np.arctan(tangent) * np.float32(1 / _ANGLE) + np.float32(_ROWS // 2)).astype(np.int32) - self._first
         # cells as large as the picture's, or the next smaller ones
         level = np.floor(np.log2(CELL / distance / _ANGLE) + 0.5)
         level = np.clip(level, 0, _LEVELS - 1).astype(np.int32)[:, None, None]
-        at = self._at(level, row, column)
-        count = self._count[at]
+        cells = self._at(level, row, column)
+        count = self._count[cells]
         views = np.empty((len(centers), RANGE_CHANNELS, rows, columns), np.uint8)
-        views[:, 0] = _range_bytes(self._near[at] - slant)
-        views[:, 1] = _range_bytes(self._far[at] - slant)
+        views[:, 0] = _range_bytes(self._near[cells] - slant)
+        views[:, 1] = _range_bytes(self._far[cells] - slant)
         views[:, 2] = _COUNT_BYTES[count]
         views[:, 3] = _COUNT_BYTES[self._count[self._at(level + 1, row, column)]]
         views[:, :2] *= count[:, None] > 0
@@ -80,9 +80,9 @@ class RangeImage:
 
     def _at(self, level: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
         """Flat cells of levels (K, 1, 1) at rows (K, H, 1 or W) and columns (K, 1, W) of the finest."""
-        flat = self._starts[level] + (row >> level) * (self._columns >> level) + (column >> level)
-        flat[(row < 0) | (row >= self._rows)] = self._starts[-1]
-        return flat
+        cells = self._starts[level] + (row >> level) * (self._columns >> level) + (column >> level)
+        cells[(row < 0) | (row >= self._rows)] = self._starts[-1]
+        return cells
 
 
 def _range_bytes(meters: np.ndarray) -> np.ndarray:

@@ -56,9 +56,9 @@ class Augmentation:
 
     def apply(self, places: np.ndarray) -> np.ndarray:
         """places (K, 3) m, one a candidate, mirrored, turned, scaled and shifted."""
-        own = self.over(len(places))
-        xy = (own.matrix @ places[:, :2, None])[..., 0] + own.shift
-        return np.column_stack([xy, places[:, 2] * own.scale])
+        augmentation = self.over(len(places))
+        xy = (augmentation.matrix @ places[:, :2, None])[..., 0] + augmentation.shift
+        return np.column_stack([xy, places[:, 2] * augmentation.scale])
 
 
 def draw_augmentation(rng: np.random.Generator, count: int, *, drop_origin: float = 0.15) -> Augmentation:
@@ -81,23 +81,24 @@ def render(
     candidates: Candidates, augmentation: Augmentation | None = None, *, fine: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
     """The network's inputs, float32: see the module. fine: memory (K, 28, 24, 24) float32 for that input."""
-    own, known, count = candidates, candidates.distance > 0, candidates.count
-    points, owner = own.xyz * np.float32(UNIT), np.repeat(np.arange(len(own)), own.sizes)
-    contexts, change = own.contexts, None
+    has_sensor, count = candidates.distance > 0, candidates.count
+    points = candidates.xyz * np.float32(UNIT)
+    owner = np.repeat(np.arange(len(candidates)), candidates.sizes)
+    contexts, change = candidates.contexts, None
     if augmentation is not None:
-        change = augmentation.over(len(own))
-        known, count = known & ~change.drop_origin, count * change.keep
-        points, owner = _moved_points(points, owner, own.sizes, change)
+        change = augmentation.over(len(candidates))
+        has_sensor, count = has_sensor & ~change.drop_origin, count * change.keep
+        points, owner = _moved_points(points, owner, candidates.sizes, change)
         contexts = _moved_contexts(contexts, change)
-    scalars = np.zeros((len(own), 4), np.float32)
-    scalars[:, 0] = np.log(np.where(known, own.distance, 1.0))
-    scalars[:, 1] = known * own.sensor_height / 4
+    scalars = np.zeros((len(candidates), 4), np.float32)
+    scalars[:, 0] = np.log(np.where(has_sensor, candidates.distance, 1.0))
+    scalars[:, 1] = has_sensor * candidates.sensor_height / 4
     scalars[:, 2] = np.log1p(count)
-    scalars[:, 3] = known
+    scalars[:, 3] = has_sensor
     return {
         # of a place with more points than are kept, those stand for all
-        "fine": _fine(points, owner, own.count / np.maximum(own.sizes, 1), fine),
-        "range_view": _range_views(own.range_views, known, change),
+        "fine": _fine(points, owner, candidates.count / np.maximum(candidates.sizes, 1), fine),
+        "range_view": _range_views(candidates.range_views, has_sensor, change),
         "context": contexts * np.float32(1 / 255),
         "scalars": scalars,
     }
@@ -113,8 +114,8 @@ def _moved_points(
         rng = np.random.default_rng(seed)
         draws.append(np.stack([rng.random(size, np.float32), rng.standard_normal(size, np.float32) * deviation]))
     chance, noise = np.concatenate(draws, axis=1)
-    kept = chance < change.keep.astype(np.float32)[owner]
-    points, owner, noise = points[:, kept], owner[kept], noise[kept]
+    is_kept = chance < change.keep.astype(np.float32)[owner]
+    points, owner, noise = points[:, is_kept], owner[is_kept], noise[is_kept]
     points[0] += noise
     matrix, shift = change.matrix.astype(np.float32)[owner], change.shift.astype(np.float32)[owner]
     x, y = (matrix[:, i, 0] * points[0] + matrix[:, i, 1] * points[1] + shift[:, i] for i in (0, 1))
@@ -124,57 +125,57 @@ def _moved_points(
 def _fine(points: np.ndarray, owner: np.ndarray, weight: np.ndarray, fine: np.ndarray | None) -> np.ndarray:
     """(K, 28, 24, 24) of points (3, n) m, of whose owners (n,) each stands for `weight` (K,) points."""
     shape = (len(weight), SLICES, SIDE, SIDE)
-    first = np.array([[SIDE // 2], [SIDE // 2], [-BOTTOM / CELL]], np.float32)
-    j, k, i = np.floor(points * np.float32(1 / CELL) + first).astype(np.int64)
+    origin_cell = np.array([[SIDE // 2], [SIDE // 2], [-BOTTOM / CELL]], np.float32)
+    j, k, i = np.floor(points * np.float32(1 / CELL) + origin_cell).astype(np.int64)
     # as unsigned numbers, what is below 0 is large
-    inside = np.logical_and.reduce([at.view(np.uint64) < n for at, n in zip((i, j, k), shape[1:], strict=True)])
-    flat = (((owner * SLICES + i) * SIDE + j) * SIDE + k)[inside]
+    is_inside = np.logical_and.reduce([axis.view(np.uint64) < n for axis, n in zip((i, j, k), shape[1:], strict=True)])
+    cell_index = (((owner * SLICES + i) * SIDE + j) * SIDE + k)[is_inside]
     fine = np.empty(shape, np.float32) if fine is None else fine
     fine[:] = 0
     cells = fine.reshape(-1)
-    np.add.at(cells, flat, np.float32(1))
-    cells[flat] = 0.5 + 0.125 * np.log2(1 + cells[flat] * weight[owner[inside]])
+    np.add.at(cells, cell_index, np.float32(1))
+    cells[cell_index] = 0.5 + 0.125 * np.log2(1 + cells[cell_index] * weight[owner[is_inside]])
     return fine
 
 
-def _range_views(stored: np.ndarray, known: np.ndarray, change: Augmentation | None) -> np.ndarray:
-    views = np.zeros((len(known), RANGE_CHANNELS, SLICES, SIDE), np.float32)
-    stored = stored[known]
+def _range_views(pixels: np.ndarray, has_sensor: np.ndarray, change: Augmentation | None) -> np.ndarray:
+    views = np.zeros((len(has_sensor), RANGE_CHANNELS, SLICES, SIDE), np.float32)
+    pixels = pixels[has_sensor]
     if change is None:
-        margin = (stored.shape[3] - SIDE) // 2
-        stored = stored[:, :, margin : margin + SLICES, margin : margin + SIDE]
+        margin = (pixels.shape[3] - SIDE) // 2
+        pixels = pixels[:, :, margin : margin + SLICES, margin : margin + SIDE]
     else:
-        scale, sign = change.scale[known, None], np.where(change.mirror, -1.0, 1.0)[known, None]
+        scale, sign = change.scale[has_sensor, None], np.where(change.mirror, -1.0, 1.0)[has_sensor, None]
         height = ((np.arange(SLICES) + 0.5) * CELL + BOTTOM) / scale
         lateral = (np.arange(SIDE) + 0.5) * CELL - SIDE * CELL / 2
-        lateral = sign * (lateral - change.shift[known, 1:]) / scale
+        lateral = sign * (lateral - change.shift[has_sensor, 1:]) / scale
         i = np.floor((height - BOTTOM) / CELL).astype(np.int64) + MARGIN
         j = np.floor((lateral + SIDE * CELL / 2) / CELL).astype(np.int64) + MARGIN
-        i, j = np.clip(i, 0, stored.shape[2] - 1), np.clip(j, 0, stored.shape[3] - 1)
-        stored = np.moveaxis(stored[np.arange(len(stored))[:, None, None], :, i[:, :, None], j[:, None, :]], -1, 1)
-        _lose_returns(stored, change.keep[known], change.seed[known].tolist())
-    ranges = (stored[:, :2] - np.float32(128)) / np.float32(127)
-    ranges[stored[:, :2] == 0] = 0
-    views[known, :2], views[known, 2:] = ranges, stored[:, 2:] / np.float32(255)
+        i, j = np.clip(i, 0, pixels.shape[2] - 1), np.clip(j, 0, pixels.shape[3] - 1)
+        pixels = np.moveaxis(pixels[np.arange(len(pixels))[:, None, None], :, i[:, :, None], j[:, None, :]], -1, 1)
+        _lose_returns(pixels, change.keep[has_sensor], change.seed[has_sensor].tolist())
+    ranges = (pixels[:, :2] - np.float32(128)) / np.float32(127)
+    ranges[pixels[:, :2] == 0] = 0
+    views[has_sensor, :2], views[has_sensor, 2:] = ranges, pixels[:, 2:] / np.float32(255)
     return views
 
 
-def _lose_returns(views: np.ndarray, keep: np.ndarray, seeds: list[int]) -> None:
+def _lose_returns(views: np.ndarray, share: np.ndarray, seeds: list[int]) -> None:
     """Keeps a share (K,) of the returns of range views (K, 4, H, W), in place: a cell is empty where all are lost."""
-    keep = keep[:, None, None]
+    share = share[:, None, None]
     count = np.exp2(views[:, 2] / (0.125 * 255)) - 1
     chance = np.empty(count.shape, np.float32)
     for k, seed in enumerate(seeds):
         chance[k] = np.random.default_rng([seed, 1]).random(count.shape[1:], np.float32)
-    views[:, :3] *= (chance >= (1 - keep) ** count)[:, None]
-    fewer = np.log2(keep) * (0.125 * 255)
-    views[:, 2:] = np.where(views[:, 2:] > 0, np.maximum(views[:, 2:] + fewer[:, None], 1), 0)
+    views[:, :3] *= (chance >= (1 - share) ** count)[:, None]
+    byte_offset = np.log2(share) * (0.125 * 255)
+    views[:, 2:] = np.where(views[:, 2:] > 0, np.maximum(views[:, 2:] + byte_offset[:, None], 1), 0)
 
 
-def _moved_contexts(stored: np.ndarray, change: Augmentation) -> np.ndarray:
+def _moved_contexts(contexts: np.ndarray, change: Augmentation) -> np.ndarray:
     side = (np.arange(CONTEXT_SIDE) - (CONTEXT_SIDE - 1) / 2) * CONTEXT_CELL
-    to = np.stack(np.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
-    source = (to - change.shift[:, None]) @ np.swapaxes(np.linalg.inv(change.matrix), 1, 2)
+    target = np.stack(np.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
+    source = (target - change.shift[:, None]) @ np.swapaxes(np.linalg.inv(change.matrix), 1, 2)
     i, j = np.moveaxis(np.floor(source / CONTEXT_CELL).astype(np.int64) + CONTEXT_SIDE // 2, -1, 0)
     i, j = np.clip(i, 0, CONTEXT_SIDE - 1), np.clip(j, 0, CONTEXT_SIDE - 1)
-    return np.moveaxis(stored[np.arange(len(stored))[:, None], :, i, j], -1, 1).reshape(stored.shape)
+    return np.moveaxis(contexts[np.arange(len(contexts))[:, None], :, i, j], -1, 1).reshape(contexts.shape)

@@ -127,9 +127,9 @@ def shape(name: str, x: float = 1.0, y: float = 1.0, z: float = 1.0) -> Mesh:
 def shipped_meshes() -> dict[str, Mesh]:
     """All of them by name, read once; read-only."""
     with resources.files("lidarpose.synth").joinpath("assets/meshes.npz").open("rb") as file:
-        stored = dict(np.load(file, allow_pickle=False))
-    names = [key.removesuffix("/faces") for key in stored if key.endswith("/faces")]
-    meshes = {name: Mesh(stored[f"{name}/vertices"], stored[f"{name}/faces"].astype(np.int32)) for name in names}
+        arrays = dict(np.load(file, allow_pickle=False))
+    names = [key.removesuffix("/faces") for key in arrays if key.endswith("/faces")]
+    meshes = {name: Mesh(arrays[f"{name}/vertices"], arrays[f"{name}/faces"].astype(np.int32)) for name in names}
     for mesh in meshes.values():
         mesh.vertices.setflags(write=False)
         mesh.faces.setflags(write=False)
@@ -153,7 +153,9 @@ def wall(length: float, height: float, *, thick: float = 0.2, opening: tuple | N
     if sill > 0:
         pieces.append(((left + right) / 2, 0.0, right - left, sill))
     middle = [(0.0, y, z) for y, z, _, _ in pieces]
-    return boxes(np.array(middle), np.array([(thick, wide, tall) for _, _, wide, tall in pieces]))
+    return boxes(
+        np.array(middle), np.array([(thick, piece_width, piece_height) for _, _, piece_width, piece_height in pieces])
+    )
 
 
 def sign(height: float, wide: float) -> Mesh:
@@ -164,13 +166,13 @@ def sign(height: float, wide: float) -> Mesh:
 
 def rail_fence(length: float, height: float, rails: int) -> Mesh:
     """Posts 1.5 m apart or less along y, and `rails` bars between them: beams pass between."""
-    posts = max(2, int(np.ceil(length / 1.5)) + 1)
-    at = np.linspace(-length / 2, length / 2, posts)
-    middle, size = np.zeros((posts + rails, 3)), np.empty((posts + rails, 3))
-    middle[:posts, 1] = at
-    size[:posts] = (0.06, 0.06, height)
-    middle[posts:, 2] = (np.arange(rails) + 0.6) * (height / (rails + 0.2)) - 0.02
-    size[posts:] = (0.04, length, 0.05)
+    post_count = max(2, int(np.ceil(length / 1.5)) + 1)
+    post_y = np.linspace(-length / 2, length / 2, post_count)
+    middle, size = np.zeros((post_count + rails, 3)), np.empty((post_count + rails, 3))
+    middle[:post_count, 1] = post_y
+    size[:post_count] = (0.06, 0.06, height)
+    middle[post_count:, 2] = (np.arange(rails) + 0.6) * (height / (rails + 0.2)) - 0.02
+    size[post_count:] = (0.04, length, 0.05)
     return boxes(middle, size)
 
 
@@ -201,10 +203,10 @@ def foliage(size: Vector, leaves: int, leaf: float, rng: np.random.Generator) ->
     pick, turn, flip = rng.random(3).tolist()
     center, leaf_shape = _leaf_balls()[int(pick * _LEAF_BALLS)]
     c, s = np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)
-    turned = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1 if flip < 0.5 else -1]], np.float32)
+    rotation = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1 if flip < 0.5 else -1]], np.float32)
     half = np.asarray(size, np.float32) / 2
     # a leaf may not stick out of the ellipsoid by more than itself, nor into the ground
-    vertices = ((center[:leaves] @ turned) * half)[:, None] + leaf_shape[:leaves] * np.float32(leaf)
+    vertices = ((center[:leaves] @ rotation) * half)[:, None] + leaf_shape[:leaves] * np.float32(leaf)
     vertices[..., 2] = np.maximum(vertices[..., 2] + half[2], 0)
     return Mesh(vertices.reshape(-1, 3), repeated(min(leaves, _LEAVES), 3, "triangle"))
 
@@ -224,14 +226,14 @@ def _leaf_balls() -> list[tuple[np.ndarray, np.ndarray]]:
 
 def grass(radius: float, height: float, blades: int, rng: np.random.Generator) -> Mesh:
     """`blades` upright thin triangles on a disc of `radius` m, up to `height` m high."""
-    angle, far, tall, lean, wide = rng.random((5, blades))
-    far = radius * np.sqrt(far)
+    angle, distance, height_draw, lean_draw, width_draw = rng.random((5, blades))
+    distance = radius * np.sqrt(distance)
     angle = angle * (2 * np.pi)
-    foot = np.stack([far * np.cos(angle), far * np.sin(angle)], 1)
-    across = np.stack([np.sin(7 * angle), np.cos(7 * angle)], 1) * (0.008 + 0.03 * wide[:, None])
+    foot = np.stack([distance * np.cos(angle), distance * np.sin(angle)], 1)
+    half_blade = np.stack([np.sin(7 * angle), np.cos(7 * angle)], 1) * (0.008 + 0.03 * width_draw[:, None])
     vertices = np.zeros((blades, 3, 3), np.float32)
-    vertices[:, 0, :2] = foot - across
-    vertices[:, 1, :2] = foot + across
-    vertices[:, 2, :2] = foot + (lean[:, None] - 0.5) * 0.1
-    vertices[:, 2, 2] = height * (0.4 + 0.6 * tall)
+    vertices[:, 0, :2] = foot - half_blade
+    vertices[:, 1, :2] = foot + half_blade
+    vertices[:, 2, :2] = foot + (lean_draw[:, None] - 0.5) * 0.1
+    vertices[:, 2, 2] = height * (0.4 + 0.6 * height_draw)
     return Mesh(vertices.reshape(-1, 3), repeated(blades, 3, "triangle"))

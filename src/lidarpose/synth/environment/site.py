@@ -57,13 +57,13 @@ class Site:
         self.areas = np.array(layout.areas) - [x, x, y, y, 0]
         self.items: list[Item] = []
         self.low = np.zeros((0, 5))
-        moved = [(name, mesh.moved((-x, -y, 0))) for name, mesh in layout.items]
-        rows = np.array([_footprint(mesh) for _, mesh in moved])
-        fixed = np.array([name in ("ground", "ceiling", "wall") for name, _ in moved])
-        clear = fixed | (_gap(rows, np.zeros(2)) > 0.5)
-        self.items = [item for item, keep in zip(moved, clear, strict=True) if keep]
-        stands = np.array([name not in ("ground", "ceiling") for name, _ in moved])
-        self.low = rows[clear & stands]
+        moved_items = [(name, mesh.moved((-x, -y, 0))) for name, mesh in layout.items]
+        rows = np.array([_footprint(mesh) for _, mesh in moved_items])
+        is_structure = np.array([name in ("ground", "ceiling", "wall") for name, _ in moved_items])
+        is_clear = is_structure | (_gap(rows, np.zeros(2)) > 0.5)
+        self.items = [item for item, keep in zip(moved_items, is_clear, strict=True) if keep]
+        is_standing = np.array([name not in ("ground", "ceiling") for name, _ in moved_items])
+        self.low = rows[is_clear & is_standing]
         self.low = self.low[np.isfinite(self.low[:, 0])]
 
     def add(self, name: str, mesh: Mesh) -> None:
@@ -75,9 +75,9 @@ class Site:
 
     def level(self, place: np.ndarray) -> float:
         """z of the flat ground at (2,) m."""
-        inside = (place[0] >= self.areas[:, 0]) & (place[0] <= self.areas[:, 1])
-        inside &= (place[1] >= self.areas[:, 2]) & (place[1] <= self.areas[:, 3])
-        return float(self.areas[np.argmax(inside), 4])
+        is_inside = (place[0] >= self.areas[:, 0]) & (place[0] <= self.areas[:, 1])
+        is_inside &= (place[1] >= self.areas[:, 2]) & (place[1] <= self.areas[:, 3])
+        return float(self.areas[np.argmax(is_inside), 4])
 
     def is_free(self, place: np.ndarray, room: float) -> bool:
         """Whether nothing stands within `room` m of a place (2,) m, nor the sensor."""
@@ -86,33 +86,33 @@ class Site:
     def is_hidden(self, places: np.ndarray) -> np.ndarray:
         """(k,) bool: whether something stands between the sensor and the chest of a person at places (k, 2) m, or the
         chest is above or below all beams."""
-        up = np.full((len(places), 1), _CHEST - self.mount.height)
-        chest = np.hstack([places, up]) @ rotation_about("z", self.mount.turn).T @ self.mount.R_sensor_level.T
+        chest_z = np.full((len(places), 1), _CHEST - self.mount.height)
+        chest = np.hstack([places, chest_z]) @ rotation_about("z", self.mount.turn).T @ self.mount.R_sensor_level.T
         elevation = np.arctan2(chest[:, 2], np.hypot(*chest[:, :2].T))
-        outside = (elevation < self.elevations[0]) | (elevation > self.elevations[1])
-        ways = places[:, None, :]
-        ways = np.where(np.abs(ways) < 1e-6, 1e-6, ways)
-        near, far = self.low[:, :2] / ways, self.low[:, 2:4] / ways
+        is_outside = (elevation < self.elevations[0]) | (elevation > self.elevations[1])
+        directions = places[:, None, :]
+        directions = np.where(np.abs(directions) < 1e-6, 1e-6, directions)
+        near, far = self.low[:, :2] / directions, self.low[:, 2:4] / directions
         enter, leave = np.minimum(near, far).max(2), np.maximum(near, far).min(2)
         beam = self.mount.height + (_CHEST - self.mount.height) * enter
-        return outside | np.any((enter < leave) & (enter > 0) & (enter < 0.97) & (self.low[:, 4] > beam), axis=1)
+        return is_outside | np.any((enter < leave) & (enter > 0) & (enter < 0.97) & (self.low[:, 4] > beam), axis=1)
 
     def spot(self, distance: float, room: float, rng: np.random.Generator, *, seen: bool = False) -> np.ndarray:
         """Some free place (2,) m in the areas about so far from the sensor, in view where the view is narrow; where
         a person is `seen` if there is such a place."""
-        middle, half = self.mount.view
+        middle, half_width = self.mount.view
         u = rng.random((48, 3))
-        angle = middle + half * 0.95 * (2 * u[:24, 0] - 1)
-        polar = distance * np.stack([np.cos(angle), np.sin(angle)], 1)
+        angle = middle + half_width * 0.95 * (2 * u[:24, 0] - 1)
+        polar_places = distance * np.stack([np.cos(angle), np.sin(angle)], 1)
         area = self.areas[(u[24:, 0] * len(self.areas)).astype(int)]
-        inside = area[:, [0, 2]] + u[24:, 1:] * (area[:, [1, 3]] - area[:, [0, 2]])
-        places = np.concatenate([polar, inside])
-        far = np.hypot(*places.T)
-        cost = np.abs(far - distance) + 50 * (far > self.reach) + 100 * (far < max(room, _NEAREST))
-        off = np.abs((np.arctan2(places[:, 1], places[:, 0]) - middle + pi) % (2 * pi) - pi)
-        cost += 20 * (off > half)
-        in_area = (places[:, None, :] >= self.areas[:, [0, 2]]) & (places[:, None, :] <= self.areas[:, [1, 3]])
-        cost += 200 * ~np.any(np.all(in_area, axis=2), axis=1)
+        area_places = area[:, [0, 2]] + u[24:, 1:] * (area[:, [1, 3]] - area[:, [0, 2]])
+        places = np.concatenate([polar_places, area_places])
+        distances = np.hypot(*places.T)
+        cost = np.abs(distances - distance) + 50 * (distances > self.reach) + 100 * (distances < max(room, _NEAREST))
+        angle_errors = np.abs((np.arctan2(places[:, 1], places[:, 0]) - middle + pi) % (2 * pi) - pi)
+        cost += 20 * (angle_errors > half_width)
+        is_in_area = (places[:, None, :] >= self.areas[:, [0, 2]]) & (places[:, None, :] <= self.areas[:, [1, 3]])
+        cost += 200 * ~np.any(np.all(is_in_area, axis=2), axis=1)
         if len(self.low):
             cost += 200 * (_gap(self.low, places) < room).any(1)
             cost += 30 * self.is_hidden(places) if seen else 0
@@ -120,10 +120,10 @@ class Site:
 
     def beside(self, rng: np.random.Generator, gap: float) -> np.ndarray:
         """A place (2,) m so near to something that stands there."""
-        near = self.low[np.hypot(*((self.low[:, :2] + self.low[:, 2:4]) / 2).T) < self.reach]
-        if not len(near):
+        footprints = self.low[np.hypot(*((self.low[:, :2] + self.low[:, 2:4]) / 2).T) < self.reach]
+        if not len(footprints):
             return self.spot(rng.uniform(_NEAREST, self.reach), HALF_WIDTH, rng)
-        low_x, low_y, high_x, high_y, _ = near[rng.integers(len(near))]
+        low_x, low_y, high_x, high_y, _ = footprints[rng.integers(len(footprints))]
         u = rng.random(2)
         x, y = low_x + u[0] * (high_x - low_x), low_y + u[0] * (high_y - low_y)
         sides = [(low_x - gap, y), (high_x + gap, y), (x, low_y - gap), (x, high_y + gap)]
@@ -132,17 +132,17 @@ class Site:
 
 def _footprint(mesh: Mesh) -> np.ndarray:
     """(5,): least x, y, greatest x, y of what is below 1.9 m, inf where nothing is, and the top's z."""
-    low = mesh.vertices[mesh.vertices[:, 2] < 1.9, :2]
-    if not len(low):
+    low_points = mesh.vertices[mesh.vertices[:, 2] < 1.9, :2]
+    if not len(low_points):
         return np.full(5, np.inf)
-    return np.array([*low.min(0), *low.max(0), mesh.vertices[:, 2].max()])
+    return np.array([*low_points.min(0), *low_points.max(0), mesh.vertices[:, 2].max()])
 
 
-def _gap(low: np.ndarray, places: np.ndarray) -> np.ndarray:
+def _gap(footprints: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Distance of places (..., 2) from footprints (M, 5): (..., M) m, 0 within."""
     places = places[..., None, :]
-    outside = np.maximum(np.maximum(low[:, :2] - places, places - low[:, 2:4]), 0)
-    return np.hypot(outside[..., 0], outside[..., 1])
+    offsets = np.maximum(np.maximum(footprints[:, :2] - places, places - footprints[:, 2:4]), 0)
+    return np.hypot(offsets[..., 0], offsets[..., 1])
 
 
 def draw_habits(indoors: bool, family: str, rng: np.random.Generator) -> dict[str, float]:
@@ -164,43 +164,45 @@ def scatter(site: Site, weights: dict[str, float], count: int, feet: np.ndarray,
         mesh = mesh.moved((0, 0, 0), rng.choice([0.0, pi / 2, pi, -pi / 2]) + rng.normal(0, 0.15))
         if mesh.vertices[:, 2].max() > ceiling:
             mesh = mesh.scaled((1, 1, 0.97 * min(ceiling, 3.0) / mesh.vertices[:, 2].max()))
-        low = _footprint(mesh)
+        footprint = _footprint(mesh)
         for _attempt in range(3):
             if len(feet) and name != "mannequin" and rng.random() < _BESIDE:
-                angle, near = rng.uniform(-pi, pi), feet[rng.integers(len(feet))]
-                across = np.array([np.cos(angle), np.sin(angle)])
-                place = near + across * (HALF_WIDTH + 0.05 + 0.45 * rng.random())
-                place = np.where(np.abs(across) < 0.3, near, place - np.where(across > 0, low[:2], low[2:4]))
+                angle, neighbor = rng.uniform(-pi, pi), feet[rng.integers(len(feet))]
+                direction = np.array([np.cos(angle), np.sin(angle)])
+                position = neighbor + direction * (HALF_WIDTH + 0.05 + 0.45 * rng.random())
+                position = np.where(
+                    np.abs(direction) < 0.3, neighbor, position - np.where(direction > 0, footprint[:2], footprint[2:4])
+                )
             elif name in ("fragment", "mannequin") and not site.layout.indoors:
-                place = site.spot(rng.uniform(18, 40), 0.3, rng, seen=True)
+                position = site.spot(rng.uniform(18, 40), 0.3, rng, seen=True)
             else:
-                place = site.spot(_NEAREST + (site.reach - _NEAREST) * rng.random() ** 1.2, 0.3, rng)
-            row = low + [*place, *place, 0]
+                position = site.spot(_NEAREST + (site.reach - _NEAREST) * rng.random() ** 1.2, 0.3, rng)
+            row = footprint + [*position, *position, 0]
             if _gap(row[None], np.zeros(2)).min() > 0.6 and (not len(feet) or _gap(row[None], feet).min() > 0.2):
-                site.add(name, mesh.moved((*place, site.level(place))))
+                site.add(name, mesh.moved((*position, site.level(position))))
                 break
 
 
 def add_screens(site: Site, feet: np.ndarray, rng: np.random.Generator) -> None:
     """Plates and leaves close before the sensor, in a quarter of the scenes; none in people at feet (k, 2) m."""
     for _ in range(rng.integers(1, 7) if rng.random() < 0.25 else 0):
-        far, angle, u = rng.uniform(0.6, 3.0), rng.uniform(-pi, pi), rng.random(3).tolist()
-        wide, low = (0.03 + 0.5 * u[0] ** 2) * far, max(0.0, site.mount.height - u[1] * far)
-        screen = shapes.box((0.03, wide, min(0.1 + 1.2 * u[2], site.layout.ceiling - low)))
+        distance, angle, u = rng.uniform(0.6, 3.0), rng.uniform(-pi, pi), rng.random(3).tolist()
+        width, bottom = (0.03 + 0.5 * u[0] ** 2) * distance, max(0.0, site.mount.height - u[1] * distance)
+        screen = shapes.box((0.03, width, min(0.1 + 1.2 * u[2], site.layout.ceiling - bottom)))
         if rng.random() < 0.3:
-            screen = shapes.foliage((wide, wide, 0.2 + 1.0 * u[2]), 80, 0.08, rng)
-        place = np.array([far * np.cos(angle), far * np.sin(angle)])
-        if not len(feet) or np.hypot(*(feet - place).T).min() > 0.3 + wide / 2:
-            site.add("screen", screen.moved((*place, low + site.level(place)), angle))
+            screen = shapes.foliage((width, width, 0.2 + 1.0 * u[2]), 80, 0.08, rng)
+        position = np.array([distance * np.cos(angle), distance * np.sin(angle)])
+        if not len(feet) or np.hypot(*(feet - position).T).min() > 0.3 + width / 2:
+            site.add("screen", screen.moved((*position, bottom + site.level(position)), angle))
 
 
 def add_own_vehicle(site: Site, rng: np.random.Generator) -> None:
     """What carries the sensor, where the sensor sees it."""
     if rng.random() < 0.4:
-        own = _own_vehicle(site.mount.height, site.layout.by_car, rng)
-        site.items.append(("own vehicle", own.moved((0, 0, site.layout.sensor[2]))))
+        own_mesh = _own_vehicle(site.mount.height, site.layout.by_car, rng)
+        site.items.append(("own vehicle", own_mesh.moved((0, 0, site.layout.sensor[2]))))
         # nobody stands in it, and it hides nothing that is higher than it
-        site.low = np.concatenate([site.low, [[*_footprint(own)[:4], 0]]])
+        site.low = np.concatenate([site.low, [[*_footprint(own_mesh)[:4], 0]]])
 
 
 def _own_vehicle(height: float, by_car: bool, rng: np.random.Generator) -> Mesh:
@@ -213,8 +215,13 @@ def _own_vehicle(height: float, by_car: bool, rng: np.random.Generator) -> Mesh:
         deck = shapes.box((0.3 + 0.5 * u[0], 0.3 + 0.3 * u[1], 0.8 * height))
         return deck.moved((-0.2 * u[2], 0, 0), 2 * pi * u[3])
     leg = shape("tube", 0.02, 0.02, 0.9 * height)
-    ways = [np.array([np.cos(angle), np.sin(angle)]) for angle in (0, 2.1, 4.2)]
-    return union([leg.placed([[1, 0, 0], [0, 1, 0], [*(0.02 * way), 1]], (*(0.15 * way), 0)) for way in ways])
+    directions = [np.array([np.cos(angle), np.sin(angle)]) for angle in (0, 2.1, 4.2)]
+    return union(
+        [
+            leg.placed([[1, 0, 0], [0, 1, 0], [*(0.02 * direction), 1]], (*(0.15 * direction), 0))
+            for direction in directions
+        ]
+    )
 
 
 @dataclass(frozen=True)
@@ -232,8 +239,8 @@ class Relief:
         slope = rng.normal(0, 0.035 if rng.random() < 0.6 else 0.0, 2).clip(-0.12, 0.12)
         waves = []
         for _ in range(rng.integers(1, 4) if rng.random() < 0.45 else 0):
-            long, angle, phase = rng.uniform(14, 70), rng.uniform(-pi, pi), rng.uniform(-pi, pi)
-            k = 2 * pi / long
+            wavelength, angle, phase = rng.uniform(14, 70), rng.uniform(-pi, pi), rng.uniform(-pi, pi)
+            k = 2 * pi / wavelength
             waves.append([k * np.cos(angle), k * np.sin(angle), phase, rng.uniform(0, 0.08) / k])
         return cls(slope, np.array(waves).reshape(-1, 4))
 
@@ -241,6 +248,6 @@ class Relief:
         """Height m of the ground at places (2 or 3, ...) m, 0 below the sensor."""
         x, y = places[0], places[1]
         z = self.slope[0] * x + self.slope[1] * y
-        for a, b, phase, high in self.waves:
-            z = z + high * (np.sin(a * x + b * y + phase) - np.sin(phase))
+        for a, b, phase, amplitude in self.waves:
+            z = z + amplitude * (np.sin(a * x + b * y + phase) - np.sin(phase))
         return z

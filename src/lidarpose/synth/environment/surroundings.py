@@ -45,26 +45,26 @@ def surroundings(config: SceneConfig, feet: np.ndarray, radius: float, rng: np.r
 
 
 def _place_thing(feet: np.ndarray, radius: float, draw: list[float], rng: np.random.Generator) -> Mesh | None:
-    kind, around, apart, shift, a, b, c, yaw = draw
-    angle, gap = (2 * around - 1) * pi, radius + 0.05 + 0.55 * apart
+    kind, angle_draw, gap_draw, shift, a, b, c, yaw = draw
+    angle, gap = (2 * angle_draw - 1) * pi, radius + 0.05 + 0.55 * gap_draw
     if _WALLS[0] <= kind < _WALLS[1]:
         # beside or behind the person: before them they would hide all
         angle = atan2(feet[1], feet[0]) + _BESIDE * angle
     if kind < 0.16:
         # hand luggage, parcels and what lies about: touches the body
         mesh = shapes.box((0.12 + 0.38 * a, 0.12 + 0.18 * b, 0.12 + 0.38 * c))
-        near = (0.6 + 0.4 * apart) * radius
-        place = (feet[0] + near * cos(angle), feet[1] + near * sin(angle), feet[2] + 0.9 * shift)
-        return mesh.moved(place, 2 * pi * yaw)
-    mesh, deep, long, slack = _draw_thing(kind, a, b, c, yaw, rng)
+        distance = (0.6 + 0.4 * gap_draw) * radius
+        position = (feet[0] + distance * cos(angle), feet[1] + distance * sin(angle), feet[2] + 0.9 * shift)
+        return mesh.moved(position, 2 * pi * yaw)
+    mesh, depth, length, yaw_range = _draw_thing(kind, a, b, c, yaw, rng)
     # the near side at the gap, the length across the way there, give or take, and shifted along itself
-    gap += deep
-    along = (shift - 0.5) * 0.7 * long
-    x = feet[0] + gap * cos(angle) - along * sin(angle)
-    y = feet[1] + gap * sin(angle) + along * cos(angle)
-    if hypot(x, y) < deep + long / 2 + 0.3:
+    gap += depth
+    lateral_offset = (shift - 0.5) * 0.7 * length
+    x = feet[0] + gap * cos(angle) - lateral_offset * sin(angle)
+    y = feet[1] + gap * sin(angle) + lateral_offset * cos(angle)
+    if hypot(x, y) < depth + length / 2 + 0.3:
         return None
-    return mesh.moved((x, y, feet[2]), angle + pi + slack * (2 * yaw - 1))
+    return mesh.moved((x, y, feet[2]), angle + pi + yaw_range * (2 * yaw - 1))
 
 
 def _draw_thing(
@@ -84,44 +84,44 @@ def _draw_thing(
     if kind < _WALLS[1]:
         return _draw_car(a, b, c)
     if kind < 0.76:
-        long = 1.2 + 2 * a
+        length = 1.2 + 2 * a
         if b < 0.5:
-            return shapes.rail_fence(long, 0.8 + 0.4 * c, 2 + int(2 * b)), 0.03, long, 0.05
-        return shapes.lattice_fence(long, 0.8 + 1.0 * c, 0.10 + 0.10 * b, 0.02 + 0.04 * c), 0.03, long, 0.05
+            return shapes.rail_fence(length, 0.8 + 0.4 * c, 2 + int(2 * b)), 0.03, length, 0.05
+        return shapes.lattice_fence(length, 0.8 + 1.0 * c, 0.10 + 0.10 * b, 0.02 + 0.04 * c), 0.03, length, 0.05
     if kind < 0.88:
         bush = (0.4 + 0.6 * a, 0.5 + 1.5 * b, 0.4 + 1.4 * c)
         return shapes.foliage(bush, 50 + int(70 * b), 0.07 + 0.08 * d, rng), bush[0] / 2, bush[1], 0.2
     if kind < 0.92:
-        long = 1.2 + 0.8 * a
-        return shape("bench" if b < 0.6 else "bench without back", 1.0, long), 0.22, long, 0.3
+        length = 1.2 + 0.8 * a
+        return shape("bench" if b < 0.6 else "bench without back", 1.0, length), 0.22, length, 0.3
     if kind < 0.96:
-        long, deep = 0.8 + 0.9 * a, 0.3 + 0.15 * b
-        return shape("table", 2 * deep, long, 0.7 + 0.35 * c * c), deep, long, 0.2
+        length, depth = 0.8 + 0.9 * a, 0.3 + 0.15 * b
+        return shape("table", 2 * depth, length, 0.7 + 0.35 * c * c), depth, length, 0.2
     if kind < 0.98:
         return shapes.sign(1.6 + 1.0 * a, 0.4 + 0.4 * b), 0.05, 0.3, 1.0
-    high = 0.45 + 0.35 * a
-    return shape("traffic cone", high, high, high), 0.12, 0.0, 1.0
+    height = 0.45 + 0.35 * a
+    return shape("traffic cone", height, height, height), 0.12, 0.0, 1.0
 
 
 def _draw_wall(a: float, b: float, c: float) -> tuple[Mesh, float, float, float]:
-    long, high = 1.0 + 3.0 * a, 0.5 + 2.5 * b
-    opening = (-0.25 * long, (0.5 * c) * long, 0.0 if c < 0.1 else 0.9, 0.85 * high)
-    wall = shapes.wall(long, high, thick=0.15, opening=opening if high > 1.8 and c < 0.4 else None)
-    return wall, 0.08, long, 0.15
+    length, height = 1.0 + 3.0 * a, 0.5 + 2.5 * b
+    opening = (-0.25 * length, (0.5 * c) * length, 0.0 if c < 0.1 else 0.9, 0.85 * height)
+    wall = shapes.wall(length, height, thick=0.15, opening=opening if height > 1.8 and c < 0.4 else None)
+    return wall, 0.08, length, 0.15
 
 
 def _draw_car(a: float, b: float, c: float) -> tuple[Mesh, float, float, float]:
     """A car or a van whose side, front or back is towards the person."""
-    wide = 1.65 + 0.25 * a
+    width = 1.65 + 0.25 * a
     if c < 0.75:
-        long, mesh = 3.7 + b, shape("car", 3.7 + b, wide, 1.4 + 0.3 * a)
+        length, mesh = 3.7 + b, shape("car", 3.7 + b, width, 1.4 + 0.3 * a)
     else:
-        long, wide = 4.6 + b, wide + 0.2
-        mesh = shape("van", long, wide, 1.9 + 0.4 * a)
+        length, width = 4.6 + b, width + 0.2
+        mesh = shape("van", length, width, 1.9 + 0.4 * a)
     if b < 0.35:
         # end on
-        return mesh, long / 2, wide, 0.15
-    return mesh.moved((0, 0, 0), pi / 2), wide / 2, long, 0.1
+        return mesh, length / 2, width, 0.15
+    return mesh.moved((0, 0, 0), pi / 2), width / 2, length, 0.1
 
 
 def occluder(config: SceneConfig, feet: np.ndarray, tall: float, rng: np.random.Generator) -> Mesh | None:
@@ -133,26 +133,30 @@ def occluder(config: SceneConfig, feet: np.ndarray, tall: float, rng: np.random.
     """
     if rng.random() >= config.occluder * config.hard:
         return None
-    near, kind, hide, side, a, b, c = rng.random(7).tolist()
-    share = 0.5 + 0.35 * near
+    distance_draw, kind, hide_draw, side_draw, a, b, c = rng.random(7).tolist()
+    share = 0.5 + 0.35 * distance_draw
     distance = max(hypot(feet[0], feet[1]), 1e-6)
     heading = atan2(feet[1], feet[0])
     if kind < 0.55:
         # hides the legs up to a share of the height: its top lies on the beam to that height
-        share = min(0.5 + 0.47 * near, 1 - _BEFORE / max(distance, 2 * _BEFORE))
-        top = share * (feet[2] + tall * (0.15 + 0.40 * hide)) - feet[2]
+        share = min(0.5 + 0.47 * distance_draw, 1 - _BEFORE / max(distance, 2 * _BEFORE))
+        top = share * (feet[2] + tall * (0.15 + 0.40 * hide_draw)) - feet[2]
         mesh = _low(max(top, 0.1), share, a, b, c, rng)
-        return mesh.moved((feet[0] * share, feet[1] * share, feet[2]), heading + 0.5 * (side - 0.5))
+        return mesh.moved((feet[0] * share, feet[1] * share, feet[2]), heading + 0.5 * (side_draw - 0.5))
     if kind < 0.8:
         # hides one side, from a hand's breadth beyond the middle to the shoulder
-        edge = (-0.05 + 0.30 * hide) * share
-        mesh, half = _tall(distance, share, tall, a, b, c, rng)
-        across = edge + half if side < 0.5 else -(edge + half)
+        edge = (-0.05 + 0.30 * hide_draw) * share
+        mesh, half_width = _tall(distance, share, tall, a, b, c, rng)
+        lateral_offset = edge + half_width if side_draw < 0.5 else -(edge + half_width)
     else:
         # hides a strip
-        mesh, across = _strip(share, tall, a, b, c, rng), (side + hide - 1) * 0.5 * share
-    place = (feet[0] * share - across * feet[1] / distance, feet[1] * share + across * feet[0] / distance, feet[2])
-    return mesh.moved(place, heading)
+        mesh, lateral_offset = _strip(share, tall, a, b, c, rng), (side_draw + hide_draw - 1) * 0.5 * share
+    position = (
+        feet[0] * share - lateral_offset * feet[1] / distance,
+        feet[1] * share + lateral_offset * feet[0] / distance,
+        feet[2],
+    )
+    return mesh.moved(position, heading)
 
 
 def _low(top: float, share: float, a: float, b: float, c: float, rng: np.random.Generator) -> Mesh:
@@ -170,28 +174,28 @@ def _low(top: float, share: float, a: float, b: float, c: float, rng: np.random.
 
 
 def _tall(
-    distance: float, share: float, tall: float, a: float, b: float, c: float, rng: np.random.Generator
+    distance: float, share: float, person_height: float, a: float, b: float, c: float, rng: np.random.Generator
 ) -> tuple[Mesh, float]:
     """The edge of a wall, a van or a hedge that is higher than anybody, or of a parked car, and its half width."""
-    room = distance * min(share, 1 - share)
-    if a < 0.3 and room > 1.2:
-        wide = 1.7 + 0.2 * b
+    clearance = distance * min(share, 1 - share)
+    if a < 0.3 and clearance > 1.2:
+        width = 1.7 + 0.2 * b
         # end on: the person stands beside it
-        if room > 2.8:
-            mesh = shape("car", 3.8 + c, wide, 1.45) if b < 0.5 else shape("van", 4.6 + c, wide, 2.0 + 0.4 * c)
-            return mesh, wide / 2
+        if clearance > 2.8:
+            mesh = shape("car", 3.8 + c, width, 1.45) if b < 0.5 else shape("van", 4.6 + c, width, 2.0 + 0.4 * c)
+            return mesh, width / 2
         return shape("van", 1.6, 1.6 + c, 2.2).moved((0, 0, 0), pi / 2), 0.8
     if a < 0.5:
-        wide = 0.8 + 0.6 * b
-        return shapes.foliage((0.5, wide, tall + 0.3 + c), 120, 0.10 + 0.10 * b, rng), 0.45 * wide
-    return shapes.box((0.2, 1.5, tall + 2)), 0.75
+        width = 0.8 + 0.6 * b
+        return shapes.foliage((0.5, width, person_height + 0.3 + c), 120, 0.10 + 0.10 * b, rng), 0.45 * width
+    return shapes.box((0.2, 1.5, person_height + 2)), 0.75
 
 
-def _strip(share: float, tall: float, a: float, b: float, c: float, rng: np.random.Generator) -> Mesh:
+def _strip(share: float, person_height: float, a: float, b: float, c: float, rng: np.random.Generator) -> Mesh:
     """A pole, a trunk, a signpost, a branch that hangs down or a pillar."""
     radius = (0.03 + 0.17 * b * b) * share
     if a < 0.6:
-        return shape("pole", radius, radius, tall + 2)
+        return shape("pole", radius, radius, person_height + 2)
     if a < 0.7:
         return shapes.sign(1.3 + 0.8 * c, 0.35 * share + 0.2 * b)
     if a < 0.85:
@@ -199,7 +203,7 @@ def _strip(share: float, tall: float, a: float, b: float, c: float, rng: np.rand
         mesh = shapes.foliage((0.4, 0.6 * share + 0.4 * b, 1.0), 60 + int(60 * c), 0.08 + 0.06 * b, rng)
         stem = shape("pole", 0.02, 0.02, 0.6)
         return shapes.union([stem, mesh.moved((0, 0, 0.55 + 0.5 * c))])
-    return shapes.box((0.3, (0.15 + 0.25 * b) * share, tall + 2))
+    return shapes.box((0.3, (0.15 + 0.25 * b) * share, person_height + 2))
 
 
 def ground(config: SceneConfig, feet: np.ndarray, rng: np.random.Generator) -> Mesh:
@@ -208,21 +212,21 @@ def ground(config: SceneConfig, feet: np.ndarray, rng: np.random.Generator) -> M
     Else a square of half width 3 m, and by `hard` now and then a kerb (the person on either side of it), a rough
     surface, which is lowest at the feet's level, or grass about the ankles.
     """
-    u, v, kind, around, a, b, c = rng.random(7).tolist()
+    u, v, kind, heading_draw, a, b, c = rng.random(7).tolist()
     # a standard normal of two uniforms: Box and Muller 1958
-    normal, heading = sqrt(-2 * log(1 - u)) * cos(2 * pi * v), (2 * around - 1) * pi
+    normal, heading = sqrt(-2 * log(1 - u)) * cos(2 * pi * v), (2 * heading_draw - 1) * pi
     tilt = tan(config.slope * normal)
     slope = (tilt * cos(heading), tilt * sin(heading))
     if config.name in _BARE:
         return shapes.quad(_PAPER_HALF, slope).moved(feet)
-    uneven = config.clutter * config.hard
-    if kind < _KERB * uneven:
+    share_scale = config.clutter * config.hard
+    if kind < _KERB * share_scale:
         return _kerb(slope, a, b, c).moved(feet)
-    kind -= _KERB * uneven
-    if kind < _ROUGH * uneven:
+    kind -= _KERB * share_scale
+    if kind < _ROUGH * share_scale:
         return _rough(slope, a, rng).moved(feet)
-    kind -= _ROUGH * uneven
-    if kind < _GRASS * uneven:
+    kind -= _ROUGH * share_scale
+    if kind < _GRASS * share_scale:
         lawn = shapes.grass(0.5 + 0.3 * a, 0.05 + 0.15 * b, 40 + int(40 * c), rng)
         lawn.vertices[:, 2] += lawn.vertices[:, :2] @ np.array(slope, np.float32)
         return shapes.union([shapes.quad(_WILD_HALF, slope), lawn]).moved(feet)
@@ -233,10 +237,10 @@ def _kerb(slope: tuple[float, float], a: float, b: float, c: float) -> Mesh:
     """Two levels with an edge 0.2 to 0.9 m from the feet; the feet's level is 0."""
     turn, edge = 2 * pi * a, 0.2 + 0.7 * b
     step = (0.04 + 0.14 * abs(2 * c - 1)) * (1 if c < 0.5 else -1)
-    far = _WILD_HALF
-    strip = [[-far, -far, 0], [edge, -far, 0], [edge, far, 0], [-far, far, 0]]
-    riser = [[edge, -far, 0], [edge, -far, step], [edge, far, step], [edge, far, 0]]
-    beyond = [[edge, -far, step], [far, -far, step], [far, far, step], [edge, far, step]]
+    half = _WILD_HALF
+    strip = [[-half, -half, 0], [edge, -half, 0], [edge, half, 0], [-half, half, 0]]
+    riser = [[edge, -half, 0], [edge, -half, step], [edge, half, step], [edge, half, 0]]
+    beyond = [[edge, -half, step], [half, -half, step], [half, half, step], [edge, half, step]]
     kerb = Mesh(np.array(strip + riser + beyond, np.float32), shapes.repeated(3, 4, "quad")).moved((0, 0, 0), turn)
     kerb.vertices[:, 2] += kerb.vertices[:, :2] @ np.array(slope, np.float32)
     return kerb
@@ -244,12 +248,12 @@ def _kerb(slope: tuple[float, float], a: float, b: float, c: float) -> Mesh:
 
 def _rough(slope: tuple[float, float], a: float, rng: np.random.Generator) -> Mesh:
     """A field of heights, finer towards the feet, where it is 0 or below."""
-    flat, faces, spread, beneath = _grid()
-    vertices = flat.copy()
-    height = rng.standard_normal(len(flat), np.float32) * np.float32(_ROUGHNESS * (0.5 + a))
+    flat_vertices, faces, scale, is_at_feet = _grid()
+    vertices = flat_vertices.copy()
+    height = rng.standard_normal(len(flat_vertices), np.float32) * np.float32(_ROUGHNESS * (0.5 + a))
     # nobody's soles are buried
-    np.minimum(height, 0, out=height, where=beneath)
-    vertices[:, 2] = height * spread + flat[:, :2] @ np.array(slope, np.float32)
+    np.minimum(height, 0, out=height, where=is_at_feet)
+    vertices[:, 2] = height * scale + flat_vertices[:, :2] @ np.array(slope, np.float32)
     return Mesh(vertices, faces)
 
 
@@ -257,8 +261,8 @@ def _rough(slope: tuple[float, float], a: float, rng: np.random.Generator) -> Me
 def _grid() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Vertices ((cells + 1)^2, 3), flat, closer to each other near the middle, and two triangles a cell; how much a
     vertex's height varies, 1 at the feet; which vertices lie under or beside the feet."""
-    at = np.linspace(-1, 1, _CELLS + 1)
-    at = _WILD_HALF * np.sign(at) * np.abs(at) ** 1.7
-    plane = shapes.grid(at, at)
-    flat = plane.vertices
-    return flat, plane.faces, 1 + 0.4 * np.abs(flat[:, :2]).sum(1), np.hypot(*flat[:, :2].T) < 0.6
+    coordinates = np.linspace(-1, 1, _CELLS + 1)
+    coordinates = _WILD_HALF * np.sign(coordinates) * np.abs(coordinates) ** 1.7
+    plane = shapes.grid(coordinates, coordinates)
+    vertices = plane.vertices
+    return vertices, plane.faces, 1 + 0.4 * np.abs(vertices[:, :2]).sum(1), np.hypot(*vertices[:, :2].T) < 0.6

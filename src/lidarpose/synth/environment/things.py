@@ -33,12 +33,12 @@ def _at(mesh: Mesh, x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float =
     return mesh.moved((x, y, z), yaw)
 
 
-def _box(size: Sequence[float] | np.ndarray, *at: float) -> Mesh:
-    return _at(shapes.box(size), *at)
+def _box(size: Sequence[float] | np.ndarray, *position: float) -> Mesh:
+    return _at(shapes.box(size), *position)
 
 
-def _post(radius: float, height: float, *at: float) -> Mesh:
-    return _at(shape("pole", radius, radius, height), *at)
+def _post(radius: float, height: float, *position: float) -> Mesh:
+    return _at(shape("pole", radius, radius, height), *position)
 
 
 def _union(*parts: Mesh | bool) -> Mesh:
@@ -54,98 +54,98 @@ def facade(
 ) -> list[tuple[str, Mesh]]:
     """A house front along y, its face at x = 0, with a depth: windows set back, some with bars, niches and doorways,
     pilasters, drainpipes, ledges; behind glass a room."""
-    middle, size, rods = [], [], []
+    centers, sizes, rods = [], [], []
 
-    def block(y: float, wide: float, low: float, high: float, near: float, deep: float) -> None:
-        """From x = near backwards."""
-        middle.append((near - deep / 2, y, low))
-        size.append((deep, wide, high - low))
+    def block(y: float, width: float, low: float, high: float, front_x: float, depth: float) -> None:
+        """From x = front_x backwards."""
+        centers.append((front_x - depth / 2, y, low))
+        sizes.append((depth, width, high - low))
 
-    thick, y = rng.uniform(0.15, 0.5), -length / 2
+    thickness, y = rng.uniform(0.15, 0.5), -length / 2
     sill, top = rng.uniform(0.5, 1.1), rng.uniform(1.9, 2.6)
     while y < length / 2 - 0.3:
-        wide = min(rng.uniform(0.8, 2.6), length / 2 - y)
-        kind, open_share, deep, u, v = rng.random(5)
-        center, opening = y + wide / 2, wide * (0.45 + 0.35 * open_share)
+        bay_width = min(rng.uniform(0.8, 2.6), length / 2 - y)
+        kind, opening_draw, depth_draw, u, v = rng.random(5)
+        center, opening = y + bay_width / 2, bay_width * (0.45 + 0.35 * opening_draw)
         if kind < 0.3 or height < 2.8:
-            block(center, wide, 0, height, 0, thick)
+            block(center, bay_width, 0, height, 0, thickness)
             if u < 0.25:
                 rods.append(_post(0.04 + 0.03 * v, height, 0.07, center))
         elif kind < 0.3 + niches:
             # a doorway or a niche
-            back = 0.15 + 1.0 * deep * deep
+            niche_depth = 0.15 + 1.0 * depth_draw * depth_draw
             for side in (-1, 1):
-                block(center + side * (wide + opening) / 4, (wide - opening) / 2, 0, height, 0, back)
-            block(center, opening, 2.0 + 0.5 * u, height, 0, back)
-            block(center, opening, 0, 2.6, -back, 0.05)
+                block(center + side * (bay_width + opening) / 4, (bay_width - opening) / 2, 0, height, 0, niche_depth)
+            block(center, opening, 2.0 + 0.5 * u, height, 0, niche_depth)
+            block(center, opening, 0, 2.6, -niche_depth, 0.05)
             if v < 0.4:
-                block(center, opening, 0, 0.1 + 0.3 * u, -0.1, back)
+                block(center, opening, 0, 0.1 + 0.3 * u, -0.1, niche_depth)
         elif kind < 0.88:
-            block(center, wide, 0, sill, 0, thick)
-            block(center, wide, top, height, 0, thick)
+            block(center, bay_width, 0, sill, 0, thickness)
+            block(center, bay_width, top, height, 0, thickness)
             for side in (-1, 1):
-                block(center + side * (wide + opening) / 4, (wide - opening) / 2, sill, top, 0, thick)
+                block(center + side * (bay_width + opening) / 4, (bay_width - opening) / 2, sill, top, 0, thickness)
             if u < 0.7:
-                block(center, opening, sill, top, -thick * (0.3 + 0.6 * deep), 0.03)
+                block(center, opening, sill, top, -thickness * (0.3 + 0.6 * depth_draw), 0.03)
             block(center, opening + 0.1, sill - 0.06, sill, 0.08, 0.1)
             if v < bars:
                 rods.append(_at(_window_bars(opening, top - sill, rng), 0.03, center, sill))
         else:
             # a pilaster or a corner of a projection
-            proud = 0.08 + 0.5 * deep * deep
-            block(center, wide, 0, height, 0, thick)
-            block(center, 0.25 + 0.5 * u, 0, height, proud, proud + 0.05)
-        y += wide
+            projection = 0.08 + 0.5 * depth_draw * depth_draw
+            block(center, bay_width, 0, height, 0, thickness)
+            block(center, 0.25 + 0.5 * u, 0, height, projection, projection + 0.05)
+        y += bay_width
     if rng.random() < 0.4:
         block(0, length, height * 0.6, height * 0.6 + 0.2, 0.15, 0.2)
     # rooms end somewhere
     block(0, length, 0, height, -1.5 - 3 * rng.random(), 0.1)
-    front = shapes.boxes(np.array(middle), np.array(size))
+    front = shapes.boxes(np.array(centers), np.array(sizes))
     return [("facade", front)] + [("window bars" if len(rod.faces) > 30 else "pole", rod) for rod in rods]
 
 
-def _window_bars(wide: float, tall: float, rng: np.random.Generator) -> Mesh:
-    count = max(3, int(wide / rng.uniform(0.09, 0.16)))
+def _window_bars(width: float, height: float, rng: np.random.Generator) -> Mesh:
+    count = max(3, int(width / rng.uniform(0.09, 0.16)))
     middle, size = np.zeros((count + 2, 3)), np.empty((count + 2, 3))
-    middle[:count, 1] = (np.arange(count) + 0.5) * (wide / count) - wide / 2
-    size[:count] = (0.02, 0.02, tall)
-    middle[count:, 2], size[count:] = (0.1 * tall, 0.85 * tall), (0.02, wide, 0.03)
+    middle[:count, 1] = (np.arange(count) + 0.5) * (width / count) - width / 2
+    size[:count] = (0.02, 0.02, height)
+    middle[count:, 2], size[count:] = (0.1 * height, 0.85 * height), (0.02, width, 0.03)
     return shapes.boxes(middle, size)
 
 
 def _bars(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A barred opening in a piece of wall."""
-    wide, low = 0.8 + u[0], 0.3 + 0.7 * u[1]
-    wall = shapes.wall(wide + 0.8, 2.4 + u[2], thick=0.25, opening=(-wide / 2, wide / 2, low, low + 1.3))
-    return union([wall, _at(_window_bars(wide, 1.3, rng), 0.1, 0, low)])
+    width, sill = 0.8 + u[0], 0.3 + 0.7 * u[1]
+    wall = shapes.wall(width + 0.8, 2.4 + u[2], thick=0.25, opening=(-width / 2, width / 2, sill, sill + 1.3))
+    return union([wall, _at(_window_bars(width, 1.3, rng), 0.1, 0, sill)])
 
 
 def _wall_end(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A short wall seen on its end, or a corner of two."""
-    high, long = 1.2 + 1.8 * u[0], 0.5 + 2.5 * u[1]
-    wall = _box((long, 0.15 + 0.3 * u[2], high), -long / 2)
+    height, length = 1.2 + 1.8 * u[0], 0.5 + 2.5 * u[1]
+    wall = _box((length, 0.15 + 0.3 * u[2], height), -length / 2)
     if u[3] < 0.4:
         side = 1 if u[4] < 0.5 else -1
-        return union([wall, _box((0.2, 0.4 + u[5], high), 0, side * (0.2 + u[5] / 2))])
+        return union([wall, _box((0.2, 0.4 + u[5], height), 0, side * (0.2 + u[5] / 2))])
     # a post at the end, with a cap
-    return _union(wall, u[3] < 0.7 and _box((0.3, 0.3, high + 0.1)))
+    return _union(wall, u[3] < 0.7 and _box((0.3, 0.3, height + 0.1)))
 
 
 def _cabinet(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """Of a street's power or telephone: a plinth, a body, a roof."""
-    deep, wide, high = 0.25 + 0.3 * u[0], 0.4 + 0.9 * u[1] ** 2, 0.9 + 0.9 * u[2]
+    depth, width, height = 0.25 + 0.3 * u[0], 0.4 + 0.9 * u[1] ** 2, 0.9 + 0.9 * u[2]
     return _union(
-        _box((deep, wide, 0.15)),
-        _box((0.94 * deep, 0.96 * wide, high - 0.15), 0, 0, 0.15),
-        u[3] < 0.6 and _box((deep + 0.06, wide + 0.06, 0.05), 0, 0, high),
-        u[4] < 0.3 and _box((deep, 0.5 * wide + 0.2, 0.7 * high), 0, 0.75 * wide + 0.15),
+        _box((depth, width, 0.15)),
+        _box((0.94 * depth, 0.96 * width, height - 0.15), 0, 0, 0.15),
+        u[3] < 0.6 and _box((depth + 0.06, width + 0.06, 0.05), 0, 0, height),
+        u[4] < 0.3 and _box((depth, 0.5 * width + 0.2, 0.7 * height), 0, 0.75 * width + 0.15),
     )
 
 
 def _pillar(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """Round or square, up to a ceiling or with a base and a cap."""
-    half, high = 0.1 + 0.22 * u[0], 1.6 + 2.4 * u[1]
-    mesh = _post(half, high) if u[2] < 0.5 else _box((2 * half, 2 * half * (0.6 + 0.8 * u[5]), high))
+    half, height = 0.1 + 0.22 * u[0], 1.6 + 2.4 * u[1]
+    mesh = _post(half, height) if u[2] < 0.5 else _box((2 * half, 2 * half * (0.6 + 0.8 * u[5]), height))
     return _union(mesh, u[3] < 0.4 and _box((2.6 * half, 2.6 * half, 0.15 + 0.6 * u[4] ** 2)))
 
 
@@ -165,34 +165,36 @@ def crown(size: tuple[float, float, float], rng: np.random.Generator, *, dense: 
     balls = []
     for _ in range(count):
         share = rng.uniform(0.55, 1.0, 3) if count > 1 else np.ones(3)
-        off = (1 - share) * (rng.random(3) - [0.5, 0.5, 0])
+        offset = (1 - share) * (rng.random(3) - [0.5, 0.5, 0])
         leaf = max(0.05, 0.09 * max(size)) * rng.uniform(0.7, 1.3)
         ball = shapes.foliage(share * size, int(min(120, 70 + 50 * dense)), leaf, rng)
-        balls.append(_leaves(ball).moved(off * size))
+        balls.append(_leaves(ball).moved(offset * size))
         if rng.random() < 0.6 * dense:
             # no beam passes the middle
             half = 0.3 * share * size
-            balls.append(shape("ball", *half).moved(off * size + [0, 0, share[2] * size[2] / 2]))
+            balls.append(shape("ball", *half).moved(offset * size + [0, 0, share[2] * size[2] / 2]))
     return union(balls)
 
 
 def _clipped(size: tuple[float, float, float], rng: np.random.Generator) -> Mesh:
     """A clipped hedge: a box whose sides are leaves, with a dense inside."""
-    deep, long, high = size
+    depth, length, height = size
     leaf = 0.1
-    count = int(min(260, 22 * (2 * long * high + 2 * deep * high + deep * long)))
-    where = rng.random((count, 3)) * [deep, long, high] - [deep / 2, long / 2, 0]
+    count = int(min(260, 22 * (2 * length * height + 2 * depth * height + depth * length)))
+    positions = rng.random((count, 3)) * [depth, length, height] - [depth / 2, length / 2, 0]
     # to the nearest of a side that is drawn by its area
-    area = np.array([long * high, long * high, deep * high, deep * high, deep * long])
+    area = np.array([length * height, length * height, depth * height, depth * height, depth * length])
     side = rng.choice(5, count, p=area / area.sum())
-    for number, (axis, value) in enumerate(((0, deep / 2), (0, -deep / 2), (1, long / 2), (1, -long / 2), (2, high))):
-        where[side == number, axis] = value
-    where += rng.normal(0, 0.04, where.shape)
-    leaves = where[:, None] + rng.normal(0, leaf, (count, 3, 3))
+    for number, (axis, value) in enumerate(
+        ((0, depth / 2), (0, -depth / 2), (1, length / 2), (1, -length / 2), (2, height))
+    ):
+        positions[side == number, axis] = value
+    positions += rng.normal(0, 0.04, positions.shape)
+    leaves = positions[:, None] + rng.normal(0, leaf, (count, 3, 3))
     leaves[..., 2] = np.maximum(leaves[..., 2], 0)
-    inside = _box((max(deep - 0.25, 0.05), max(long - 0.2, 0.05), max(high - 0.15, 0.1)))
-    outside = Mesh(leaves.reshape(-1, 3).astype(np.float32), shapes.repeated(count, 3, "triangle"))
-    return union([_leaves(outside), inside])
+    core = _box((max(depth - 0.25, 0.05), max(length - 0.2, 0.05), max(height - 0.15, 0.1)))
+    shell = Mesh(leaves.reshape(-1, 3).astype(np.float32), shapes.repeated(count, 3, "triangle"))
+    return union([_leaves(shell), core])
 
 
 def _hedge(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -208,50 +210,57 @@ def _hedge(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 def _hedge_at_wall(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A hedge, a climber or a pot plant close to a wall."""
-    long = 1.0 + 3.5 * u[4]
+    length = 1.0 + 3.5 * u[4]
     plant = _hedge(u, rng) if u[5] < 0.6 else crown((0.4 + 0.3 * u[0], 0.4 + 0.5 * u[1], 1.0 + 0.9 * u[2]), rng)
     low, high = plant.vertices.min(0), plant.vertices.max(0)
-    wall = _box((0.2, long, 0.8 + 2.2 * u[6]))
+    wall = _box((0.2, length, 0.8 + 2.2 * u[6]))
     return union([_at(plant, y=-(low[1] + high[1]) / 2), _at(wall, low[0] - 0.12)])
 
 
 def _bush(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    wide = 0.4 + 1.2 * u[0]
-    return crown((wide, wide * (0.7 + 0.6 * u[1]), 0.5 + 1.4 * u[2]), rng)
+    width = 0.4 + 1.2 * u[0]
+    return crown((width, width * (0.7 + 0.6 * u[1]), 0.5 + 1.4 * u[2]), rng)
 
 
 def _tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A trunk and a crown above heads."""
-    clear, wide = 2.0 + 1.2 * u[0], 2.0 + 3.0 * u[1]
+    trunk_height, width = 2.0 + 1.2 * u[0], 2.0 + 3.0 * u[1]
     radius = 0.08 + 0.25 * u[2] ** 2
-    top = _at(crown((wide, wide, 2 + 2.5 * u[3]), rng), z=clear)
+    top = _at(crown((width, width, 2 + 2.5 * u[3]), rng), z=trunk_height)
     # suckers at the foot
-    low = u[4] < 0.3 and shapes.foliage((0.6, 0.6, 0.3 + 0.7 * u[5]), 70, 0.06, rng)
-    return _union(_post(radius, clear + 0.8), top, low)
+    suckers = u[4] < 0.3 and shapes.foliage((0.6, 0.6, 0.3 + 0.7 * u[5]), 70, 0.06, rng)
+    return _union(_post(radius, trunk_height + 0.8), top, suckers)
 
 
 def _young_tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A thin trunk and a small crown that begins low."""
-    clear, wide, high = 0.7 + 1.3 * u[0], 0.4 + 1.0 * u[1], 1.0 + 1.8 * u[3]
-    top = _at(crown((wide, wide, high), rng, dense=0.3), z=clear)
-    return union([_post(0.012 + 0.035 * u[2], clear + high * 0.6), top])
+    trunk_height, width, height = 0.7 + 1.3 * u[0], 0.4 + 1.0 * u[1], 1.0 + 1.8 * u[3]
+    top = _at(crown((width, width, height), rng, dense=0.3), z=trunk_height)
+    return union([_post(0.012 + 0.035 * u[2], trunk_height + height * 0.6), top])
 
 
 def _low_crown(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A trunk with a crown down to knees or hips: thuja, spruce, an old shrub."""
-    clear, wide, high = 0.1 + 1.0 * u[0], 0.6 + 2.2 * u[1], 1.6 + 3.0 * u[2]
-    return union([_post(0.05 + 0.15 * u[3], clear + 0.6 * high), _at(crown((wide, wide, high), rng), z=clear)])
+    trunk_height, width, height = 0.1 + 1.0 * u[0], 0.6 + 2.2 * u[1], 1.6 + 3.0 * u[2]
+    return union(
+        [
+            _post(0.05 + 0.15 * u[3], trunk_height + 0.6 * height),
+            _at(crown((width, width, height), rng), z=trunk_height),
+        ]
+    )
 
 
 def _staked_tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A young tree tied to one to three stakes."""
-    parts, count, tall = [_young_tree(u, rng)], 1 + int(3 * u[4]), 0.9 + 0.9 * u[5]
-    away = 0.12 + 0.25 * u[6]
+    parts, count, stake_height = [_young_tree(u, rng)], 1 + int(3 * u[4]), 0.9 + 0.9 * u[5]
+    distance = 0.12 + 0.25 * u[6]
     for k in range(count):
         angle = 2 * pi * (k / count + u[7])
-        parts.append(_post(0.025 + 0.02 * u[6], tall, away * cos(angle), away * sin(angle)))
+        parts.append(_post(0.025 + 0.02 * u[6], stake_height, distance * cos(angle), distance * sin(angle)))
         if count > 1:
-            bar = _box((0.04, 1.6 * away, 0.07), away * cos(angle) / 2, away * sin(angle) / 2, 0.92 * tall)
+            bar = _box(
+                (0.04, 1.6 * distance, 0.07), distance * cos(angle) / 2, distance * sin(angle) / 2, 0.92 * stake_height
+            )
             parts.append(bar)
     return _union(*parts, u[0] < 0.3 and _post(0.08 + 0.06 * u[1], 0.9 + 0.5 * u[2]))
 
@@ -260,18 +269,18 @@ def _staked_tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 
 def _bollard(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    half, high = 0.05 + 0.12 * u[0], 0.5 + 0.8 * u[1]
-    mesh = _post(half, high) if u[2] < 0.7 else _box((2 * half, 2 * half, high))
-    return _union(mesh, u[3] < 0.4 and _at(shape("ball", 1.15 * half, 1.15 * half, 1.1 * half), z=high))
+    half, height = 0.05 + 0.12 * u[0], 0.5 + 0.8 * u[1]
+    mesh = _post(half, height) if u[2] < 0.7 else _box((2 * half, 2 * half, height))
+    return _union(mesh, u[3] < 0.4 and _at(shape("ball", 1.15 * half, 1.15 * half, 1.1 * half), z=height))
 
 
 def _pole(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A lamp post, a flagpole, a post with a box on it."""
-    radius, high = 0.025 + 0.1 * u[0] ** 2, 1.5 + 6 * u[1]
+    radius, height = 0.025 + 0.1 * u[0] ** 2, 1.5 + 6 * u[1]
     foot = u[2] < 0.3 and _post(1.7 * radius, 0.8 + 0.5 * u[3])
     # a box, a bin or a parking meter at the height of a chest
     box = u[4] < 0.35 and _box((0.2 + 0.2 * u[5], 0.25 + 0.2 * u[6], 0.3 + 0.5 * u[7]), 0.1, 0, 0.6 + 0.7 * u[3])
-    return _union(_post(radius, high), foot, box)
+    return _union(_post(radius, height), foot, box)
 
 
 def _sign(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -279,9 +288,9 @@ def _sign(u: Uniforms, rng: np.random.Generator) -> Mesh:
         return shapes.sign(1.7 + 1.2 * u[1], 0.35 + 0.5 * u[2])
     if u[0] < 0.8:
         # a board on two feet
-        wide, high = 0.5 + 0.8 * u[1], 1.0 + 1.0 * u[2]
-        board = _box((0.04, wide, 0.75 * high), 0, 0, 0.25 * high)
-        return union([board, _post(0.03, high, 0, wide / 2), _post(0.03, high, 0, -wide / 2)])
+        width, height = 0.5 + 0.8 * u[1], 1.0 + 1.0 * u[2]
+        board = _box((0.04, width, 0.75 * height), 0, 0, 0.25 * height)
+        return union([board, _post(0.03, height, 0, width / 2), _post(0.03, height, 0, -width / 2)])
     # an advertising column or a stele
     return _box((0.12 + 0.3 * u[1] ** 2, 0.5 + 0.6 * u[2], 1.3 + 1.1 * u[3]))
 
@@ -307,10 +316,12 @@ def _chair(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 
 def _table(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    long, deep, high = 0.6 + 1.4 * u[0], 0.5 + 0.5 * u[1], 0.7 + 0.4 * u[2] ** 3
+    length, depth, height = 0.6 + 1.4 * u[0], 0.5 + 0.5 * u[1], 0.7 + 0.4 * u[2] ** 3
     # a screen, a case or a pile on it
     size = (0.05 + 0.3 * u[4], 0.3 + 0.3 * u[5], 0.2 + 0.4 * u[6])
-    return _union(shape("table", deep, long, high), u[3] < 0.4 and _box(size, 0, long * (u[7] - 0.5) / 2, high))
+    return _union(
+        shape("table", depth, length, height), u[3] < 0.4 and _box(size, 0, length * (u[7] - 0.5) / 2, height)
+    )
 
 
 def _cart(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -319,18 +330,18 @@ def _cart(u: Uniforms, rng: np.random.Generator) -> Mesh:
     if u[0] < 0.65:
         return _at(shape("pram"), -0.5)
     # a cage or a luggage cart
-    deep, wide, high = 0.6 + 0.3 * u[1], 0.5 + 0.3 * u[2], 0.9 + 0.8 * u[3]
-    sides = [_at(shapes.lattice_fence(wide, high, 0.12, 0.02), side * deep / 2) for side in (-1, 1)]
-    return union([_box((deep, wide, 0.06), 0, 0, 0.15), _box((deep, wide, 0.5 * high * u[4]), 0, 0, 0.2), *sides])
+    depth, width, height = 0.6 + 0.3 * u[1], 0.5 + 0.3 * u[2], 0.9 + 0.8 * u[3]
+    sides = [_at(shapes.lattice_fence(width, height, 0.12, 0.02), side * depth / 2) for side in (-1, 1)]
+    return union([_box((depth, width, 0.06), 0, 0, 0.15), _box((depth, width, 0.5 * height * u[4]), 0, 0, 0.2), *sides])
 
 
 def _bicycle(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """Parked, one or a few side by side."""
     size = 0.9 + 0.2 * u[0]
-    single = union([shape("bicycle"), _box((0.04, 0.56, 0.035), 0.52, 0, 1.02)]).scaled((size,) * 3)
-    single = _union(single, u[1] < 0.3 and _box((0.3, 0.35, 0.25), -0.4 if u[2] < 0.5 else 0.7, 0, 0.75))
+    bicycle = union([shape("bicycle"), _box((0.04, 0.56, 0.035), 0.52, 0, 1.02)]).scaled((size,) * 3)
+    bicycle = _union(bicycle, u[1] < 0.3 and _box((0.3, 0.35, 0.25), -0.4 if u[2] < 0.5 else 0.7, 0, 0.75))
     count = 1 + int(4 * max(0.0, u[3] - 0.5))
-    return union([_at(single, 0.05 * k, 0.45 * k + 0.05 * u[4], yaw=0.1 * (u[5] - 0.5)) for k in range(count)])
+    return union([_at(bicycle, 0.05 * k, 0.45 * k + 0.05 * u[4], yaw=0.1 * (u[5] - 0.5)) for k in range(count)])
 
 
 def moped() -> Mesh:
@@ -351,38 +362,38 @@ def moped() -> Mesh:
 def _moped(u: Uniforms, rng: np.random.Generator) -> Mesh:
     mesh = moped().scaled((0.9 + 0.2 * u[0], 1.0, 0.9 + 0.2 * u[1]))
     # a top box or a wind screen
-    more = _box((0.35, 0.38, 0.35), -0.6, 0, 0.75) if u[3] < 0.6 else _box((0.04, 0.45, 0.5), 0.66, 0, 0.95)
-    return _union(mesh, u[2] < 0.35 and more)
+    extra = _box((0.35, 0.38, 0.35), -0.6, 0, 0.75) if u[3] < 0.6 else _box((0.04, 0.45, 0.5), 0.66, 0, 0.95)
+    return _union(mesh, u[2] < 0.35 and extra)
 
 
 def _cone(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    high = 0.4 + 0.6 * u[0]
-    return shape("traffic cone", 0.9 * high, 0.9 * high, high)
+    height = 0.4 + 0.6 * u[0]
+    return shape("traffic cone", 0.9 * height, 0.9 * height, height)
 
 
 def _sacks(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """Sacks, boxes or cases in a heap."""
-    parts, high = [], 0.0
+    parts, top = [], 0.0
     for _ in range(1 + int(5 * u[0])):
         a, b, c, d, e = rng.random(5)
         size = (0.3 + 0.4 * a, 0.3 + 0.5 * b, 0.2 + 0.4 * c)
-        up = high if u[1] < 0.5 else 0.0
-        where = {"x": 0.4 * (d - 0.5), "y": (0.3 if u[1] < 0.5 else 1.0) * (e - 0.5), "z": up, "yaw": pi * d}
+        bottom = top if u[1] < 0.5 else 0.0
+        placement = {"x": 0.4 * (d - 0.5), "y": (0.3 if u[1] < 0.5 else 1.0) * (e - 0.5), "z": bottom, "yaw": pi * d}
         half = np.array(size) / 2
         part = _box(size) if u[2] < 0.5 else _at(shape("ball", *half), z=half[2] * 0.9)
-        parts.append(_at(part, **where))
-        high = min(high + 0.85 * size[2], 1.5)
+        parts.append(_at(part, **placement))
+        top = min(top + 0.85 * size[2], 1.5)
     return union(parts)
 
 
 def _fence(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    long, high = 1.5 + 5 * u[0], 0.7 + 1.2 * u[1]
+    length, height = 1.5 + 5 * u[0], 0.7 + 1.2 * u[1]
     if u[2] < 0.35:
-        return shapes.rail_fence(long, high, 2 + int(3 * u[3]))
+        return shapes.rail_fence(length, height, 2 + int(3 * u[3]))
     if u[2] < 0.8:
-        return shapes.lattice_fence(long, high, 0.08 + 0.14 * u[3], 0.015 + 0.06 * u[4])
+        return shapes.lattice_fence(length, height, 0.08 + 0.14 * u[3], 0.015 + 0.06 * u[4])
     # boards between posts
-    return union([_box((0.04, long, high - 0.1), 0, 0, 0.1), shapes.rail_fence(long, high + 0.05, 1)])
+    return union([_box((0.04, length, height - 0.1), 0, 0, 0.1), shapes.rail_fence(length, height + 0.05, 1)])
 
 
 def car(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -396,12 +407,12 @@ def car(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 def _car_corner(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A car's corner beside what hides the rest: only a strip of it is seen."""
-    vehicle, hides = car(u * [0.9] + [0.0] * 8, rng), _box((0.15, 2.0 + 2 * u[4], 1.6 + 0.8 * u[5]))
+    vehicle, occluder = car(u * [0.9] + [0.0] * 8, rng), _box((0.15, 2.0 + 2 * u[4], 1.6 + 0.8 * u[5]))
     gap = 0.25 + 0.5 * u[6]
     low, high = vehicle.vertices.min(0), vehicle.vertices.max(0)
-    aside = (2.0 + 2 * u[4]) / 2
+    lateral_offset = (2.0 + 2 * u[4]) / 2
     vehicle = _at(vehicle, -(high[0] if u[7] < 0.5 else -low[0]), (u[3] - 0.5) * high[1] * 2)
-    return union([vehicle, _at(hides, 0.8, gap + aside), _at(hides, 0.8, -aside)])
+    return union([vehicle, _at(occluder, 0.8, gap + lateral_offset), _at(occluder, 0.8, -lateral_offset)])
 
 
 # --- indoors
@@ -409,28 +420,28 @@ def _car_corner(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 def _shelf(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """Uprights, boards and what lies on them."""
-    deep, long, high = 0.3 + 0.3 * u[0], 0.7 + 1.8 * u[1], 1.2 + 1.2 * u[2]
+    depth, length, height = 0.3 + 0.3 * u[0], 0.7 + 1.8 * u[1], 1.2 + 1.2 * u[2]
     levels = 3 + int(3 * u[3])
-    middle = [(0, side * long / 2, 0) for side in (-1, 1)]
-    size = [(deep, 0.03, high)] * 2
+    centers = [(0, side * length / 2, 0) for side in (-1, 1)]
+    sizes = [(depth, 0.03, height)] * 2
     for k in range(levels):
-        z = 0.05 + k * (high - 0.1) / (levels - 1)
-        middle.append((0, 0, z))
-        size.append((deep, long, 0.025))
-        for y in rng.uniform(-0.45, 0.45, 3) * long:
-            middle.append((0, y, z + 0.02))
-            size.append((deep * 0.8, 0.1 + 0.3 * rng.random(), 0.1 + 0.2 * rng.random()))
+        z = 0.05 + k * (height - 0.1) / (levels - 1)
+        centers.append((0, 0, z))
+        sizes.append((depth, length, 0.025))
+        for y in rng.uniform(-0.45, 0.45, 3) * length:
+            centers.append((0, y, z + 0.02))
+            sizes.append((depth * 0.8, 0.1 + 0.3 * rng.random(), 0.1 + 0.2 * rng.random()))
     if u[4] < 0.5:
-        middle.append((-deep / 2, 0, 0))
-        size.append((0.01, long, high))
-    return shapes.boxes(np.array(middle), np.array(size))
+        centers.append((-depth / 2, 0, 0))
+        sizes.append((0.01, length, height))
+    return shapes.boxes(np.array(centers), np.array(sizes))
 
 
 def _cupboard(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    deep, wide, high = 0.35 + 0.3 * u[0], 0.5 + 1.2 * u[1], 0.8 + 1.4 * u[2]
-    door = u[3] < 0.35 and _box((0.5, 0.02, high), deep / 2 + 0.25, wide / 2)
-    case = u[4] < 0.3 and _box((0.3, 0.4, 0.3), 0, wide * (u[5] - 0.5) / 2, high)
-    return _union(_box((deep, wide, high)), door, case)
+    depth, width, height = 0.35 + 0.3 * u[0], 0.5 + 1.2 * u[1], 0.8 + 1.4 * u[2]
+    door = u[3] < 0.35 and _box((0.5, 0.02, height), depth / 2 + 0.25, width / 2)
+    case = u[4] < 0.3 and _box((0.3, 0.4, 0.3), 0, width * (u[5] - 0.5) / 2, height)
+    return _union(_box((depth, width, height)), door, case)
 
 
 def _door(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -441,16 +452,21 @@ def _door(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 def _plant(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A pot plant."""
-    pot, wide = 0.25 + 0.35 * u[0], 0.3 + 0.6 * u[1]
-    return union([_post(0.5 * pot, pot), _at(crown((wide, wide, 0.4 + 1.1 * u[2]), rng, dense=0.5), z=pot)])
+    pot_height, width = 0.25 + 0.35 * u[0], 0.3 + 0.6 * u[1]
+    return union(
+        [
+            _post(0.5 * pot_height, pot_height),
+            _at(crown((width, width, 0.4 + 1.1 * u[2]), rng, dense=0.5), z=pot_height),
+        ]
+    )
 
 
 def _floor_lamp(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A floor lamp, a coat stand, a music stand, a screen on a stand."""
-    high = 1.2 + 0.7 * u[0]
-    shade = u[2] < 0.4 and _post(0.12 + 0.12 * u[3], 0.25, 0, 0, high - 0.1)
-    screen = 0.4 <= u[2] < 0.7 and _box((0.05, 0.5 + 0.5 * u[3], 0.35 + 0.3 * u[4]), 0, 0, high - 0.3)
-    return _union(_post(0.015 + 0.01 * u[1], high), _post(0.14, 0.03), shade, screen)
+    height = 1.2 + 0.7 * u[0]
+    shade = u[2] < 0.4 and _post(0.12 + 0.12 * u[3], 0.25, 0, 0, height - 0.1)
+    screen = 0.4 <= u[2] < 0.7 and _box((0.05, 0.5 + 0.5 * u[3], 0.35 + 0.3 * u[4]), 0, 0, height - 0.3)
+    return _union(_post(0.015 + 0.01 * u[1], height), _post(0.14, 0.03), shade, screen)
 
 
 # --- pieces
@@ -458,41 +474,41 @@ def _floor_lamp(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 def _fragment(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A piece as large as a person or smaller, of no particular thing: a plate, a clump, a corner, some posts."""
-    high, wide = 0.5 + 1.4 * u[0], 0.15 + 0.6 * u[1]
+    height, width = 0.5 + 1.4 * u[0], 0.15 + 0.6 * u[1]
     if u[2] < 0.3:
-        piece = _box((0.05, wide, high))
+        piece = _box((0.05, width, height))
     elif u[2] < 0.5:
-        piece = shapes.foliage((wide, wide, high), 40 + int(70 * u[3]), 0.1, rng)
+        piece = shapes.foliage((width, width, height), 40 + int(70 * u[3]), 0.1, rng)
     elif u[2] < 0.7:
-        half = _box((0.05, wide, high), 0, wide / 2)
+        half = _box((0.05, width, height), 0, width / 2)
         piece = union([half, half.moved((0, 0, 0), 1.2 + 0.6 * u[3])])
     elif u[2] < 0.85:
-        piece = union([_post(0.05, high * (0.4 + 0.6 * rng.random()), 0, wide * rng.random()) for _ in range(4)])
+        piece = union([_post(0.05, height * (0.4 + 0.6 * rng.random()), 0, width * rng.random()) for _ in range(4)])
     else:
-        piece = union([_box(0.15 + 0.35 * rng.random(3), *(rng.random(3) * [wide, wide, high])) for _ in "abc"])
+        piece = union([_box(0.15 + 0.35 * rng.random(3), *(rng.random(3) * [width, width, height])) for _ in "abc"])
     return _at(piece, z=0.7 * max(0.0, u[4] - 0.6))
 
 
 def _floating(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """What hangs, or stands on legs too thin to be seen: a sign, a lamp, a banner, a branch, a machine."""
-    z, high, wide = 0.35 + 1.1 * u[0], 0.3 + 0.9 * u[1], 0.2 + 0.7 * u[2]
+    z, height, width = 0.35 + 1.1 * u[0], 0.3 + 0.9 * u[1], 0.2 + 0.7 * u[2]
     if u[3] < 0.5:
-        return _box((0.04 + 0.3 * u[4] ** 2, wide, high), 0, 0, z)
-    return _at(shapes.foliage((wide, wide, high), 60, 0.1, rng), z=z)
+        return _box((0.04 + 0.3 * u[4] ** 2, width, height), 0, 0, z)
+    return _at(shapes.foliage((width, width, height), 60, 0.1, rng), z=z)
 
 
 def _mannequin(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """As tall and as wide as a person, of a few rough parts: a column, a wrapped pile, a dummy without limbs."""
-    tall, wide = 1.3 + 0.6 * u[0], 0.3 + 0.3 * u[1]
+    height, width = 1.3 + 0.6 * u[0], 0.3 + 0.3 * u[1]
     if u[2] < 0.4:
-        edges, parts = [0.0, *np.sort(rng.uniform(0.1, 0.9, 2)) * tall, tall], []
+        edges, parts = [0.0, *np.sort(rng.uniform(0.1, 0.9, 2)) * height, height], []
         for low, high in pairwise(edges):
-            size = (wide * (0.5 + 0.5 * rng.random()), wide * (0.6 + 0.4 * rng.random()), high - low)
+            size = (width * (0.5 + 0.5 * rng.random()), width * (0.6 + 0.4 * rng.random()), high - low)
             parts.append(_box(size, 0, 0, low))
         return union(parts)
     if u[2] < 0.7:
-        return _at(shape("ball", wide / 2, wide / 2, tall / 2), z=tall / 2)
-    return union([_post(wide / 2 * (0.7 + 0.3 * u[3]), tall * (0.6 + 0.3 * u[4])), _box((0.1, wide, tall))])
+        return _at(shape("ball", width / 2, width / 2, height / 2), z=height / 2)
+    return union([_post(width / 2 * (0.7 + 0.3 * u[3]), height * (0.6 + 0.3 * u[4])), _box((0.1, width, height))])
 
 
 THINGS: dict[str, Thing] = {

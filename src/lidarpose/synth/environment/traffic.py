@@ -33,84 +33,85 @@ def vehicle(rng: np.random.Generator) -> Mesh:
     body = car(u, rng)
     if len(body.faces) != len(_is_window()):
         return body
-    long, wide, high = np.ptp(body.vertices, axis=0)
-    clear = _is_window() & (rng.random(len(body.faces)) < rng.choice([0.0, 0.5, 1.0]))
-    parts = [Mesh(body.vertices, body.faces[~clear])]
+    length, width, height = np.ptp(body.vertices, axis=0)
+    is_open = _is_window() & (rng.random(len(body.faces)) < rng.choice([0.0, 0.5, 1.0]))
+    parts = [Mesh(body.vertices, body.faces[~is_open])]
     for x, y in ((0.06, 0.22), (0.06, -0.22), (-0.16, 0.22), (-0.16, -0.22)):
-        x, y, z = x * long, y * wide, 0.62 * high
-        parts.append(shapes.box((0.1, 0.45, 0.24 * high)).moved((x - 0.15, y, z)))
+        x, y, z = x * length, y * width, 0.62 * height
+        parts.append(shapes.box((0.1, 0.45, 0.24 * height)).moved((x - 0.15, y, z)))
         if rng.random() < 0.3:
-            parts.append(shapes.box((0.22, 0.42, 0.12 * high)).moved((x, y, z)))
-            parts.append(shape("ball", 0.1, 0.09, 0.12).moved((x, y, 0.82 * high)))
+            parts.append(shapes.box((0.22, 0.42, 0.12 * height)).moved((x, y, z)))
+            parts.append(shape("ball", 0.1, 0.09, 0.12).moved((x, y, 0.82 * height)))
     return union(parts)
 
 
 def _post(rng: np.random.Generator) -> Mesh:
     """A post or a mast with plates, boxes and balls: signs, bins, meters, flowers, a traffic light."""
     u = rng.random(3)
-    radius, high = 0.03 + 0.09 * u[0] ** 2, 1.4 + 3.5 * u[1]
-    parts = [shape("pole", radius, radius, high)]
+    radius, height = 0.03 + 0.09 * u[0] ** 2, 1.4 + 3.5 * u[1]
+    parts = [shape("pole", radius, radius, height)]
     for _ in range(rng.integers(1, 5)):
-        size, z, angle = 0.12 + 0.6 * rng.random(3) ** 1.5, rng.uniform(0.3, min(high, 3.0)), rng.uniform(-pi, pi)
+        size, z, angle = 0.12 + 0.6 * rng.random(3) ** 1.5, rng.uniform(0.3, min(height, 3.0)), rng.uniform(-pi, pi)
         if u[2] < 0.4:
             # plates face one way
             size[0], angle = 0.02, 0.0
         part = shapes.box(size) if rng.random() < 0.7 else shape("ball", *size / 2)
-        away = radius + size[0] / 2
-        parts.append(part.moved((away * np.cos(angle), away * np.sin(angle), z), angle))
+        distance = radius + size[0] / 2
+        parts.append(part.moved((distance * np.cos(angle), distance * np.sin(angle), z), angle))
     return union(parts)
 
 
 def _clump(rng: np.random.Generator) -> Mesh:
     """Bushes that touch each other."""
-    where = np.cumsum(rng.normal(0, 0.55, (rng.integers(2, 5), 2)), axis=0)
-    return union([draw_thing("bush", rng).moved((*place, 0)) for place in where])
+    positions = np.cumsum(rng.normal(0, 0.55, (rng.integers(2, 5), 2)), axis=0)
+    return union([draw_thing("bush", rng).moved((*position, 0)) for position in positions])
 
 
 def _corner(rng: np.random.Generator) -> Mesh:
     """A house's corner or a yard's: two walls, one with ledges or piers that stand out from it."""
-    u, (long, other) = rng.random(4), rng.uniform(0.8, 6.0, 2)
-    high, thick = 1.0 + 3.5 * u[0], 0.2 + 0.3 * u[1]
-    middle, size = [(0, long / 2, 0), (-other / 2, 0, 0)], [(thick, long, high), (other, thick, high)]
-    for y in np.arange(0.3, long, rng.uniform(0.8, 2.5)) if u[2] < 0.5 else ():
-        middle.append((thick / 2, y, 0))
-        size.append((0.15 + 0.5 * u[3], 0.25 + 0.3 * u[3], high * rng.uniform(0.7, 1.0)))
-    return shapes.boxes(np.array(middle), np.array(size))
+    u, (length, other_length) = rng.random(4), rng.uniform(0.8, 6.0, 2)
+    height, thickness = 1.0 + 3.5 * u[0], 0.2 + 0.3 * u[1]
+    centers = [(0, length / 2, 0), (-other_length / 2, 0, 0)]
+    sizes = [(thickness, length, height), (other_length, thickness, height)]
+    for y in np.arange(0.3, length, rng.uniform(0.8, 2.5)) if u[2] < 0.5 else ():
+        centers.append((thickness / 2, y, 0))
+        sizes.append((0.15 + 0.5 * u[3], 0.25 + 0.3 * u[3], height * rng.uniform(0.7, 1.0)))
+    return shapes.boxes(np.array(centers), np.array(sizes))
 
 
 # what stands along roads: names of `things.KINDS`, how often, and builders
 _ROADSIDE = (("pole", 0.5, _post), ("bush", 0.15, _clump), ("wall end", 0.2, _corner), ("car", 0.15, vehicle))
 
 
-def _put(site: Site, name: str, mesh: Mesh, place: tuple[float, float], nearest: float) -> None:
+def _put(site: Site, name: str, mesh: Mesh, position: tuple[float, float], nearest: float) -> None:
     """Adds a mesh there where nothing stands within `_GAP`, nor the sensor within `nearest` m."""
-    mesh = mesh.moved((*place, site.level(np.array(place))))
+    mesh = mesh.moved((*position, site.level(np.array(position))))
     low, high = mesh.vertices[:, :2].min(0) - _GAP, mesh.vertices[:, :2].max(0) + _GAP
-    overlaps = np.all((low < site.low[:, 2:4]) & (site.low[:, :2] < high), axis=1)
-    if not overlaps.any() and np.hypot(*np.maximum(np.maximum(low, -high), 0)) >= nearest:
+    is_overlapping = np.all((low < site.low[:, 2:4]) & (site.low[:, :2] < high), axis=1)
+    if not is_overlapping.any() and np.hypot(*np.maximum(np.maximum(low, -high), 0)) >= nearest:
         site.add(name, mesh)
 
 
 def _add_road(site: Site, offset: float, turn: int, rng: np.random.Generator) -> None:
     """Vehicles one after the other on a line along x, or y if `turn` is odd, `offset` m beside the sensor."""
-    at, apart = -_REACH + 12 * rng.random(), rng.choice([2.0, 8.0, 25.0])
+    position, mean_gap = -_REACH + 12 * rng.random(), rng.choice([2.0, 8.0, 25.0])
     heading = pi * rng.integers(2) + turn * pi / 2
-    while at < _REACH:
+    while position < _REACH:
         mesh = vehicle(rng).moved((0, 0, 0), heading + rng.normal(0, 0.05))
-        _put(site, "car", mesh, (offset, at) if turn % 2 else (at, offset), _NEAREST)
-        at += 5.0 + rng.exponential(apart)
+        _put(site, "car", mesh, (offset, position) if turn % 2 else (position, offset), _NEAREST)
+        position += 5.0 + rng.exponential(mean_gap)
 
 
 def _add_houses(site: Site, turn: int, rng: np.random.Generator) -> None:
     """A row of fronts that faces the sensor from one of four sides."""
-    far, at = rng.uniform(14, _REACH), -_REACH
-    while at < _REACH:
-        long = rng.uniform(6, 16)
+    distance, position = rng.uniform(14, _REACH), -_REACH
+    while position < _REACH:
+        length = rng.uniform(6, 16)
         if rng.random() < 0.75:
-            for name, mesh in facade(long, rng.uniform(2.8, 9), rng):
-                mesh = mesh.moved((0, 0, 0), pi).moved((far + rng.exponential(0.5), at + long / 2, 0))
+            for name, mesh in facade(length, rng.uniform(2.8, 9), rng):
+                mesh = mesh.moved((0, 0, 0), pi).moved((distance + rng.exponential(0.5), position + length / 2, 0))
                 site.add(name, mesh.moved((0, 0, 0), turn * pi / 2))
-        at += long
+        position += length
 
 
 def add_surroundings(site: Site, place: str, rng: np.random.Generator) -> None:

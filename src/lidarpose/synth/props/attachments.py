@@ -61,24 +61,24 @@ def draw_props(rng: np.random.Generator, *, kind: str, joints: np.ndarray) -> li
         joints: (26, 3) m, the pose.
     """
     u = rng.random(12).tolist()
-    carries, rides = _CARRIES.get(kind, _OTHERS_CARRY), _RIDES.get(kind)
-    dressed = kind in _ON_FEET and u[8] < _DRESSED
-    if rides is None and u[0] >= carries and not dressed and u[9] >= _HATS:
+    carry_share, ride_options = _CARRIES.get(kind, _OTHERS_CARRY), _RIDES.get(kind)
+    has_skirt = kind in _ON_FEET and u[8] < _DRESSED
+    if ride_options is None and u[0] >= carry_share and not has_skirt and u[9] >= _HATS:
         return []
     points = joints.tolist()
     props: list[Prop | None] = []
-    if rides:
-        make = next((make for share, make in rides if u[0] < share), None)
-        props.append(make(points, u) if make else None)
-    elif u[0] < carries:
+    if ride_options:
+        maker = next((maker for share, maker in ride_options if u[0] < share), None)
+        props.append(maker(points, u) if maker else None)
+    elif u[0] < carry_share:
         props += _draw_carried(points, u, kind)
-    if dressed:
+    if has_skirt:
         vertices, mesh, parts = skirt(points, u[4:8])
         props.append(Prop(name="skirt", mesh=mesh, where=vertices, face_part=parts))
     if (u[9] < (_HELMETS if kind == "cycle" else _HATS)) and kind not in _HATLESS:
         mesh, edge = shape("cap" if kind == "cycle" or u[11] < 0.6 else "hat"), 0.25 + 0.3 * u[6]
-        part = np.full(len(mesh.faces), _HEAD_PART)
-        props.append(rigid_prop("hat", mesh, lambda p: hat_frame(p, edge), face_part=part))
+        face_part = np.full(len(mesh.faces), _HEAD_PART)
+        props.append(rigid_prop("hat", mesh, lambda p: hat_frame(p, edge), face_part=face_part))
     return [prop for prop in props if prop is not None]
 
 
@@ -92,18 +92,22 @@ def upright(points: Points, size: tuple[float, float, float] = (1.0, 1.0, 1.0)) 
 def rod_rows(start: tuple, end: tuple, radius: float) -> tuple[list, list]:
     """Rows (3, 3) and an origin that put the mesh "tube" or "rod" between two points (x, y, z)."""
     dx, dy, dz = (b - a for a, b in zip(start, end, strict=True))
-    long = max((dx * dx + dy * dy + dz * dz) ** 0.5, 1e-6)
-    flat = hypot(dx, dy)
-    aside = (-dy / flat, dx / flat, 0.0) if flat > 1e-3 * long else (0.0, 1.0, 0.0)
-    x, y, z = aside
-    over = (z * dy / long - y * dz / long, x * dz / long - z * dx / long, y * dx / long - x * dy / long)
-    return [[radius * a for a in aside], [radius * a for a in over], [dx, dy, dz]], list(start)
+    length = max((dx * dx + dy * dy + dz * dz) ** 0.5, 1e-6)
+    flat_length = hypot(dx, dy)
+    side_axis = (-dy / flat_length, dx / flat_length, 0.0) if flat_length > 1e-3 * length else (0.0, 1.0, 0.0)
+    x, y, z = side_axis
+    second_axis = (
+        z * dy / length - y * dz / length,
+        x * dz / length - z * dx / length,
+        y * dx / length - x * dy / length,
+    )
+    return [[radius * a for a in side_axis], [radius * a for a in second_axis], [dx, dy, dz]], list(start)
 
 
-def _ahead_of_pelvis(points: Points, at: Point) -> float:
+def _ahead_of_pelvis(points: Points, point: Point) -> float:
     """How far a point is ahead of the pelvis, m."""
     x, y = heading(points)
-    return (at[0] - points[PELVIS][0]) * x + (at[1] - points[PELVIS][1]) * y
+    return (point[0] - points[PELVIS][0]) * x + (point[1] - points[PELVIS][1]) * y
 
 
 # --- what is carried: each a frame from the pose, the hand that carries, and uniforms
@@ -111,21 +115,25 @@ def _ahead_of_pelvis(points: Points, at: Point) -> float:
 
 def _bag(points: Points, hand: int, u: list[float]) -> Frame:
     """A shopping bag or a briefcase, straight down from a hanging hand."""
-    tall = min(0.3 + 0.3 * u[3], points[hand][2] - 0.05)
-    size = (0.22 + 0.22 * u[4], 0.07 + 0.13 * u[5], tall)
-    return lambda p: (upright(p, size), [*p[hand][:2], max(p[hand][2] - 0.01, tall + 0.01)])
+    height = min(0.3 + 0.3 * u[3], points[hand][2] - 0.05)
+    size = (0.22 + 0.22 * u[4], 0.07 + 0.13 * u[5], height)
+    return lambda p: (upright(p, size), [*p[hand][:2], max(p[hand][2] - 0.01, height + 0.01)])
 
 
 def _shoulder_bag(points: Points, hand: int, u: list[float]) -> Frame:
     """At a hip, below the hanging hand's side."""
     sign = 1.0 if u[2] < 0.5 else -1.0
-    deep, tall = 0.08 + 0.07 * u[3], 0.2 + 0.15 * u[4]
-    size, back = (0.25 + 0.15 * u[5], deep, tall), -0.05
+    depth, height = 0.08 + 0.07 * u[3], 0.2 + 0.15 * u[4]
+    size, back_offset = (0.25 + 0.15 * u[5], depth, height), -0.05
 
     def frame(p: Points):
         (x, y), hip = heading(p), p[PELVIS]
-        aside = sign * (girth(p, "hip_side") + 0.015 + deep / 2)
-        origin = [hip[0] - aside * y + back * x, hip[1] + aside * x + back * y, hip[2] - 0.12 - tall / 2]
+        lateral_offset = sign * (girth(p, "hip_side") + 0.015 + depth / 2)
+        origin = [
+            hip[0] - lateral_offset * y + back_offset * x,
+            hip[1] + lateral_offset * x + back_offset * y,
+            hip[2] - 0.12 - height / 2,
+        ]
         return upright(p, size), origin
 
     return frame
@@ -143,17 +151,17 @@ def _rucksack(points: Points, hand: int, u: list[float]) -> Frame:
     def frame(p: Points):
         spine, neck = p[JOINT["spine3"]], p[JOINT["neck"]]
         up = np.array([n - s for n, s in zip(neck, spine, strict=True)])
-        across = np.array([a - b for a, b in zip(p[JOINT["left_collar"]], p[JOINT["right_collar"]], strict=True)])
+        lateral = np.array([a - b for a, b in zip(p[JOINT["left_collar"]], p[JOINT["right_collar"]], strict=True)])
         up /= max(float(np.sqrt(up @ up)), 1e-6)
-        across -= (across @ up) * up
-        across /= max(float(np.sqrt(across @ across)), 1e-6)
-        (a0, a1, a2), (u0, u1, u2) = across.tolist(), up.tolist()
-        ahead = np.array([a1 * u2 - a2 * u1, a2 * u0 - a0 * u2, a0 * u1 - a1 * u0])
+        lateral -= (lateral @ up) * up
+        lateral /= max(float(np.sqrt(lateral @ lateral)), 1e-6)
+        (a0, a1, a2), (u0, u1, u2) = lateral.tolist(), up.tolist()
+        forward = np.array([a1 * u2 - a2 * u1, a2 * u0 - a0 * u2, a0 * u1 - a1 * u0])
         # the back is upright where the spine's joints lean forward
-        up, ahead = up * c - ahead * s, ahead * c + up * s
-        behind = girth(p, "back") + 0.01
-        origin = np.array(spine) - behind * ahead + (distance(neck, spine) - _BELOW_NECK - size[2]) * up
-        return [ahead * size[0], across * size[1], up * size[2]], origin
+        up, forward = up * c - forward * s, forward * c + up * s
+        back_distance = girth(p, "back") + 0.01
+        origin = np.array(spine) - back_distance * forward + (distance(neck, spine) - _BELOW_NECK - size[2]) * up
+        return [forward * size[0], lateral * size[1], up * size[2]], origin
 
     return frame
 
@@ -167,9 +175,9 @@ def _ball(points: Points, hand: int, u: list[float]) -> Frame:
     hand, radius = HANDS[u[2] < 0.5], 0.1 + 0.03 * u[3]
 
     def frame(p: Points):
-        at, wrist = p[hand], p[hand - 2]
-        long = max(distance(at, wrist), 1e-6)
-        x, y, z = (a + 0.9 * radius * (a - w) / long for a, w in zip(at, wrist, strict=True))
+        hand_point, wrist = p[hand], p[hand - 2]
+        length = max(distance(hand_point, wrist), 1e-6)
+        x, y, z = (a + 0.9 * radius * (a - w) / length for a, w in zip(hand_point, wrist, strict=True))
         return [[radius, 0, 0], [0, radius, 0], [0, 0, radius]], [x, y, max(z, radius)]
 
     return frame
@@ -177,58 +185,66 @@ def _ball(points: Points, hand: int, u: list[float]) -> Frame:
 
 def _parcel(points: Points, hand: int, u: list[float]) -> Frame:
     """A box between the hands or on them, before the body."""
-    apart = distance(points[HANDS[0]], points[HANDS[1]])
-    deep, tall = 0.2 + 0.2 * u[2], 0.15 + 0.25 * u[3]
-    size, under = (deep, max(apart - 0.04, 0.25), tall), apart < 0.29
+    hand_distance = distance(points[HANDS[0]], points[HANDS[1]])
+    depth, height = 0.2 + 0.2 * u[2], 0.15 + 0.25 * u[3]
+    size, is_under = (depth, max(hand_distance - 0.04, 0.25), height), hand_distance < 0.29
 
     def frame(p: Points):
-        (x, y), at = heading(p), middle(p[HANDS[0]], p[HANDS[1]])
+        (x, y), hands_middle = heading(p), middle(p[HANDS[0]], p[HANDS[1]])
         # behind its back is the belly
-        push = max(0.0, girth(p, "hip_front") + 0.04 + deep / 2 - _ahead_of_pelvis(p, at))
-        low = at[2] + 0.02 if under else at[2] - 0.4 * tall
-        return upright(p, size), [at[0] + push * x, at[1] + push * y, low]
+        push = max(0.0, girth(p, "hip_front") + 0.04 + depth / 2 - _ahead_of_pelvis(p, hands_middle))
+        bottom = hands_middle[2] + 0.02 if is_under else hands_middle[2] - 0.4 * height
+        return upright(p, size), [hands_middle[0] + push * x, hands_middle[1] + push * y, bottom]
 
     return frame
 
 
 def _stick(points: Points, hand: int, u: list[float]) -> Frame:
     """From a hand to the ground a little ahead: a cane, a crutch, a pole."""
-    lean, radius, above = 0.02 + 0.25 * u[3], 0.011 + 0.007 * u[4], 0.03 + (0.3 * u[5] if u[6] < 0.3 else 0.0)
+    lean, radius, overhang = 0.02 + 0.25 * u[3], 0.011 + 0.007 * u[4], 0.03 + (0.3 * u[5] if u[6] < 0.3 else 0.0)
 
     def frame(p: Points):
         (x, y), top = heading(p), p[hand]
         foot = (top[0] + lean * x, top[1] + lean * y, 0.0)
-        over = 1 + above / max(top[2], 0.1)
-        return rod_rows(foot, tuple(f + over * (t - f) for f, t in zip(foot, top, strict=True)), radius)
+        scale = 1 + overhang / max(top[2], 0.1)
+        return rod_rows(foot, tuple(f + scale * (t - f) for f, t in zip(foot, top, strict=True)), radius)
 
     return frame
 
 
 def _umbrella(points: Points, hand: int, u: list[float]) -> Frame:
     """Open, its shaft through a raised hand, leaning to above the head."""
-    wide, low = 0.9 + 0.3 * u[3], 0.12
+    width, handle_length = 0.9 + 0.3 * u[3], 0.12
 
     def frame(p: Points):
-        at, head = p[hand], p[JOINT["head_center"]]
-        top = [at[0] + 0.55 * (head[0] - at[0]), at[1] + 0.55 * (head[1] - at[1]), max(head[2] + 0.32, at[2] + 0.5)]
-        long = distance(top, at)
-        start = tuple(a - low * ((t - a) / long) for t, a in zip(top, at, strict=True))
+        hand_point, head = p[hand], p[JOINT["head_center"]]
+        top = [
+            hand_point[0] + 0.55 * (head[0] - hand_point[0]),
+            hand_point[1] + 0.55 * (head[1] - hand_point[1]),
+            max(head[2] + 0.32, hand_point[2] + 0.5),
+        ]
+        shaft_length = distance(top, hand_point)
+        start = tuple(a - handle_length * ((t - a) / shaft_length) for t, a in zip(top, hand_point, strict=True))
         # the canopy is as wide as it is, however long the shaft
         (x, y, z), origin = rod_rows(start, tuple(top), 1.0)
-        return [[wide * a for a in x], [wide * a for a in y], z], origin
+        return [[width * a for a in x], [width * a for a in y], z], origin
 
     return frame
 
 
 def _suitcase(points: Points, hand: int, u: list[float]) -> Frame:
     """On wheels behind a hand that pulls it, or upright beside who stands."""
-    behind, wide = 0.05 + 0.4 * u[3], 0.8 + 0.35 * u[4]
+    drag_offset, width = 0.05 + 0.4 * u[3], 0.8 + 0.35 * u[4]
 
     def frame(p: Points):
         (x, y), top = heading(p), p[hand]
-        tall = max(top[2], 0.3)
-        rows = [[wide * x, wide * y, wide * behind / tall], [-wide * y, wide * x, 0.0], [behind * x, behind * y, tall]]
-        return rows, [top[0] - behind * x, top[1] - behind * y, wide * 0.28 * behind / tall]
+        height = max(top[2], 0.3)
+        rows = [
+            [width * x, width * y, width * drag_offset / height],
+            [-width * y, width * x, 0.0],
+            [drag_offset * x, drag_offset * y, height],
+        ]
+        return rows, [top[0] - drag_offset * x, top[1] - drag_offset * y, width * 0.28 * drag_offset / height]
 
     return frame
 
@@ -285,15 +301,15 @@ def _free_hands(points: Points) -> dict[str, list[int]]:
     they hold something ahead of the body."""
     pelvis = points[PELVIS][2]
     left, right = (points[hand] for hand in HANDS)
-    ahead = {hand: _ahead_of_pelvis(points, points[hand]) for hand in HANDS}
-    both = abs(left[2] - right[2]) < 0.2 and 0.12 < distance(left, right) < 0.7 and 0.6 < left[2] < 1.5
+    ahead_distance = {hand: _ahead_of_pelvis(points, points[hand]) for hand in HANDS}
+    can_hold = abs(left[2] - right[2]) < 0.2 and 0.12 < distance(left, right) < 0.7 and 0.6 < left[2] < 1.5
     z = {joint: points[joint][2] for hand in HANDS for joint in (hand, hand + _ELBOW)}
     return {
         "any": list(HANDS),
         "hanging": [h for h in HANDS if 0.4 < z[h] < pelvis + 0.12 and z[h] < z[h + _ELBOW]],
         "raised": [h for h in HANDS if z[h] > z[h + _ELBOW] + 0.05],
-        "leaning": [h for h in HANDS if 0.5 < z[h] < 1.2 and z[h] < pelvis + 0.3 and ahead[h] > -0.2],
-        "both": list(HANDS) if both and min(ahead.values()) > 0.15 else [],
+        "leaning": [h for h in HANDS if 0.5 < z[h] < 1.2 and z[h] < pelvis + 0.3 and ahead_distance[h] > -0.2],
+        "both": list(HANDS) if can_hold and min(ahead_distance.values()) > 0.15 else [],
     }
 
 
@@ -307,13 +323,13 @@ def _pushed(name: str, points: Points, u: list[float]) -> Prop | None:
         return None
 
     def frame(p: Points):
-        at = middle(p[hands[0]], p[hands[-1]])
+        handle = middle(p[hands[0]], p[hands[-1]])
         if len(hands) == 1:
             # the middle of the handle is before the middle of the body
             x, y = heading(p)
-            aside = (p[PELVIS][1] - at[1]) * x - (p[PELVIS][0] - at[0]) * y
-            at = [at[0] - aside * y, at[1] + aside * x, at[2]]
-        return upright(p, (1.0, 1.0, min(max(at[2], 0.75), 1.2))), [at[0], at[1], 0.0]
+            lateral_offset = (p[PELVIS][1] - handle[1]) * x - (p[PELVIS][0] - handle[0]) * y
+            handle = [handle[0] - lateral_offset * y, handle[1] + lateral_offset * x, handle[2]]
+        return upright(p, (1.0, 1.0, min(max(handle[2], 0.75), 1.2))), [handle[0], handle[1], 0.0]
 
     return rigid_prop(name, shape(name), frame)
 
@@ -338,11 +354,11 @@ def _under_hips(size: tuple[float, float, float], z: float) -> Frame:
 
 def _seat(points: Points, u: list[float]) -> Prop | None:
     """A chair, a stool or a bench from the ground to the thighs; nothing for who sits on the ground."""
-    high = _seat_height(points)
-    if high < 0.2:
+    height = _seat_height(points)
+    if height < 0.2:
         return None
-    wide = 0.42 + (1.3 * u[2] if u[1] < 0.3 else 0.08 * u[2])
-    return rigid_prop("chair", shape("chair" if u[3] < 0.65 else "seat"), _under_hips((1.0, wide, high), 0.0))
+    width = 0.42 + (1.3 * u[2] if u[1] < 0.3 else 0.08 * u[2])
+    return rigid_prop("chair", shape("chair" if u[3] < 0.65 else "seat"), _under_hips((1.0, width, height), 0.0))
 
 
 # a wheelchair's foot rests are this high, m, and its seat is at 0.5 of the mesh's
@@ -350,17 +366,17 @@ _FOOT_REST, _WHEELCHAIR_SEAT = 0.08, 0.5
 
 
 def _wheelchair(points: Points, u: list[float]) -> Prop | None:
-    high = _seat_height(points) + _FOOT_REST
-    if not 0.4 < high < 0.6:
+    height = _seat_height(points) + _FOOT_REST
+    if not 0.4 < height < 0.6:
         return None
     # the foot rest is where the feet are
     (x, y), hips = heading(points), _hips(points)
     foot = middle(points[JOINT["left_foot"]], points[JOINT["right_foot"]])
-    forward = min(max((foot[0] - hips[0]) * x + (foot[1] - hips[1]) * y, 0.25), 0.75)
-    size = high / _WHEELCHAIR_SEAT
-    rest = shape("box", 0.24, 0.36, 0.025).moved(((forward - 0.04) / size, 0, 0.05))
+    foot_distance = min(max((foot[0] - hips[0]) * x + (foot[1] - hips[1]) * y, 0.25), 0.75)
+    size = height / _WHEELCHAIR_SEAT
+    foot_rest = shape("box", 0.24, 0.36, 0.025).moved(((foot_distance - 0.04) / size, 0, 0.05))
     frame = _under_hips((size, size, size), -_FOOT_REST)
-    return rigid_prop("wheelchair", union([shape("wheelchair"), rest]), frame, lift=_FOOT_REST)
+    return rigid_prop("wheelchair", union([shape("wheelchair"), foot_rest]), frame, lift=_FOOT_REST)
 
 
 # the seat of `things.moped` and its foot board, m
@@ -369,10 +385,10 @@ _MOPED_SEAT, _FOOT_BOARD = 0.75, 0.28
 
 def _moped(points: Points, u: list[float]) -> Prop | None:
     """A scooter under who sits: seat under the hips, the foot board under the feet."""
-    high = _seat_height(points) + _FOOT_BOARD
-    if not 0.6 < high < 0.95:
+    height = _seat_height(points) + _FOOT_BOARD
+    if not 0.6 < height < 0.95:
         return None
-    frame = _under_hips((1.0, 1.0, high / _MOPED_SEAT), -_FOOT_BOARD)
+    frame = _under_hips((1.0, 1.0, height / _MOPED_SEAT), -_FOOT_BOARD)
     return rigid_prop("moped", moped(), frame, lift=_FOOT_BOARD)
 
 
@@ -391,14 +407,18 @@ def _bicycle(points: Points, u: list[float]) -> Prop:
     size = min(max((_hips(points)[2] - _BELOW_SADDLE + _PEDAL) / _SADDLE[1], 0.45), 1.15)
     hands = [_in_bicycle(points, points[hand], size) for hand in HANDS]
     # hands that are where bars can be; else straight ones
-    held = [h for h in hands if 0.25 < h[0] < 0.9 and 0.75 < h[2] < 1.4]
-    bar_x, bar_z = (sum(h[0] for h in held) / len(held), sum(h[2] for h in held) / len(held)) if held else (0.52, 1.05)
+    grips = [h for h in hands if 0.25 < h[0] < 0.9 and 0.75 < h[2] < 1.4]
+    bar_x, bar_z = (
+        (sum(h[0] for h in grips) / len(grips), sum(h[2] for h in grips) / len(grips)) if grips else (0.52, 1.05)
+    )
     bars = shape("box", 0.04, 0.56, 0.035).moved((bar_x, 0, bar_z - 0.03))
-    still = union([shape("bicycle"), bars, _rod((NECK[0], 0.0, NECK[1]), (bar_x, 0.0, bar_z))])
+    frame_mesh = union([shape("bicycle"), bars, _rod((NECK[0], 0.0, NECK[1]), (bar_x, 0.0, bar_z))])
 
     def mesh(p: Points) -> Mesh:
         """In the bicycle's frame, the pedals where the feet are."""
-        return union([still, *_pedals([_in_bicycle(p, p[JOINT[f"{side}_foot"]], size) for side in ("left", "right")])])
+        return union(
+            [frame_mesh, *_pedals([_in_bicycle(p, p[JOINT[f"{side}_foot"]], size) for side in ("left", "right")])]
+        )
 
     frame = _under_hips((size, size, size), -_PEDAL)
     return Prop(name="bicycle", mesh=mesh(points), where=lambda p: mesh(p).placed(*frame(p)).vertices, lift=_PEDAL)
@@ -416,8 +436,8 @@ def _pedals(feet: list[tuple[float, float, float]]) -> Iterator[Mesh]:
     ax, az = CRANK
     for side, (px, _, pz) in zip((0.1, -0.1), feet, strict=True):
         dx, dz = px - ax, pz - 0.03 - az
-        long = max((dx * dx + dz * dz) ** 0.5, 1e-6)
-        pedal = (ax + 0.17 * dx / long, side, az + 0.17 * dz / long)
+        length = max((dx * dx + dz * dz) ** 0.5, 1e-6)
+        pedal = (ax + 0.17 * dx / length, side, az + 0.17 * dz / length)
         yield shape("box", 0.09, 0.09, 0.025).moved(pedal)
         yield _rod((ax, 0.6 * side, az), (pedal[0], 0.6 * side, pedal[2]))
 

@@ -52,8 +52,8 @@ def heading(points: Points) -> tuple[float, float]:
     """Unit x, y of where the hips face."""
     left, right = points[JOINT["left_hip"]], points[JOINT["right_hip"]]
     x, y = left[1] - right[1], right[0] - left[0]
-    long = max(hypot(x, y), 1e-6)
-    return x / long, y / long
+    length = max(hypot(x, y), 1e-6)
+    return x / length, y / length
 
 
 # --- skirts and coats
@@ -81,12 +81,14 @@ def _skirt_faces() -> np.ndarray:
 @lru_cache
 def _skirt_parts(below_knee: tuple[bool, ...]) -> np.ndarray:
     """1 + SMPL joint of each face: the pelvis above the hips, then the thigh or, below the knee, the shank."""
-    middle = _TURN[np.arange(_SIDES)] + pi / _SIDES
-    left = np.sin(middle) > 0
+    face_angle = _TURN[np.arange(_SIDES)] + pi / _SIDES
+    is_left = np.sin(face_angle) > 0
     rows = []
     for row in range(_RINGS - 1):
         names = ("left_knee", "right_knee") if below_knee[row] else ("left_hip", "right_hip")
-        part = np.where(left, 1 + JOINT[names[0]], 1 + JOINT[names[1]]) if row else np.full(_SIDES, 1 + JOINT["pelvis"])
+        part = (
+            np.where(is_left, 1 + JOINT[names[0]], 1 + JOINT[names[1]]) if row else np.full(_SIDES, 1 + JOINT["pelvis"])
+        )
         rows += [part, part]
     return np.concatenate(rows).astype(np.uint8)
 
@@ -100,34 +102,34 @@ def skirt(points: Points, u: list[float]) -> tuple[Callable[[Points], np.ndarray
     hem = 0.35 + 1.35 * u[0] if u[3] < 0.6 else 0.5 + 0.7 * u[0]
     flare = 0.02 + 0.16 * u[1] ** 2 if u[3] < 0.6 else 0.01 + 0.05 * u[1]
     ease = _EASE + (0.02 * u[2] if u[3] < 0.6 else 0.01 + 0.025 * u[2])
-    half = hem / 2
+    half_hem = hem / 2
     # which rows of faces begin and end below the knee, by their middles
-    parts = _skirt_parts((False, half / 2 > 1, (half + hem) / 2 > 1))
+    parts = _skirt_parts((False, half_hem / 2 > 1, (half_hem + hem) / 2 > 1))
 
     def vertices(points: Points) -> np.ndarray:
         x, y = heading(points)
         left, right = points[JOINT["left_hip"]], points[JOINT["right_hip"]]
         side, front, back = (girth(points, g) + ease for g in ("hip_side", "hip_front", "hip_back"))
         thigh = side - distance(left, right) / 2
-        deep, ahead = (front + back) / 2, (front - back) / 2
+        depth, forward_shift = (front + back) / 2, (front - back) / 2
         hips = middle(left, right)
         pelvis = points[JOINT["pelvis"]]
-        across = (max(side - deep, 0.0) * -y, max(side - deep, 0.0) * x, 0.0)
-        shifted = (hips[0] + ahead * x, hips[1] + ahead * y, hips[2])
-        waist = (pelvis[0] + 0.8 * ahead * x, pelvis[1] + 0.8 * ahead * y, pelvis[2] + 0.04)
-        rings: list[tuple[Point, Point, float]] = [(waist, across, 0.92 * deep), (shifted, across, deep)]
-        for at, share in ((half, 0.5), (hem, 1.0)):
-            legs = [_leg(points, name, at) for name in ("left", "right")]
-            radius = thigh * (1 + (_KNEE - 1) * min(at, 1.0) if at < 1 else _CALF) + ease + flare * share
-            apart = tuple((a - b) / 2 for a, b in zip(*legs, strict=True))
-            rings.append((tuple(middle(*legs)), apart, max(radius, 0.6 * deep * (1 - 0.3 * at))))
+        half_axis = (max(side - depth, 0.0) * -y, max(side - depth, 0.0) * x, 0.0)
+        hip_center = (hips[0] + forward_shift * x, hips[1] + forward_shift * y, hips[2])
+        waist = (pelvis[0] + 0.8 * forward_shift * x, pelvis[1] + 0.8 * forward_shift * y, pelvis[2] + 0.04)
+        rings: list[tuple[Point, Point, float]] = [(waist, half_axis, 0.92 * depth), (hip_center, half_axis, depth)]
+        for level, share in ((half_hem, 0.5), (hem, 1.0)):
+            legs = [_leg(points, name, level) for name in ("left", "right")]
+            radius = thigh * (1 + (_KNEE - 1) * min(level, 1.0) if level < 1 else _CALF) + ease + flare * share
+            half_distance = tuple((a - b) / 2 for a, b in zip(*legs, strict=True))
+            rings.append((tuple(middle(*legs)), half_distance, max(radius, 0.6 * depth * (1 - 0.3 * level))))
         centers, halves, radii = (np.array(part) for part in zip(*rings, strict=True))
-        around = np.stack([x * np.cos(_TURN) - y * np.sin(_TURN), y * np.cos(_TURN) + x * np.sin(_TURN)], 1)
+        directions = np.stack([x * np.cos(_TURN) - y * np.sin(_TURN), y * np.cos(_TURN) + x * np.sin(_TURN)], 1)
         # the hull of two circles: each vertex goes with the leg on its side
-        long = np.maximum(np.hypot(halves[:, 0], halves[:, 1]), 1e-6)
-        toward = np.clip(2.5 * (halves[:, :2] / long[:, None]) @ around.T, -1, 1)
-        cloth = centers[:, None] + toward[..., None] * halves[:, None]
-        cloth[..., :2] += (radii[:, None] * _FOLDS)[..., None] * around
+        lengths = np.maximum(np.hypot(halves[:, 0], halves[:, 1]), 1e-6)
+        side_weight = np.clip(2.5 * (halves[:, :2] / lengths[:, None]) @ directions.T, -1, 1)
+        cloth = centers[:, None] + side_weight[..., None] * halves[:, None]
+        cloth[..., :2] += (radii[:, None] * _FOLDS)[..., None] * directions
         cloth[..., 2] = np.maximum(cloth[..., 2], 0.02)
         return cloth.reshape(-1, 3).astype(np.float32)
 
@@ -138,10 +140,10 @@ def skirt(points: Points, u: list[float]) -> tuple[Callable[[Points], np.ndarray
 _FOLDS = 1 + np.array([0.0, 0.0, 0.03, 0.06])[:, None] * np.where(np.arange(_SIDES) % 2, 1, -1)
 
 
-def _leg(points: Points, side: str, at: float) -> tuple[float, float, float]:
-    """The point `at` thighs, then shanks, down a leg."""
+def _leg(points: Points, side: str, level: float) -> tuple[float, float, float]:
+    """The point `level` thighs, then shanks, down a leg."""
     hip, knee, ankle = (points[JOINT[f"{side}_{name}"]] for name in ("hip", "knee", "ankle"))
-    a, b, t = (hip, knee, at) if at < 1 else (knee, ankle, at - 1)
+    a, b, t = (hip, knee, level) if level < 1 else (knee, ankle, level - 1)
     return (a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1]), a[2] + t * (b[2] - a[2]))
 
 
@@ -156,27 +158,27 @@ def hat_frame(points: Points, edge: float) -> tuple[list[list[float]], Point]:
     """Rows and origin that put the mesh "hat" or "cap" on the head: the edge `edge` of the way from the ears to the
     crown."""
     nose, center, base = (points[JOINT[name]] for name in ("nose", "head_center", "head"))
-    n = [a - b for a, b in zip(nose, center, strict=True)]
+    nose_axis = [a - b for a, b in zip(nose, center, strict=True)]
     up = [a - b for a, b in zip(center, base, strict=True)]
     size = max(distance(nose, center), 1e-6)
     # the nose's line is 10 degrees below the level of the head; up is made square to it
-    n = [a / size for a in n]
-    along = sum(a * b for a, b in zip(n, up, strict=True))
-    up = [a - along * b for a, b in zip(up, n, strict=True)]
-    long = max(sum(a * a for a in up) ** 0.5, 1e-6)
-    up = [a / long for a in up]
-    ahead = [0.985 * a + 0.17 * b for a, b in zip(n, up, strict=True)]
-    up = [0.985 * b - 0.17 * a for a, b in zip(n, up, strict=True)]
+    nose_axis = [a / size for a in nose_axis]
+    projection = sum(a * b for a, b in zip(nose_axis, up, strict=True))
+    up = [a - projection * b for a, b in zip(up, nose_axis, strict=True)]
+    norm = max(sum(a * a for a in up) ** 0.5, 1e-6)
+    up = [a / norm for a in up]
+    forward_axis = [0.985 * a + 0.17 * b for a, b in zip(nose_axis, up, strict=True)]
+    up = [0.985 * b - 0.17 * a for a, b in zip(nose_axis, up, strict=True)]
     left = [
-        up[1] * ahead[2] - up[2] * ahead[1],
-        up[2] * ahead[0] - up[0] * ahead[2],
-        up[0] * ahead[1] - up[1] * ahead[0],
+        up[1] * forward_axis[2] - up[2] * forward_axis[1],
+        up[2] * forward_axis[0] - up[0] * forward_axis[2],
+        up[0] * forward_axis[1] - up[1] * forward_axis[0],
     ]
     length, width, crown, forward = (size * s for s in _SKULL)
     rise = edge * crown
-    rows = [[(length + _HAIR) * a for a in ahead], [(width + _HAIR) * a for a in left]]
+    rows = [[(length + _HAIR) * a for a in forward_axis], [(width + _HAIR) * a for a in left]]
     rows.append([(crown - rise + _HAIR) * a for a in up])
-    origin = [c + forward * a + rise * u for c, a, u in zip(center, ahead, up, strict=True)]
+    origin = [c + forward * a + rise * u for c, a, u in zip(center, forward_axis, up, strict=True)]
     return rows, origin
 
 

@@ -52,13 +52,13 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
         for number in range(scans):
             scene = detection_scene(_SEED, number, family="heldout")
             scene = as_detected(scene, scene.origin)
-            seen = np.unique(scene.person[scene.person >= 0])
-            people = np.array([scene.boxes[row].center for row in seen]).reshape(-1, 3)
+            box_rows = np.unique(scene.person[scene.person >= 0])
+            people = np.array([scene.boxes[row].center for row in box_rows]).reshape(-1, 3)
             detections = detector.detect(scene.points, scene.origin, max_range=MAX_RANGE, limit=MOST_POSED)
             features, _ = verification_features(detections, scene.points, scene.origin)
             # the strongest first
-            own = match(detections.centers[:, :2], detections.logit, people[:, :2], np.ones(len(people), bool))
-            tables.append((features, own >= 0))
+            matches = match(detections.centers[:, :2], detections.logit, people[:, :2], np.ones(len(people), bool))
+            tables.append((features, matches >= 0))
             bar.update(number + 1)
     features, is_person = (np.concatenate(column) for column in zip(*tables, strict=True))
     card = header.card | fit(features, is_person, scans) | {"calibrated_on": scans}
@@ -76,15 +76,15 @@ def fit(features: np.ndarray, is_person: np.ndarray, scans: int) -> dict:
     features: (D, 6) of detections in so many scans, see `inference.verification.FEATURES`, NaN of those that could not
     be posed; is_person: (D,). The default score lets `FALSE` false people a scan pass.
     """
-    posed = np.isfinite(features).all(1)
-    own, labels = features[posed], is_person[posed]
-    terms = score_terms(own)
+    is_posed = np.isfinite(features).all(1)
+    posed_features, labels = features[is_posed], is_person[is_posed]
+    terms = score_terms(posed_features)
     table = np.column_stack(list(terms.values()))
     bias, weights = logistic(table, labels)
     verification = {"bias": bias, **dict(zip(terms, weights.tolist(), strict=True))}
     verification["calibration"] = monotone(bias + table @ weights, labels)
     header = {"calibration": monotone(features[:, 0], is_person), "verification": verification}
-    return header | {"default_score": passing_score(final_score(own, header)[~labels], scans)}
+    return header | {"default_score": passing_score(final_score(posed_features, header)[~labels], scans)}
 
 
 def passing_score(false: np.ndarray, scans: int) -> float:
@@ -106,8 +106,8 @@ def logistic(features: np.ndarray, labels: np.ndarray, *, iterations: int = 30) 
         gradient = x.T @ (probability - labels) + shrink @ weights
         hessian = (x * (probability * (1 - probability))[:, None]).T @ x + shrink
         weights -= np.linalg.solve(hessian, gradient)
-    own = weights[1:] / scale
-    return float(weights[0] - own @ mean), own
+    feature_weights = weights[1:] / scale
+    return float(weights[0] - feature_weights @ mean), feature_weights
 
 
 def monotone(logit: np.ndarray, labels: np.ndarray) -> list[list[float]]:
@@ -115,8 +115,8 @@ def monotone(logit: np.ndarray, labels: np.ndarray) -> list[list[float]]:
     until each has a larger share than the one before (pool adjacent violators)."""
     order = np.argsort(logit, kind="stable")
     # half of the knots where people are, half where they are not
-    at = np.linspace(0, 1, _KNOTS // 2 + 1)[1:-1]
-    pivots = np.unique(np.concatenate([np.quantile(logit[labels == kind], at) for kind in np.unique(labels)]))
+    quantiles = np.linspace(0, 1, _KNOTS // 2 + 1)[1:-1]
+    pivots = np.unique(np.concatenate([np.quantile(logit[labels == label], quantiles) for label in np.unique(labels)]))
     groups = np.split(order, np.searchsorted(logit[order], pivots))
     pools: list[np.ndarray] = []
     for group in groups:
@@ -124,8 +124,8 @@ def monotone(logit: np.ndarray, labels: np.ndarray) -> list[list[float]]:
             continue
         pools.append(group)
         while len(pools) > 1 and labels[pools[-2]].mean() >= labels[pools[-1]].mean():
-            last = pools.pop()
-            pools[-1] = np.concatenate([pools[-1], last])
+            last_pool = pools.pop()
+            pools[-1] = np.concatenate([pools[-1], last_pool])
     # half a one of each kind more: nothing is certain
     shares = [(labels[pool].sum() + 0.5) / (len(pool) + 1) for pool in pools]
     middles = [float(logit[pool].mean()) for pool in pools]

@@ -73,27 +73,27 @@ class DetectorExample:
 
 def labels_of(candidates: Candidates, scene: DetectionScene) -> Labels:
     """What is true of the candidates of a scene."""
-    count, own, yaw = len(candidates), candidates.centers, candidates.yaw
+    count, centers, yaw = len(candidates), candidates.centers, candidates.yaw
     center, foot, height = np.zeros((count, 3), np.float32), np.zeros(count, np.float32), np.zeros(count, np.float32)
     person, mounted = np.full(count, NOBODY), np.zeros(count, bool)
     if count and scene.boxes:
-        true = np.stack([box.center for box in scene.boxes])
-        half = np.array([box.size[2] / 2 for box in scene.boxes]) - _MARGIN
-        offset = true[None, :, :2] - own[:, None, :2]
+        true_centers = np.stack([box.center for box in scene.boxes])
+        half_height = np.array([box.size[2] / 2 for box in scene.boxes]) - _MARGIN
+        offset = true_centers[None, :, :2] - centers[:, None, :2]
         distance = np.linalg.norm(offset, axis=-1)
-        nearest, rows = distance.argmin(1), np.arange(count)
-        points = np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes))
-        least = distance[rows, nearest]
-        person[least <= IGNORED] = UNCLEAR
-        is_near = (least <= POSITIVE) | ((least <= IGNORED) & (distance.argmin(0)[nearest] == rows))
-        is_found = is_near & (points[nearest] >= LEAST_POINTS)
-        person[is_found] = nearest[is_found]
-        x, y = offset[rows, nearest].T
+        nearest_box, rows = distance.argmin(1), np.arange(count)
+        point_counts = np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes))
+        min_distance = distance[rows, nearest_box]
+        person[min_distance <= IGNORED] = UNCLEAR
+        is_near = (min_distance <= POSITIVE) | ((min_distance <= IGNORED) & (distance.argmin(0)[nearest_box] == rows))
+        is_found = is_near & (point_counts[nearest_box] >= LEAST_POINTS)
+        person[is_found] = nearest_box[is_found]
+        x, y = offset[rows, nearest_box].T
         center[:, 0] = np.cos(yaw) * x + np.sin(yaw) * y
         center[:, 1] = np.cos(yaw) * y - np.sin(yaw) * x
-        foot[:] = true[nearest, 2] - half[nearest] - own[:, 2]
-        height[:] = 2 * half[nearest]
-        mounted[:] = scene.mounted[nearest]
+        foot[:] = true_centers[nearest_box, 2] - half_height[nearest_box] - centers[:, 2]
+        height[:] = 2 * half_height[nearest_box]
+        mounted[:] = scene.mounted[nearest_box]
     return Labels(person=person, center=center, foot=foot, height=height, mounted=mounted)
 
 
@@ -124,25 +124,25 @@ class CandidateSource:
         return {}
 
     def example(self, index: int) -> DetectorExample:
-        newest, use = divmod(index, self.uses)
-        number = newest - use * self.lag
-        full = self._scan(newest // (use + 1) if number < 0 else number, newest)
+        newest_scene, use = divmod(index, self.uses)
+        number = newest_scene - use * self.lag
+        scan = self._scan(newest_scene // (use + 1) if number < 0 else number, newest_scene)
         rng = np.random.default_rng([self.seed, RandomStream.CANDIDATES, index])
-        person = full.labels.person
-        others = np.flatnonzero(person == NOBODY)
-        others = rng.choice(others, min(NEGATIVES, len(others)), replace=False)
-        rows = np.concatenate([np.flatnonzero(person >= 0), np.sort(others)])
+        person = scan.labels.person
+        negatives = np.flatnonzero(person == NOBODY)
+        negatives = rng.choice(negatives, min(NEGATIVES, len(negatives)), replace=False)
+        rows = np.concatenate([np.flatnonzero(person >= 0), np.sort(negatives)])
         augmentation = draw_augmentation(rng, len(rows), drop_origin=DROP_ORIGIN)
-        labels = moved(full.labels.take(rows), augmentation)
-        return DetectorExample(candidates=full.candidates.take(rows), labels=labels, augmentation=augmentation)
+        labels = moved(scan.labels.take(rows), augmentation)
+        return DetectorExample(candidates=scan.candidates.take(rows), labels=labels, augmentation=augmentation)
 
-    def _scan(self, number: int, newest: int) -> DetectorExample:
-        kept = self._kept
-        if number not in kept:
-            for old in [old for old in kept if old < newest - self.uses * self.lag]:
-                del kept[old]
-            kept[number] = scan_example(self.seed, number)
-        return kept[number]
+    def _scan(self, number: int, newest_scene: int) -> DetectorExample:
+        scans = self._kept
+        if number not in scans:
+            for old_number in [old_number for old_number in scans if old_number < newest_scene - self.uses * self.lag]:
+                del scans[old_number]
+            scans[number] = scan_example(self.seed, number)
+        return scans[number]
 
 
 def scan_example(seed: int, number: int, *, family: str = "train") -> DetectorExample:
@@ -177,9 +177,9 @@ def leveled(scene: DetectionScene, up: np.ndarray) -> DetectionScene:
     R_level_scene = rotation_between(up, np.array([0.0, 0.0, 1.0]))
     joints = scene.joints @ R_level_scene.T.astype(np.float32)
     boxes = []
-    for box, before, after in zip(scene.boxes, scene.joints[..., 2], joints[..., 2], strict=True):
-        low = after.min() - before.min() + box.center[2] - box.size[2] / 2
-        high = after.max() - before.max() + box.center[2] + box.size[2] / 2
+    for box, old_z, new_z in zip(scene.boxes, scene.joints[..., 2], joints[..., 2], strict=True):
+        low = new_z.min() - old_z.min() + box.center[2] - box.size[2] / 2
+        high = new_z.max() - old_z.max() + box.center[2] + box.size[2] / 2
         center = np.array([*(R_level_scene @ box.center)[:2], (low + high) / 2])
         boxes.append(replace(box, center=center, size=np.array([*box.size[:2], high - low])))
     return replace(

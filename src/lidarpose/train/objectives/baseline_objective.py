@@ -24,7 +24,7 @@ from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.train.augment import ClipExample, Example
 from lidarpose.train.objectives.objective import Share, alone, at_least_one, in_body26, on_device
 
-# a point is labelled with the nearest joint within this distance, m
+# a point is labeled with the nearest joint within this distance, m
 LABEL_RADIUS = 0.25
 _COLUMNS = BODY26.map_to(SMPL24)
 
@@ -53,20 +53,20 @@ class BaselineObjective:
         self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
     ) -> dict[str, Tensor]:
         """`frame_losses`, people moved by their shift; joints without a label teach nothing."""
-        read = on_device(arrays, device)
-        shift, valid = read["shift"][:, None, None], read["valid"]
-        points = (read["points"] + shift).masked_fill(~valid[..., None], 0)
-        known = read["joints"].isfinite().all(-1)
-        joints = torch.where(known[..., None], read["joints"] + shift, 0)
-        outputs = network(points, valid, read["center"])
-        terms = frame_losses(self.config, outputs, points, valid, joints, known, share)
-        return terms | {"mpjpe": mean_distance(outputs.joints.detach(), joints, known, share)}
+        tensors = on_device(arrays, device)
+        shift, valid = tensors["shift"][:, None, None], tensors["valid"]
+        points = (tensors["points"] + shift).masked_fill(~valid[..., None], 0)
+        is_labeled = tensors["joints"].isfinite().all(-1)
+        joints = torch.where(is_labeled[..., None], tensors["joints"] + shift, 0)
+        outputs = network(points, valid, tensors["center"])
+        terms = frame_losses(self.config, outputs, points, valid, joints, is_labeled, share)
+        return terms | {"mpjpe": mean_distance(outputs.joints.detach(), joints, is_labeled, share)}
 
     @torch.no_grad()
     def joints(self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu") -> np.ndarray:
         points, valid, center = (torch.as_tensor(arrays[name]).to(device) for name in ("points", "valid", "center"))
-        own = in_body26(network(points, valid, center).joints, self.config.columns)
-        return own + arrays["middle"][:, None]
+        joints = in_body26(network(points, valid, center).joints, self.config.columns)
+        return joints + arrays["middle"][:, None]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,8 +86,8 @@ class ClipObjective:
         for number, name in enumerate(self.config.clouds):
             clouds = [cloud for example in examples for cloud in example.clouds[name]]
             seeds = [frame.seed + number for example in examples for frame in example.frames]
-            reach = WINDOW if name == "person" else np.inf
-            points, valid = pad_frames(clouds, self.config, seeds, window=reach)
+            window = WINDOW if name == "person" else np.inf
+            points, valid = pad_frames(clouds, self.config, seeds, window=window)
             arrays |= {name: points.reshape(*shape, -1, 3), f"{name}_valid": valid.reshape(*shape, -1)}
         joints = np.stack([frame.joints[_COLUMNS] for example in examples for frame in example.frames])
         rotations = axis_angle_to_matrix(np.stack([example.rotations for example in examples])).astype(np.float32)
@@ -104,9 +104,9 @@ class ClipObjective:
         all."""
         outputs = network(self._clouds(arrays, device))
         joints, rotations = (torch.as_tensor(arrays[name]).to(device) for name in ("joints", "rotations"))
-        known = joints.isfinite().all(-1)
+        is_labeled = joints.isfinite().all(-1)
         terms = clip_losses(outputs, rotations, joints[:, :, :1], rest_offsets().to(device))
-        return terms | {"mpjpe": mean_distance(outputs.posed().detach(), joints, known)}
+        return terms | {"mpjpe": mean_distance(outputs.posed().detach(), joints, is_labeled)}
 
     @torch.no_grad()
     def joints(self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu") -> np.ndarray:
@@ -148,12 +148,12 @@ def frame_losses(
         # zero, of the head without a loss: processes that average gradients wait for all heads
         return {"joints": distance + 0 * outputs.visible.sum(), "part": _cross_entropy(parts, label, share)}
     is_body = label < joints.shape[1]
-    missed = (outputs.offsets - offset[valid]).norm(dim=-1)[is_body]
+    offset_error = (outputs.offsets - offset[valid]).norm(dim=-1)[is_body]
     return {
         "joints": distance,
         "vote": mean_distance(outputs.voted, joints, known, share),
         "part": _cross_entropy(outputs.parts, label, share),
-        "offset": missed.sum() / at_least_one(share(is_body.sum())),
+        "offset": offset_error.sum() / at_least_one(share(is_body.sum())),
     }
 
 
@@ -164,12 +164,12 @@ def clip_losses(outputs: ClipOutputs, rotations: Tensor, pelvis: Tensor, offsets
     at rest. Joints are of this one skeleton, prediction and truth alike, where the published code regresses them from
     posed vertices. The first stage's are about the frame's center, those of the rotations about the pelvis.
     """
-    true = forward_kinematics(rotations, offsets, SMPL24.parents)
-    posed = forward_kinematics(outputs.rotations, offsets, SMPL24.parents)
+    true_joints = forward_kinematics(rotations, offsets, SMPL24.parents)
+    posed_joints = forward_kinematics(outputs.rotations, offsets, SMPL24.parents)
     return {
         "rotation": F.mse_loss(outputs.rotations, rotations),
-        "joints": F.mse_loss(posed, true),
-        "first": F.mse_loss(outputs.joints, pelvis + true),
+        "joints": F.mse_loss(posed_joints, true_joints),
+        "first": F.mse_loss(outputs.joints, pelvis + true_joints),
     }
 
 
@@ -191,15 +191,15 @@ def with_joints(trained: Any, config: PrnConfig | LpformerConfig) -> Any:
     """A network of a configuration with the weights of a trained one of its kind; of joints that the trained one lacks
     they are random."""
     network: Any = build(config)
-    before = trained.config.joints
+    old_joints = trained.config.joints
     state = trained.state_dict()
     # background is the last row where there is one
-    rows = {name: row for row, name in enumerate((*before, ""))}
+    rows = {name: row for row, name in enumerate((*old_joints, ""))}
     pairs = [(k, rows[name]) for k, name in enumerate((*config.joints, "")) if name in rows]
     for name, value in network.state_dict().items():
         if not name.startswith(network.per_joint):
             value.copy_(state[name])
             continue
-        own, other = zip(*(pair for pair in pairs if pair[0] < len(value)), strict=True)
-        value[list(own)] = state[name][list(other)]
+        new_rows, old_rows = zip(*(pair for pair in pairs if pair[0] < len(value)), strict=True)
+        value[list(new_rows)] = state[name][list(old_rows)]
     return network

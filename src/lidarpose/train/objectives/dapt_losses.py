@@ -26,7 +26,7 @@ class DaptTargets:
     """What the losses compare with.
 
     joints (B, J, 3) m in the network's order, numbers also where nothing is known; weight (B, J): v_i of the paper, 1
-    where a joint is labelled and else 0; part (M,) int64, -1 where it is not known, None where none is asked for.
+    where a joint is labeled and else 0; part (M,) int64, -1 where it is not known, None where none is asked for.
     """
 
     joints: Tensor
@@ -118,16 +118,16 @@ def log_gaussian(place: Tensor, bins: int) -> Tensor:
     (`decode.out_of_range`); the released code's target for it fades to nothing.
     """
     index = torch.arange(bins, device=place.device)
-    away = (index - place.clamp(0, bins - 1)[..., None]) / SIGMA
-    return (-0.5 * away.square()).log_softmax(-1)
+    distance = (index - place.clamp(0, bins - 1)[..., None]) / SIGMA
+    return (-0.5 * distance.square()).log_softmax(-1)
 
 
 def _mpjpe(joints: Tensor, targets: DaptTargets, labels: Tensor) -> Tensor:
-    """Mean distance over labelled joints, m."""
+    """Mean distance over labeled joints, m."""
     return ((joints.detach() - targets.joints).norm(dim=-1) * targets.weight).sum() / labels
 
 
-def _divisors(targets: DaptTargets, share: Share, *more: Tensor) -> tuple[Tensor, ...]:
-    """How many people have a label, how many labels there are, and more counts, shared all at once."""
-    counts = ((targets.weight.sum(1) > 0).sum(), targets.weight.sum(), *more)
+def _divisors(targets: DaptTargets, share: Share, *extra_counts: Tensor) -> tuple[Tensor, ...]:
+    """How many people have a label, how many labels there are, and extra counts, shared all at once."""
+    counts = ((targets.weight.sum(1) > 0).sum(), targets.weight.sum(), *extra_counts)
     return at_least_one(share(torch.stack([count.float() for count in counts]))).unbind()

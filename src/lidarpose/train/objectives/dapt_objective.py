@@ -41,10 +41,10 @@ class DaptArrays:
     part: np.ndarray | None
 
     def targets(self, device: torch.device | str) -> DaptTargets:
-        labelled = np.isfinite(self.joints).all(-1)
+        is_labeled = np.isfinite(self.joints).all(-1)
         return DaptTargets(
-            joints=torch.as_tensor(np.where(labelled[..., None], self.joints, 0)).to(device),
-            weight=torch.as_tensor(labelled.astype(np.float32)).to(device),
+            joints=torch.as_tensor(np.where(is_labeled[..., None], self.joints, 0)).to(device),
+            weight=torch.as_tensor(is_labeled.astype(np.float32)).to(device),
             part=None if self.part is None else torch.as_tensor(self.part).to(device),
         )
 
@@ -88,19 +88,19 @@ class DaptObjective:
         `config.patch` voxels are shuffled by all seeds of the batch; smaller people attend in full, whatever the curve.
         A voxel's part is that of most of its points, where the released code takes the kept point's.
         """
-        thinned = [_thinned(example, self.config.grid) for example in examples]
+        samples = [_thinned(example, self.config.grid) for example in examples]
         tables = build_tables(
-            [points for points, _ in thinned],
+            [points for points, _ in samples],
             self.config,
             layout=self.layout,
             rng=np.random.default_rng([example.seed for example in examples]),
         )
         # the last entry: of the stand-in for an empty cloud
-        part = np.concatenate([*(part for _, part in thinned), [UNKNOWN_PART]])
+        part = np.concatenate([*(part for _, part in samples), [UNKNOWN_PART]])
         joints = np.stack([example.joints for example in examples])[:, self._columns].astype(np.float32)
         if self.config.neck == "prn":
-            nearest = nearest_joints(tables.features, np.repeat(joints, tables.levels[0].lengths, axis=0))
-            labels: np.ndarray | None = np.where(tables.kept < 0, UNKNOWN_PART, nearest)
+            nearest_labels = nearest_joints(tables.features, np.repeat(joints, tables.levels[0].lengths, axis=0))
+            labels: np.ndarray | None = np.where(tables.kept < 0, UNKNOWN_PART, nearest_labels)
         else:
             labels = part[tables.kept] if self.stage == "pretrain" else None
         return DaptArrays(tables=tables, joints=joints, part=labels)
@@ -108,23 +108,23 @@ class DaptObjective:
     def terms(
         self, network: Callable, arrays: DaptArrays, *, device: torch.device | str = "cpu", share: Share = alone
     ) -> dict[str, Tensor]:
-        """`dapt_losses.pretraining`, `finetuning` or `prn`. A joint's weight is 1 where it is labelled, seen or not, as
+        """`dapt_losses.pretraining`, `finetuning` or `prn`. A joint's weight is 1 where it is labeled, seen or not, as
         in the released code."""
         outputs, targets = network(to_tensors(arrays.tables, device)), arrays.targets(device)
         losses = prn if self.config.neck == "prn" else pretraining if self.stage == "pretrain" else finetuning
         terms = losses(outputs, targets, share=share)
         # zero, of all heads, used or not: processes that average gradients wait for all of them
-        first = next(iter(terms))
+        first_term = next(iter(terms))
         heads = [value for name in _HEADS if (value := getattr(outputs, name)) is not None]
-        terms[first] = sum((value.float().sum() * 0 for value in heads), terms[first])
+        terms[first_term] = sum((value.float().sum() * 0 for value in heads), terms[first_term])
         return terms
 
     @torch.no_grad()
     def joints(self, network: Callable, arrays: DaptArrays, *, device: torch.device | str = "cpu") -> np.ndarray:
         """Of the heatmaps; in pre-training of the coordinates, which are what it teaches."""
         outputs = network(to_tensors(arrays.tables, device))
-        own = outputs.coordinates if self.stage == "pretrain" else outputs.joints()
-        return in_body26(own, self._columns)
+        joints = outputs.coordinates if self.stage == "pretrain" else outputs.joints()
+        return in_body26(joints, self._columns)
 
 
 def pretraining_config() -> DaptConfig:
@@ -183,10 +183,10 @@ def nearest_joints(points: np.ndarray, joints: np.ndarray) -> np.ndarray:
     """points (M, 3) m, joints (M, J, 3) m of each point's person, NaN where unknown -> (M,) int64: 1 + the number of
     the nearest joint within `PRN_RADIUS`, 0 for background, -1 for people without any label."""
     distance = np.linalg.norm(joints - points[:, None], axis=-1)
-    known = np.isfinite(distance)
-    distance = np.where(known, distance, np.inf)
+    is_known = np.isfinite(distance)
+    distance = np.where(is_known, distance, np.inf)
     label = np.where(distance.min(1) < PRN_RADIUS, 1 + distance.argmin(1), 0)
-    return np.where(known.any(1), label, UNKNOWN_PART)
+    return np.where(is_known.any(1), label, UNKNOWN_PART)
 
 
 def _thinned(example: Example, grid: float) -> tuple[np.ndarray, np.ndarray]:
@@ -197,16 +197,16 @@ def _thinned(example: Example, grid: float) -> tuple[np.ndarray, np.ndarray]:
     points = np.asarray(example.points, np.float32).reshape(-1, 3)
     part = np.asarray(example.part, np.int64)
     if len(part) != len(points) or part.size and part.max() >= PARTS:
-        most = part.max() if part.size else "none"
+        max_part = part.max() if part.size else "none"
         raise InputError(
-            f"each of {len(points)} points needs a part below {PARTS}, got {len(part)}, the highest {most}"
+            f"each of {len(points)} points needs a part below {PARTS}, got {len(part)}, the highest {max_part}"
         )
     cells = np.floor(points / grid)
     order = np.lexsort((*points.T, *cells.T))
     cells = cells[order]
-    begins = np.ones(len(cells), bool)
-    begins[1:] = (cells[1:] != cells[:-1]).any(1)
-    first = np.flatnonzero(begins)
-    counts = np.diff(first, append=len(cells))
-    kept = order[first + (np.random.default_rng(example.seed).random(len(first)) * counts).astype(np.int64)]
-    return points[kept], majority_part(np.cumsum(begins) - 1, part[order], voxels=len(first), parts=PARTS)
+    is_start = np.ones(len(cells), bool)
+    is_start[1:] = (cells[1:] != cells[:-1]).any(1)
+    starts = np.flatnonzero(is_start)
+    counts = np.diff(starts, append=len(cells))
+    rows = order[starts + (np.random.default_rng(example.seed).random(len(starts)) * counts).astype(np.int64)]
+    return points[rows], majority_part(np.cumsum(is_start) - 1, part[order], voxels=len(starts), parts=PARTS)

@@ -21,12 +21,12 @@ def transferred(source: DaptNet, config: DaptConfig, *, keep_anchors: bool = Fal
     setting or tensor of the backbone that does not fit.
     """
     network = DaptNet(config)
-    wanted = network.state_dict()
-    state = wanted | _backbone(source, network)
+    initial_state = network.state_dict()
+    state = initial_state | _backbone(source, network)
     if keep_anchors:
         # the backbones fit, so the widths of their anchors do; the neck prn has none
-        if (name := f"backbone.{_ANCHORS}") in wanted:
-            state[name] = _by_joint(source.state_dict()[name], wanted[name], source.config.joints, config.joints)
+        if (name := f"backbone.{_ANCHORS}") in initial_state:
+            state[name] = _by_joint(source.state_dict()[name], initial_state[name], source.config.joints, config.joints)
         state |= _heads(source, network)
     network.load_state_dict(state)
     return network
@@ -36,12 +36,12 @@ def _backbone(trained: DaptNet, network: DaptNet) -> dict[str, Tensor]:
     """All of the trained backbone but its anchors. Raises InputError where it does not fit."""
     names = f"{trained.config.name} was pre-trained with", f"{network.config.name} has"
     remedy = "fine-tune with the sizes of the pre-trained network"
-    stored, wanted = (
+    trained_state, new_state = (
         {name: value for name, value in net.backbone.state_dict().items() if name != _ANCHORS}
         for net in (trained, network)
     )
-    for name in sorted(stored.keys() | wanted.keys()):
-        shapes = [tuple(state[name].shape) if name in state else "none" for state in (stored, wanted)]
+    for name in sorted(trained_state.keys() | new_state.keys()):
+        shapes = [tuple(state[name].shape) if name in state else "none" for state in (trained_state, new_state)]
         if shapes[0] != shapes[1]:
             raise InputError(
                 f"tensor backbone.{name} does not fit: {names[0]} {shapes[0]}, {names[1]} {shapes[1]}: {remedy}"
@@ -50,53 +50,58 @@ def _backbone(trained: DaptNet, network: DaptNet) -> dict[str, Tensor]:
         values = [getattr(net.config, setting) for net in (trained, network)]
         if values[0] != values[1]:
             raise InputError(f"{setting} does not fit: {names[0]} {values[0]}, {names[1]} {values[1]}: {remedy}")
-    return {f"backbone.{name}": value for name, value in stored.items()}
+    return {f"backbone.{name}": value for name, value in trained_state.items()}
 
 
 def _heads(trained: DaptNet, network: DaptNet) -> dict[str, Tensor]:
     """Tensors of the heads that both networks have, by what they do: the coordinate head has two names."""
-    old, new = trained.config, network.config
-    stored, wanted = trained.state_dict(), network.state_dict()
+    old_config, new_config = trained.config, network.config
+    trained_state, new_state = trained.state_dict(), network.state_dict()
     # modules whose tensors go on, by their old names and by their new ones
     modules = {}
-    if new.neck == "prn":
+    if new_config.neck == "prn":
         modules["heads.prn."] = "heads.prn."
-    elif old.coordinates and new.coordinates:
-        before, after = ("heads.coordinate." if config.bins else "heads.query." for config in (old, new))
-        modules[before] = after
-    if old.parts and new.parts:
+    elif old_config.coordinates and new_config.coordinates:
+        old_prefix, new_prefix = (
+            "heads.coordinate." if config.bins else "heads.query." for config in (old_config, new_config)
+        )
+        modules[old_prefix] = new_prefix
+    if old_config.parts and new_config.parts:
         modules["heads.feat."] = "heads.feat."
-    if old.bins and new.bins:
+    if old_config.bins and new_config.bins:
         for k in range(3):
             # bins of another place or width mean something else
-            same = old.bins[k] == new.bins[k] and old.ranges[k] == new.ranges[k]
-            fc = f"heads.query.fcs.{k}." if same else f"heads.query.fcs.{k}.fc1."
+            is_same = old_config.bins[k] == new_config.bins[k] and old_config.ranges[k] == new_config.ranges[k]
+            fc = f"heads.query.fcs.{k}." if is_same else f"heads.query.fcs.{k}.fc1."
             modules[fc] = fc
     heads: dict[str, Tensor] = {}
-    if old.auxiliary and new.auxiliary:
+    if old_config.auxiliary and new_config.auxiliary:
         modules["heads.inter_feat.fc.fc1."] = "heads.inter_feat.fc.fc1."
         for name in ("heads.inter_feat.fc.fc2.weight", "heads.inter_feat.fc.fc2.bias"):
             # three rows a joint
-            ours, fresh = (state[name].unflatten(0, (-1, 3)) for state in (stored, wanted))
-            heads[name] = _by_joint(ours, fresh, old.joints, new.joints).flatten(0, 1)
-    for name, value in stored.items():
-        for before, after in modules.items():
-            new_name = after + name.removeprefix(before)
-            if name.startswith(before) and new_name in wanted and value.shape == wanted[new_name].shape:
+            trained_rows, new_rows = (state[name].unflatten(0, (-1, 3)) for state in (trained_state, new_state))
+            heads[name] = _by_joint(trained_rows, new_rows, old_config.joints, new_config.joints).flatten(0, 1)
+    for name, value in trained_state.items():
+        for old_prefix, new_prefix in modules.items():
+            new_name = new_prefix + name.removeprefix(old_prefix)
+            if name.startswith(old_prefix) and new_name in new_state and value.shape == new_state[new_name].shape:
                 heads[new_name] = value
-    if new.neck == "prn":
+    if new_config.neck == "prn":
         # a row a joint, of parts background before them
         heads["heads.prn.joint"] = _by_joint(
-            stored["heads.prn.joint"], wanted["heads.prn.joint"], old.joints, new.joints
+            trained_state["heads.prn.joint"], new_state["heads.prn.joint"], old_config.joints, new_config.joints
         )
-        last = max(name for name in wanted if name.startswith("heads.prn.vote.parts.")).rpartition(".")[0]
-        for name in (f"{last}.weight", f"{last}.bias"):
-            rows = _by_joint(stored[name][1:], wanted[name][1:], old.joints, new.joints)
-            heads[name] = torch.cat([stored[name][:1], rows])
+        last_layer = max(name for name in new_state if name.startswith("heads.prn.vote.parts.")).rpartition(".")[0]
+        for name in (f"{last_layer}.weight", f"{last_layer}.bias"):
+            rows = _by_joint(trained_state[name][1:], new_state[name][1:], old_config.joints, new_config.joints)
+            heads[name] = torch.cat([trained_state[name][:1], rows])
     return heads
 
 
-def _by_joint(before: Tensor, after: Tensor, had: tuple[str, ...], has: tuple[str, ...]) -> Tensor:
-    """after (J', ...), the rows of joints that `before` (J, ...) has too taken from there."""
-    rows = [before[had.index(name)].to(after) if name in had else after[j] for j, name in enumerate(has)]
+def _by_joint(trained: Tensor, initial: Tensor, trained_joints: tuple[str, ...], joints: tuple[str, ...]) -> Tensor:
+    """initial (J', ...), the rows of joints that `trained` (J, ...) has too taken from there."""
+    rows = [
+        trained[trained_joints.index(name)].to(initial) if name in trained_joints else initial[j]
+        for j, name in enumerate(joints)
+    ]
     return torch.stack(rows)

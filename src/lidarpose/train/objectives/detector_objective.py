@@ -41,10 +41,10 @@ class DetectorObjective:
     def collate(self, examples: list[DetectorExample]) -> dict[str, np.ndarray]:
         """The network's inputs as float16, which halves what goes between processes; labels (K, ...) of all scans one
         after the other, and scan (K,), of which each is."""
-        drawn = [render(example.candidates, example.augmentation) for example in examples]
+        renders = [render(example.candidates, example.augmentation) for example in examples]
         # torch rounds ten times as fast as numpy
         arrays = {
-            name: torch.as_tensor(np.concatenate([each[name] for each in drawn])).half().numpy() for name in INPUTS
+            name: torch.as_tensor(np.concatenate([scan[name] for scan in renders])).half().numpy() for name in INPUTS
         }
         for name in vars(examples[0].labels):
             arrays[name] = np.concatenate([getattr(example.labels, name) for example in examples])
@@ -71,12 +71,12 @@ class DetectorObjective:
         def l1(column: int, name: str) -> Tensor:
             return of_people((out[:, column] - tensors[name][rows]).abs())
 
-        binary = F.binary_cross_entropy_with_logits
+        cross_entropy = F.binary_cross_entropy_with_logits
         center = tensors["center"][rows, :2]
-        mounted = binary(out[:, 5], tensors["mounted"][rows].float(), reduction="none")
+        mounted = cross_entropy(out[:, 5], tensors["mounted"][rows].float(), reduction="none")
         count = at_least_one(share(torch.ones_like(is_person).sum()))
         return {
-            "person": PERSON * binary(out[:, 0], is_person, reduction="sum") / count,
+            "person": PERSON * cross_entropy(out[:, 0], is_person, reduction="sum") / count,
             "offset": OFFSET * of_people((out[:, 1:3] - center).norm(dim=1)),
             "foot": FOOT * l1(3, "foot"),
             "height": HEIGHT * l1(4, "height"),
@@ -94,13 +94,13 @@ class DetectorObjective:
 def chosen(logit: Tensor, person: Tensor, scan: Tensor) -> Tensor:
     """Rows to learn from, by logits (K,): all people's, the hardest of nobody's, and some at random, by torch's
     generator."""
-    theirs, others = (person >= 0).nonzero()[:, 0], (person == NOBODY).nonzero()[:, 0]
+    positives, negatives = (person >= 0).nonzero()[:, 0], (person == NOBODY).nonzero()[:, 0]
     scans = int(scan.max()) + 1 if len(scan) else 0
-    hard = min(round(HARD * len(theirs)) + HARD_OF_SCAN * scans, len(others))
+    hard_count = min(round(HARD * len(positives)) + HARD_OF_SCAN * scans, len(negatives))
     # the loss of somebody who is not there rises with the logit
-    order = others[logit[others].argsort(descending=True)]
-    easy = order[hard:]
-    return torch.cat([theirs, order[:hard], easy[torch.rand(len(easy), device=easy.device) < EASY]])
+    order = negatives[logit[negatives].argsort(descending=True)]
+    easy = order[hard_count:]
+    return torch.cat([positives, order[:hard_count], easy[torch.rand(len(easy), device=easy.device) < EASY]])
 
 
 def average_precision(logit: Tensor, is_person: Tensor) -> Tensor:
@@ -115,17 +115,17 @@ def missed_people(
 ) -> tuple[float, None]:
     """Per cent of the people that candidates have who are missed at `FALSE` false people a scan. batch: is not used."""
     device = next(network.parameters()).device
-    false: list[np.ndarray] = []
-    best: list[np.ndarray] = []
+    false_logits: list[np.ndarray] = []
+    best_logits: list[np.ndarray] = []
     for example in examples:
         outputs = objective.scores(network, objective.collate([example]), device=device)
         logit, person, candidates = outputs[:, 0], example.labels.person, example.candidates
         centers, _ = predicted_boxes(candidates.centers, candidates.yaw, outputs)
         rows = suppress_near(centers, logit, SAME)
-        false.append(logit[rows][person[rows] == NOBODY])
+        false_logits.append(logit[rows][person[rows] == NOBODY])
         people = np.unique(person[person >= 0])
-        best.append(np.array([logit[rows][person[rows] == number].max(initial=-np.inf) for number in people]))
-    ranked = np.sort(np.concatenate([*false, [-np.inf]]))[::-1]
-    threshold = ranked[min(round(FALSE * len(examples)), len(ranked) - 1)]
-    people = np.concatenate(best)
-    return float((people <= threshold).mean() * 100) if len(people) else 0.0, None
+        best_logits.append(np.array([logit[rows][person[rows] == number].max(initial=-np.inf) for number in people]))
+    false_ranking = np.sort(np.concatenate([*false_logits, [-np.inf]]))[::-1]
+    threshold = false_ranking[min(round(FALSE * len(examples)), len(false_ranking) - 1)]
+    person_logits = np.concatenate(best_logits)
+    return float((person_logits <= threshold).mean() * 100) if len(person_logits) else 0.0, None

@@ -82,6 +82,6 @@ def at_least_one(count: Tensor) -> Tensor:
 def majority_part(voxel: np.ndarray, part: np.ndarray, *, voxels: int, parts: int) -> np.ndarray:
     """voxel (n,) of each point, negative for none; part (n,), negative where unknown -> (voxels,) int64: the part that
     most points of a voxel are of, the first of equals; -1 where none is known."""
-    known = (voxel >= 0) & (part >= 0)
-    votes = np.bincount(voxel[known] * parts + part[known], minlength=voxels * parts).reshape(-1, parts)
+    is_known = (voxel >= 0) & (part >= 0)
+    votes = np.bincount(voxel[is_known] * parts + part[is_known], minlength=voxels * parts).reshape(-1, parts)
     return np.where(votes.any(1), votes.argmax(1), UNKNOWN_PART)

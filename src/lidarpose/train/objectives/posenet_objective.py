@@ -94,67 +94,67 @@ def losses(
     here the mean distance of votes, of decoded joints and of the coarser levels' joints (the released code squares it);
     L_hm a cross entropy against normalized targets, axes alike; L_seg with background as a class.
     """
-    known = targets.known.float()
-    true = torch.where(targets.known[..., None], targets.joints, 0.0)
-    labels = at_least_one(share(known.sum()))
+    is_labeled = targets.known.float()
+    truth = torch.where(targets.known[..., None], targets.joints, 0.0)
+    labels = at_least_one(share(is_labeled.sum()))
     # of joints with a label, those whose visibility is known
-    seen = targets.visible.float()
-    seen_known = known * ~seen.isnan()
+    visibility = targets.visible.float()
+    has_visibility = is_labeled * ~visibility.isnan()
 
     def over(value: Tensor, count: Tensor) -> Tensor:
         return value / at_least_one(share(count))
 
     def mean(value: Tensor) -> Tensor:
-        return (value.float() * known).sum() / labels
+        return (value.float() * is_labeled).sum() / labels
 
-    error = (outputs.joints().float() - true).norm(dim=-1)
-    missed = error.detach()
-    hit = (missed < CONFIDENCE_RADIUS).to(true.dtype)
+    error = (outputs.joints().float() - truth).norm(dim=-1)
+    distance = error.detach()
+    is_hit = (distance < CONFIDENCE_RADIUS).to(truth.dtype)
     log_spread = outputs.log_spread.float()
     part = F.cross_entropy(outputs.part.float().flatten(0, 1), targets.part.flatten(), ignore_index=-1, reduction="sum")
-    visible = _binary(outputs.visible, seen.nan_to_num(0.0))
+    visible_loss = _binary(outputs.visible, visibility.nan_to_num(0.0))
     terms = {
         "joints": JOINTS * mean(error),
-        "level": LEVEL * sum((mean((j.float() - true).norm(dim=-1)) for j in outputs.level_joints), torch.zeros(())),
+        "level": LEVEL * sum((mean((j.float() - truth).norm(dim=-1)) for j in outputs.level_joints), torch.zeros(())),
         "part": PART * over(part, (targets.part >= 0).sum().float()),
-        "confidence": CONFIDENCE * mean(_binary(outputs.confidence, hit)),
+        "confidence": CONFIDENCE * mean(_binary(outputs.confidence, is_hit)),
         # log-likelihood of an exponential law: its mean, exp(log_spread), becomes the expected distance
-        "spread": SPREAD * mean(log_spread + missed * torch.exp(-log_spread)),
-        "visible": VISIBLE * over((visible * seen_known).sum(), seen_known.sum()),
-        "mpjpe": mean(missed),
+        "spread": SPREAD * mean(log_spread + distance * torch.exp(-log_spread)),
+        "visible": VISIBLE * over((visible_loss * has_visibility).sum(), has_visibility.sum()),
+        "mpjpe": mean(distance),
     }
     if outputs.has_votes:
-        terms["vote"] = VOTE * mean((outputs.vote.float() - true).norm(dim=-1))
+        terms["vote"] = VOTE * mean((outputs.vote.float() - truth).norm(dim=-1))
     if outputs.person is not None:
-        known_person = (~targets.person.isnan()).float()
-        missed_person = _binary(outputs.person, targets.person.nan_to_num(0.0)) * known_person
-        terms["person"] = PERSON * over(missed_person.sum(), known_person.sum())
+        has_person_label = (~targets.person.isnan()).float()
+        person_loss = _binary(outputs.person, targets.person.nan_to_num(0.0)) * has_person_label
+        terms["person"] = PERSON * over(person_loss.sum(), has_person_label.sum())
     bins = outputs.heatmap.shape[-1]
     if bins:
-        offset = true - outputs.vote.detach().float()
-        reached = (offset.abs() < bins * BIN / 2).to(true.dtype) * known[..., None]
-        cross = -(encode(offset, SIGMA, bins) * outputs.heatmap.float().log_softmax(-1)).sum(-1)
-        terms["heatmap"] = HEATMAP * (cross * reached).sum() / at_least_one(share(reached.sum()))
+        offset = truth - outputs.vote.detach().float()
+        is_in_range = (offset.abs() < bins * BIN / 2).to(truth.dtype) * is_labeled[..., None]
+        cross_entropy = -(encode(offset, SIGMA, bins) * outputs.heatmap.float().log_softmax(-1)).sum(-1)
+        terms["heatmap"] = HEATMAP * (cross_entropy * is_in_range).sum() / at_least_one(share(is_in_range.sum()))
     if bone or symmetry:
-        terms |= _lengths(outputs.joints().float(), true, known, share, bone, symmetry)
+        terms |= _lengths(outputs.joints().float(), truth, is_labeled, share, bone, symmetry)
     return terms
 
 
 def _lengths(
-    joints: Tensor, true: Tensor, known: Tensor, share: Share, bone: float, symmetry: float
+    joints: Tensor, truth: Tensor, is_labeled: Tensor, share: Share, bone: float, symmetry: float
 ) -> dict[str, Tensor]:
     """Mean errors of bones' lengths, and mean differences between the two sides."""
     parent, child = _BONES.to(joints.device).unbind(1)
     length = (joints[:, parent] - joints[:, child]).norm(dim=-1)
     terms = {}
     if bone:
-        both = known[:, parent] * known[:, child]
-        missed = (length - (true[:, parent] - true[:, child]).norm(dim=-1)).abs() * both
-        terms["bone"] = bone * missed.sum() / at_least_one(share(both.sum()))
+        has_length = is_labeled[:, parent] * is_labeled[:, child]
+        length_error = (length - (truth[:, parent] - truth[:, child]).norm(dim=-1)).abs() * has_length
+        terms["bone"] = bone * length_error.sum() / at_least_one(share(has_length.sum()))
     if symmetry:
         left, right = _PAIRS.to(joints.device).unbind(1)
-        uneven = (length[:, left] - length[:, right]).abs()
-        terms["symmetry"] = symmetry * uneven.sum() / at_least_one(share(torch.ones_like(uneven).sum()))
+        difference = (length[:, left] - length[:, right]).abs()
+        terms["symmetry"] = symmetry * difference.sum() / at_least_one(share(torch.ones_like(difference).sum()))
     return terms
 
 
