@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from lidarpose.geometry import rotation_about
+from lidarpose.models.detector import proposals
 from lidarpose.models.detector.candidates import SceneIndex, suppress_near
 from lidarpose.models.detector.ground import estimate_ground, estimate_up, without_ground
 from lidarpose.models.detector.proposals import columns, heights_above, propose
@@ -238,6 +239,29 @@ def test_a_map_wider_than_a_tile_has_the_candidates_of_its_parts():
     centers = propose(points, estimate_ground(points))
     assert all(nearest(centers, x + 5, y) < 0.1 for x, y in places)
     assert len(centers) == 3
+
+
+def test_tiles_hold_what_lies_in_them_and_a_meter_around():
+    rng = np.random.default_rng(2)
+    x, y = rng.uniform(-50, 300, (2, 4000)).astype(np.float32)
+    covered = []
+    for corner, (low, high), rows in proposals._tiles(x, y):
+        is_inside = (x >= low[0] - 1) & (x < high[0] + 1) & (y >= low[1] - 1) & (y < high[1] + 1)
+        assert (rows == np.flatnonzero(is_inside)).all() and (corner == low - 1).all() and (high == low + 64).all()
+        covered.append(np.flatnonzero((x >= low[0]) & (x < high[0]) & (y >= low[1]) & (y < high[1])))
+    assert (np.sort(np.concatenate(covered)) == np.arange(len(x))).all()
+
+
+def test_tiles_without_a_dense_place_have_no_column(monkeypatch):
+    rng = np.random.default_rng(3)
+    scattered = np.column_stack([rng.uniform(0, 400, (6000, 2)), rng.uniform(0, 2.5, 6000)])
+    points = np.concatenate([scattered, *(column(x, y, ground=0.0) for x, y in ((70, 333.5), (128, 192), (5, 5)))])
+    skipping = columns(points, points[:, 2])
+    monkeypatch.setattr(proposals, "_is_dense_somewhere", lambda x, y: True)
+    everywhere = columns(points, points[:, 2])
+    assert len(skipping[0]) >= 3
+    for one, other in zip(skipping, everywhere, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 # --- candidates

@@ -10,6 +10,7 @@ in the end, by a look at each column and the two rings around it.
 import threading
 from collections.abc import Iterator
 from functools import cache
+from itertools import product
 
 import numpy as np
 
@@ -76,7 +77,10 @@ def columns(points: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.nda
     x, y, heights = points[band_rows, 0], points[band_rows, 1], heights[band_rows]
     places, features = [np.zeros((0, 2))], [np.zeros((0, FEATURES), np.float32)]
     for corner, bounds, rows in _tiles(x, y):
-        tile_places, tile_features = _peaks(x[rows] - corner[0], y[rows] - corner[1], heights[rows])
+        tile_x, tile_y = x[rows] - corner[0], y[rows] - corner[1]
+        if not _is_dense_somewhere(tile_x, tile_y):
+            continue
+        tile_places, tile_features = _peaks(tile_x, tile_y, heights[rows])
         tile_places = tile_places + corner
         is_inside = ((tile_places >= bounds[0]) & (tile_places < bounds[1])).all(1)
         places.append(tile_places[is_inside])
@@ -116,13 +120,29 @@ def _tiles(x: np.ndarray, y: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarra
     if max(x.max() - start[0], y.max() - start[1]) < 1.5 * _TILE:
         yield start, np.array([[-np.inf] * 2, [np.inf] * 2]), slice(None)
         return
-    tile = np.floor((np.stack([x, y], 1) - start) / _TILE).astype(np.int64)
-    for i, j in np.unique(tile, axis=0):
-        low = start + np.array([i, j]) * _TILE
-        high = low + _TILE
-        is_inside = (x >= low[0] - _OVERLAP) & (x < high[0] + _OVERLAP)
-        is_inside &= (y >= low[1] - _OVERLAP) & (y < high[1] + _OVERLAP)
-        yield low - _OVERLAP, np.stack([low, high]), np.flatnonzero(is_inside)
+    # of a point near to a border its own tile, that beyond, and at a corner all four, as one number each
+    shifts = np.array(list(product((0, -_OVERLAP, _OVERLAP), repeat=2)))
+    tiles = [np.floor((np.stack([x, y], 1) - start + shift) / _TILE).astype(np.int64) for shift in shifts]
+    tile_columns = max(tile[:, 1].max() for tile in tiles) + 2
+    keys = [(tile[:, 0] + 1) * tile_columns + tile[:, 1] + 1 for tile in tiles]
+    neighbor_rows = [np.flatnonzero(key != keys[0]) for key in keys[1:]]
+    rows = np.concatenate([np.arange(len(x)), *neighbor_rows])
+    key = np.concatenate([keys[0], *(key[r] for key, r in zip(keys[1:], neighbor_rows, strict=True))])
+    entries = np.unique(key * len(x) + rows)
+    ends = np.flatnonzero(np.diff(entries // len(x))) + 1
+    for tile_entries in np.split(entries, ends):
+        low = start + (np.array(divmod(tile_entries[0] // len(x), tile_columns)) - 1) * _TILE
+        yield low - _OVERLAP, np.stack([low, low + _TILE]), tile_entries % len(x)
+
+
+def _is_dense_somewhere(x: np.ndarray, y: np.ndarray) -> bool:
+    """Whether a column may have its `LEAST_POINTS`: it is less than 1 m wide, so 2 x 2 cells of 1 m hold it. x, y (n,)
+    m, at least 0. Most of a map of kilometers, thinned, has none."""
+    row, column = (values.astype(np.int64) for values in (x, y))
+    shape = int(row.max()) + 2, int(column.max()) + 2
+    counts = np.bincount(row * shape[1] + column, minlength=shape[0] * shape[1]).reshape(shape)
+    pairs = counts[1:] + counts[:-1]
+    return bool((pairs[:, 1:] + pairs[:, :-1]).max() >= LEAST_POINTS)
 
 
 def _peaks(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
