@@ -272,6 +272,10 @@ def test_the_sensor_stands_at_zero_unless_it_cannot(scene, fake):
         np.testing.assert_allclose(fake.calls[-1]["origin"], moved)
     assert lidarpose.detect(points, sensor_origin="unknown").warnings == ()
     assert fake.calls[-1]["origin"] is None
+    # a drone, and what is no sensor's height
+    assert lidarpose.detect(points, sensor_origin=(0, 0, 40)).warnings == ()
+    (warning,) = lidarpose.detect(points, sensor_origin=(0, 0, 100)).warnings
+    assert "m from the nearest point" in warning and fake.calls[-1]["origin"] is None
 
 
 def test_nothing_to_find_is_no_error(model):

@@ -58,8 +58,9 @@ _MOST, _ENOUGH, _STREET, _FLATTER = (10, 90), 25_000, 10.0, 3.0
 # a scan that is so long and has so few points a square meter is in other units, and in millimeters from so far on; a
 # whole room is larger than the smallest, m
 _LONGEST_SCAN, _SPARSEST, _LONG_IN_MILLIMETERS, _SMALLEST_SCAN = 500.0, 0.1, 10_000.0, 0.5
-# a sensor is not so far from the nearest point, m; of the points so near, m, some percents lie lower than it by more
-_FAR_OUT, _BELOW_SENSOR, _LOWEST, _LEAST_HEIGHT = 25.0, 15.0, 5, 0.2
+# a sensor is not so far from the nearest point, m, along the ground and in space, as a drone's is; of the points so
+# near, m, some percents lie lower than it by more
+_FAR_OUT, _FAR_AWAY, _BELOW_SENSOR, _LOWEST, _LEAST_HEIGHT = 25.0, 60.0, 15.0, 5, 0.2
 
 
 # ---- one person
@@ -239,8 +240,9 @@ def unlikely_origin(points: np.ndarray, origin: np.ndarray) -> str | None:
     """A sensor at origin (3,) m cannot have seen the points (n, 3) m of a whole scan, z up."""
     distance = np.hypot(*(points[:, :2] - origin[:2]).T)
     near_heights = points[distance < _BELOW_SENSOR, 2]
-    if distance.min() > _FAR_OUT:
-        problem = f"is {distance.min():,.0f} m from the nearest point"
+    nearest_distance = np.hypot(distance, points[:, 2] - origin[2]).min()
+    if distance.min() > _FAR_OUT or nearest_distance > _FAR_AWAY:
+        problem = f"is {nearest_distance:,.0f} m from the nearest point"
     elif len(near_heights) and np.percentile(near_heights, _LOWEST) > origin[2] - _LEAST_HEIGHT:
         problem = "has no ground below it"
     else:
