@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.io.files import check_suffix
+from lidarpose.models.detector.ground import Ground, estimate_ground
+from lidarpose.models.detector.proposals import heights_above
 from lidarpose.sample import Box, Pose
 from lidarpose.viz.draw import SIDE_COLORS, png_of, shortened
 from lidarpose.viz.person_view import bone_pairs, bone_sides, box_edges, finite, is_known, thinned
@@ -100,7 +102,7 @@ def _draw_panel(ax, panel: ScanPanel) -> None:
     ax.tick_params(labelsize=7, color=_FAINT, labelcolor=_FAINT)
     ax.spines[:].set_color(_HIGH)
     inside_points = points[(np.abs(points[:, :2] - [left + span / 2, bottom + span / 2]) <= span / 2).all(1)]
-    _draw_points(ax, inside_points[thinned(len(inside_points), _MAX_POINTS)])
+    _draw_points(ax, inside_points[thinned(len(inside_points), _MAX_POINTS)], estimate_ground(points))
     if panel.sensor is not None:
         ax.plot(*panel.sensor, ls="", marker="^", ms=8, color=_INK, mec="white", zorder=5)
         ax.annotate("sensor", panel.sensor, (7, -3), textcoords="offset points", fontsize=8, zorder=5)
@@ -135,11 +137,14 @@ def _window(panel: ScanPanel, points: np.ndarray) -> tuple[np.ndarray, float]:
     return (low + high) / 2 - span / 2, span
 
 
-def _draw_points(ax, points: np.ndarray) -> None:
+def _draw_points(ax, points: np.ndarray, ground: Ground | None) -> None:
     """The ground light gray, what stands on it by height, what is higher than people fainter still."""
     from matplotlib import colormaps
 
-    height = points[:, 2] - (np.percentile(points[:, 2], 2) if len(points) else 0)
+    if ground is not None:
+        height = heights_above(points, ground)
+    else:
+        height = points[:, 2] - (np.percentile(points[:, 2], 2) if len(points) else 0)
     is_colored = (height >= _BELOW) & (height <= _ABOVE)
     # what stands on the ground last, so that nothing covers it
     order = np.argsort(is_colored, kind="stable")
