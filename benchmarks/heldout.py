@@ -49,12 +49,12 @@ def facing(joints: np.ndarray) -> np.ndarray:
     return np.arctan2(-left[:, 0], left[:, 1])
 
 
-def score(predicted, found: list[SyntheticPerson]) -> dict:
+def score(predicted, persons: list[SyntheticPerson]) -> dict:
     """Figures in millimeters or shares."""
     pred = np.stack([p.pose.to(HUMAN15).joints for p in predicted])
-    true = np.stack([p.sample.pose.to(HUMAN15).joints for p in found])
-    facts = [p.facts for p in found]
-    count = np.array([len(p.sample.points) for p in found])
+    true = np.stack([p.sample.pose.to(HUMAN15).joints for p in persons])
+    facts = [p.facts for p in persons]
+    count = np.array([len(p.sample.points) for p in persons])
     plain = np.array([f.plain for f in facts])
     visible = np.array([f.visible for f in facts])
     clutter = np.array([f.clutter for f in facts])
@@ -63,7 +63,7 @@ def score(predicted, found: list[SyntheticPerson]) -> dict:
     confidence = np.stack([p.pose.to(HUMAN15).confidence for p in predicted])
     spread = np.stack([p.pose.to(HUMAN15).spread for p in predicted])
     masks = {
-        "all": np.ones(len(found), bool),
+        "all": np.ones(len(persons), bool),
         "upright, whole, uncluttered": plain,
         "under half visible": visible < 0.5,
         "clutter over 10 %": clutter > 0.1,
@@ -90,8 +90,8 @@ def score(predicted, found: list[SyntheticPerson]) -> dict:
             name: round(float(error[:, [HUMAN15.index(m) for m in members]].mean() * 1e3), 1)
             for name, members in joints.items()
         },
-        "mpjpe_smpl24": round(_whole(predicted, found, SMPL24), 1),
-        "mpjpe_waymo14": round(_whole(predicted, found, WAYMO14), 1),
+        "mpjpe_smpl24": round(_whole(predicted, persons, SMPL24), 1),
+        "mpjpe_waymo14": round(_whole(predicted, persons, WAYMO14), 1),
         "calibration_error": round(calibration_error(confidence.ravel(), error.ravel() < CONFIDENCE_RADIUS), 3),
         "auroc": round(auroc(confidence.ravel(), error.ravel() < CONFIDENCE_RADIUS), 3),
         "spread_over_error": round(float(spread.mean() / error.mean()), 3),

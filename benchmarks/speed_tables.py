@@ -15,9 +15,9 @@ def rate(seconds: float) -> str:
     return f"{1 / seconds:,.0f}" if seconds < 0.05 else f"{1 / seconds:.1f}"
 
 
-def medians(found: dict) -> Rows:
+def medians(record: dict) -> Rows:
     """Latency, people a second forward and in training, by points."""
-    seconds = {(entry["section"], entry["network"], entry["points"]): entry["median_s"] for entry in found["times"]}
+    seconds = {(entry["section"], entry["network"], entry["points"]): entry["median_s"] for entry in record["times"]}
     rows = []
 
     def add(section: str, unit: str, points: int | str, format_value: Callable[[float], str]) -> None:

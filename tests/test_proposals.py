@@ -252,6 +252,12 @@ def test_tiles_hold_what_lies_in_them_and_a_meter_around():
     assert (np.sort(np.concatenate(covered)) == np.arange(len(x))).all()
 
 
+def test_points_of_any_extent_are_shared_out_among_tiles():
+    x = np.repeat([0.0, 1e9, 3e15], 6)
+    tiles = [rows for _, _, rows in proposals._tiles(x, x)]
+    assert [rows.tolist() for rows in tiles] == np.arange(18).reshape(3, 6).tolist()
+
+
 def test_tiles_without_a_dense_place_have_no_column(monkeypatch):
     rng = np.random.default_rng(3)
     scattered = np.column_stack([rng.uniform(0, 400, (6000, 2)), rng.uniform(0, 2.5, 6000)])

@@ -120,19 +120,22 @@ def _tiles(x: np.ndarray, y: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarra
     if max(x.max() - start[0], y.max() - start[1]) < 1.5 * _TILE:
         yield start, np.array([[-np.inf] * 2, [np.inf] * 2]), slice(None)
         return
-    # of a point near to a border its own tile, that beyond, and at a corner all four, as one number each
-    shifts = np.array(list(product((0, -_OVERLAP, _OVERLAP), repeat=2)))
-    tiles = [np.floor((np.stack([x, y], 1) - start + shift) / _TILE).astype(np.int64) for shift in shifts]
-    tile_columns = max(tile[:, 1].max() for tile in tiles) + 2
-    keys = [(tile[:, 0] + 1) * tile_columns + tile[:, 1] + 1 for tile in tiles]
-    neighbor_rows = [np.flatnonzero(key != keys[0]) for key in keys[1:]]
-    rows = np.concatenate([np.arange(len(x)), *neighbor_rows])
-    key = np.concatenate([keys[0], *(key[r] for key, r in zip(keys[1:], neighbor_rows, strict=True))])
-    entries = np.unique(key * len(x) + rows)
-    ends = np.flatnonzero(np.diff(entries // len(x))) + 1
-    for tile_entries in np.split(entries, ends):
-        low = start + (np.array(divmod(tile_entries[0] // len(x), tile_columns)) - 1) * _TILE
-        yield low - _OVERLAP, np.stack([low, low + _TILE]), tile_entries % len(x)
+    position = np.stack([x, y], 1) - start
+    tile = np.floor(position / _TILE).astype(np.int64)
+    # (i, j, row) of each point in its own tile, and in those beyond the borders that it is near to
+    entries = [np.column_stack([tile, np.arange(len(x))])]
+    for shift in product((-_OVERLAP, 0, _OVERLAP), repeat=2):
+        near_tile = np.floor((position + shift) / _TILE).astype(np.int64)
+        near_rows = np.flatnonzero((near_tile != tile).any(1))
+        entries.append(np.column_stack([near_tile[near_rows], near_rows]))
+    table = np.concatenate(entries)
+    table = table[np.lexsort(table.T[::-1])]
+    # near a corner one tile comes by several shifts
+    table = table[np.append(True, np.diff(table, axis=0).any(1))]
+    ends = np.flatnonzero(np.diff(table[:, :2], axis=0).any(1)) + 1
+    for tile_table in np.split(table, ends):
+        low = start + tile_table[0, :2] * _TILE
+        yield low - _OVERLAP, np.stack([low, low + _TILE]), tile_table[:, 2]
 
 
 def _is_dense_somewhere(x: np.ndarray, y: np.ndarray) -> bool:
