@@ -107,7 +107,9 @@ def _path(evaluation: Step, out: Path) -> Path:
 def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
     """An evaluation's figures, what the training cost, and the mean pose's error on the same people."""
     result = read_scores(evaluation.product(out) / FILE).results[0]
-    lengths = [length_of(step, out) for step in evaluation.all()]
+    lengths = {step.line(out): length_of(step, out) for step in evaluation.all()}
+    # of shortened trainings those that ran
+    commands = [" ".join([line, *length]) for line, length in lengths.items()]
     network, header = load_checkpoint(cell.training[-1].product(out))
     runs, entry = runs_of(header.card), last_entry(cell.training[-1].folder(out))
     row = result.line("mpjpe")
@@ -127,11 +129,8 @@ def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
         "mean_pose": mean_pose,
         "undertrained": row.value is None or row.value > (1 - _UNDERTRAINED) * mean_pose,
         "scores": str(evaluation.product(out) / FILE),
-    } | (
-        {"commands": [" ".join([step.line(out), *length_of(step, out)]) for step in evaluation.all()]}
-        if any(lengths)
-        else {}
-    )
+        **({"commands": commands} if any(lengths.values()) else {}),
+    }
 
 
 def _value(result: Result, name: str) -> float | None:

@@ -241,7 +241,7 @@ def clip_example(
         clouds.append((points, *other_clouds))
     rotations = np.stack([np.asarray(sample.rotations) for sample in samples])
     if turn:
-        rotations[:, 0] = [rotation_vector(R @ root) for root in axis_angle_to_matrix(rotations[:, 0])]
+        rotations[:, 0] = rotation_vector(R @ axis_angle_to_matrix(rotations[:, 0]))
     return ClipExample(
         frames=tuple(frames),
         rotations=rotations,
