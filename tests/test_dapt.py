@@ -478,6 +478,20 @@ def test_patches_agree_in_both_layouts_and_spare_the_small():
     np.testing.assert_allclose(padded.anchors[1].numpy(), small["anchors"][0], rtol=1e-4, atol=1e-5)
 
 
+def test_gradients_agree_in_both_layouts():
+    net = network(TINY)
+    gradients = {}
+    for layout in ("ragged", "padded"):
+        net.zero_grad()
+        out = net(net.batch([person(300), person(40, 1)], layout=layout))
+        (out.points[:, 0].sum() + out.anchors[..., 1].sum()).backward()
+        gradients[layout] = {name: value.grad for name, value in net.named_parameters() if value.grad is not None}
+    assert len(gradients["ragged"]) > 50
+    for name, value in gradients["ragged"].items():
+        scale = value.abs().max().clamp(min=1e-6)
+        torch.testing.assert_close(gradients["padded"][name] / scale, value / scale, rtol=0, atol=1e-3, msg=name)
+
+
 def test_attention_equals_its_formula():
     torch.manual_seed(0)
     attention = PatchAttention(32, 2).eval()

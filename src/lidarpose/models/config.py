@@ -139,15 +139,7 @@ class NetworkConfig(Config):
 SIZES = {
     "tiny": NetworkConfig(size="tiny", channels=(48, 64, 96), head_channels=32, blocks=(1, 1, 1), convolution=12),
     "small": NetworkConfig(size="small", channels=(64, 96, 160), head_channels=32, blocks=(2, 2, 2), convolution=12),
-    "base": NetworkConfig(
-        size="base",
-        channels=(96, 192, 288),
-        head_channels=24,
-        blocks=(2, 3, 2),
-        grid=0.04,
-        max_voxels=512,
-        convolution=16,
-    ),
+    "base": NetworkConfig(size="base", channels=(96, 192, 288), head_channels=32, blocks=(2, 3, 2), convolution=12),
 }
 
 

@@ -252,6 +252,7 @@ class TrainDetector(Recipe):
     scenes: int = _setting(20_000, "scans that are made")
     uses: int = _setting(4, "how often each scan is shown, each time changed anew")
     init: str = _setting("", "weights to begin with: detector (the bundled one), or a checkpoint", "NAME|FILE")
+    revive: bool = _setting(False, "with --init: units that answer to no candidate are drawn anew")
 
 
 # the released OneCycle schedule, AdamW on everything, neither mean of weights nor clipping

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from torch import nn
 
 from lidarpose.data.dataset_card import read_card
@@ -23,12 +24,13 @@ from lidarpose.models.baselines.baseline_config import LidarcapConfig
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.dapt.dapt_config import DaptConfig
 from lidarpose.models.detector.detector import detector_path
-from lidarpose.models.detector.detector_config import DetectorConfig
+from lidarpose.models.detector.detector_config import INPUTS, DetectorConfig
+from lidarpose.models.detector.network import DetectorNet, revive
 from lidarpose.skeleton import Skeleton, skeleton
 from lidarpose.synth.scene import scene_config
 from lidarpose.train.augment import Augmentation, ClipExample, Example, augmentation, augmented
 from lidarpose.train.data_loader import BATCHES, ClipSource, MixedSource, Source, StoredSource, SyntheticSource
-from lidarpose.train.detector.candidate_source import CandidateSource, validation_scans
+from lidarpose.train.detector.candidate_source import CandidateSource, scan_example, validation_scans
 from lidarpose.train.networks import Config, expanded_network, finetuned_network, initial_network, pretraining_network
 from lidarpose.train.objectives.detector_objective import DetectorObjective, missed_people
 from lidarpose.train.objectives.objective import Objective
@@ -47,6 +49,8 @@ _NO_VALIDATION = (
 _LEAST_SEQUENCES = 3
 # chunks of a run between two times that a scan is shown: divides by the usual numbers of workers
 _LAG = 12
+# scans of which no candidate excites a dead unit of the detector
+_SCANS_TO_REVIVE = 8
 # share of objects among the synthesized people of fine-tuning, for a network that says whether somebody is there
 _OBJECTS = 0.2
 
@@ -122,7 +126,10 @@ def _detection(recipe: TrainDetector) -> TrainSetup:
         trained, header = load_checkpoint(path)
         if header.config != objective.config:
             raise file_error(path, f"expected a detector as train-detector makes it, got a network {header.network}")
-        network, card["init_card"] = partial(deepcopy, trained), header.card
+        network = partial(_revived, trained, recipe.seed) if recipe.revive else partial(deepcopy, trained)
+        card["init_card"] = header.card
+    elif recipe.revive:
+        raise InputError("revive is of weights to begin with: add --init detector, or a checkpoint")
     return TrainSetup(
         objective=objective,
         # a worker shows each scan again that it has made, for all usual numbers of workers
@@ -136,6 +143,15 @@ def _detection(recipe: TrainDetector) -> TrainSetup:
         validate=missed_people,
         error_unit="missed",
     )
+
+
+def _revived(trained: DetectorNet, seed: int) -> DetectorNet:
+    """A copy, in which units that answer to no candidate of the first scans are drawn anew."""
+    network = deepcopy(trained)
+    scans = [scan_example(seed, number) for number in range(_SCANS_TO_REVIVE)]
+    arrays = DetectorObjective(config=network.config).collate(scans)
+    revive(network, [torch.as_tensor(arrays[name]).float() for name in INPUTS])
+    return network
 
 
 def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:

@@ -63,7 +63,12 @@ class SubmanifoldConvolution(nn.Module):
         out = F.linear(rows, weights[len(weights) // 2], self.bias)
         if near.table is not None:
             # the row after the last is zero: an empty cell; the table has none for the middle tap, done above
-            neighbor_rows = F.pad(rows, (0, 0, 0, 1))[near.table.flatten()].view(rows.shape[0], -1)
+            count, width = near.table.shape
+            is_empty = near.table == count
+            own = torch.arange(count, device=rows.device)[:, None]
+            index = torch.where(is_empty, own, near.table).flatten()
+            neighbor_rows = rows.index_select(0, index).view(count, width, -1).masked_fill(is_empty[..., None], 0)
+            neighbor_rows = neighbor_rows.flatten(1)
             return out + F.linear(neighbor_rows, self.weight.flatten(1))
         # all set where there is no table
         all_sources, all_targets, pairs = cast("tuple[Tensor, Tensor, Tensor]", (near.source, near.target, near.counts))

@@ -21,7 +21,7 @@ from lidarpose.train.detector.candidate_source import NOBODY, UNCLEAR, DetectorE
 from lidarpose.train.objectives.objective import Share, alone, at_least_one, on_device
 
 # weights; distances are in meters
-PERSON, OFFSET, FOOT, HEIGHT, MOUNTED = 1.0, 2.0, 1.0, 1.0, 0.1
+PERSON, OFFSET, FOOT, HEIGHT, MOUNTED = 1.0, 2.0, 1.0, 1.0, 0.5
 # nobody's candidates that are learned from: of the largest loss, for each of people's and for each scan; and at random,
 # a share of the rest
 HARD, HARD_OF_SCAN, EASY = 1.5, 4, 0.1
