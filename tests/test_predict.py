@@ -649,10 +649,19 @@ def test_people_are_found_in_what_holds_them(model, points):
     assert poses[1] in poses and poses != model.predict([points[:0]]) and len({*poses, poses[0], poses}) == 3
 
 
-def test_points_are_no_path():
-    with pytest.raises(InputError, match="expected the path of a point file, got ndarray") as caught:
-        lidarpose.predict(np.zeros((300, 3)), crop=True)
-    assert len(str(caught.value)) < 200
+def test_points_are_as_good_as_their_file(tmp_path, points):
+    path = tmp_path / "person.npy"
+    np.save(path, points)
+    from_file, from_array = lidarpose.predict(path, model="tiny"), lidarpose.predict(points, model="tiny")
+    np.testing.assert_array_equal(from_file[0].joints, from_array[0].joints)
+    assert from_array.source is None and from_array[0].id == from_file[0].id == 0
+    # an array is searched where it is wide, or where that is asked for
+    wide = np.concatenate([points, points.min(0) + [[0, 0, 0], [30, 30, 0]]])
+    assert lidarpose.predict(wide, model="tiny").scan is not None
+    assert lidarpose.predict(points, find=True, min_score=0.99, model="tiny").scan is not None
+    for not_points in (None, 7, "points", np.zeros((3, 2)), np.zeros((0, 3)), np.zeros((300, 3))):
+        with pytest.raises(InputError, match="expected|no such file|must be"):
+            lidarpose.predict(not_points, model="tiny")
 
 
 def test_ids_are_what_json_can_hold(model, sweep):

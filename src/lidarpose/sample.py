@@ -28,7 +28,7 @@ PER_JOINT = ("confidence", "spread", "visible", "in_range")
 # and once a person
 PER_PERSON = ("person", "second_person")
 # tables of results have a row for each joint of each person, who has a number in the column "person"
-JOINT_COLUMNS = ("joint", "x", "y", "z", *PER_JOINT, "person_probability", "second_person", "score")
+JOINT_COLUMNS = ("joint", "x", "y", "z", *PER_JOINT, "person_probability", "second_person", "score", "mounted")
 # the label of a joint: not labeled (its position is NaN), labeled though hidden or uncertain, labeled and seen
 UNLABELED, HIDDEN, SEEN = 0, 1, 2
 

@@ -17,7 +17,7 @@ from lidarpose.errors import InputError, check_int
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
 from lidarpose.inference.background import is_static, read_background
 from lidarpose.inference.checks import flat_along_another_axis, flat_axis, scan_unit_warning, unlikely_origin
-from lidarpose.inference.inputs import as_origin, as_points, only_returns
+from lidarpose.inference.inputs import as_origin
 from lidarpose.inference.scan import Scan, read_scan, up_text
 from lidarpose.inference.verification import KnownPlaces, rounded, verified
 from lidarpose.io.boxes import Boxes
@@ -99,12 +99,7 @@ def detect(
     search = search_options(min_score, max_range, max_people, background, columns)
     origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)
     scan = Scan(points=np.zeros((0, 3)), origin=origin, up=up_text(up))
-    if isinstance(points, str | os.PathLike):
-        scan = read_scan(scan, points, columns)
-    else:
-        cloud, notes = only_returns(as_points(points))
-        scan = replace(scan, points=cloud, warnings=tuple(notes))
-    result = search_alone(scan, search)
+    result = search_alone(read_scan(scan, points, columns), search)
     return Boxes(
         result.boxes or [],
         source=result.source,

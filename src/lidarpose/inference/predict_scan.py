@@ -1,9 +1,10 @@
-"""`predict`: the people of a file. The steps of one scan: read, search, load, pose."""
+"""`predict`: the people of a file or an array. The steps of one scan: read, search, load, pose."""
 
 import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,12 +20,15 @@ from lidarpose.io.boxes import read_boxes
 from lidarpose.models import DEFAULT
 from lidarpose.sample import Box
 
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 # a file of less than this across is taken for a crop, m
 CROP_SIZE = 4.0
 
 
 def predict(
-    path: str | os.PathLike,
+    points: "str | os.PathLike | ArrayLike",
     *,
     boxes: "str | os.PathLike | dict | Box | list | tuple | np.ndarray | None" = None,
     calib: str | os.PathLike | None = None,
@@ -41,9 +45,10 @@ def predict(
     model: "Predictor | str | os.PathLike | Callable[[], Predictor]" = DEFAULT,
     progress: bool = False,
 ) -> Poses:
-    """Poses of the people in a point file, in the file's own frame.
+    """Poses of the people in a point file or in an array, in its own frame.
 
     Args:
+        points: a point file, or (n, 3+) m in any frame; "the file" below is either.
         boxes: whatever `read_boxes` takes (a JSON file, a KITTI label, rows, a `Box` or several), their length and
             width level, their height and yaw along and about the up axis, or the axis nearest to a direction `up`.
         calib: of a KITTI label, None for `../calib/N.txt` beside it.
@@ -63,14 +68,15 @@ def predict(
     """
     options = (min_score, max_range, max_people, background)
     check_choice(boxes, crop, find or any(option is not None for option in options))
-    _check_path(path)
     start = time.perf_counter()
     input_boxes = None if boxes is None else read_boxes(boxes, calib=calib)
     if up is None:
         up = "z" if input_boxes is None else input_boxes.up
     rotation_from_up(up)
     scan = Scan(points=np.zeros((0, 3)), boxes=input_boxes, origin=as_origin(sensor_origin), up=up_text(up))
-    scan = read_scan(scan, path, columns)
+    scan = read_scan(scan, points, columns)
+    if not len(scan.points):
+        raise InputError("expected points (n, 3) in meters, got none, or only 0,0,0, which are no returns")
     find = find or boxes is None and not crop and is_wide(scan)
     if not find and any(option is not None for option in options):
         note = f"taken as one person, since under {CROP_SIZE:g} m across, and not searched: find looks for people"
@@ -136,11 +142,3 @@ def check_choice(boxes: object, crop: bool, searched: bool) -> None:
     if searched and (boxes is not None or crop):
         options = "find, min score, range, max people and background"
         raise InputError(f"{options} are for people who are searched for: leave them away with boxes or a crop")
-
-
-def _check_path(path: object) -> None:
-    if not isinstance(path, str | os.PathLike):
-        kind = type(path).__name__
-        raise InputError(
-            f"expected the path of a point file, got {kind}: for points use lidarpose.load().predict(points)"
-        )

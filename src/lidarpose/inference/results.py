@@ -235,8 +235,8 @@ class Poses(Sequence[PersonPose]):
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """A row for each joint of each person who has a pose: person (place in this sequence), id, joint, x, y, z (m),
-        confidence, spread (m), visible, in_range, person_probability (`PersonPose.person`), second_person, score; NaN
-        for what is not known."""
+        confidence, spread (m), visible, in_range, person_probability (`PersonPose.person`), second_person, score,
+        mounted; NaN for what is not known."""
         import pandas
 
         rows = []
@@ -244,7 +244,9 @@ class Poses(Sequence[PersonPose]):
             if person.pose is None:
                 continue
             values = [getattr(person.pose, name) for name in PER_JOINT]
-            person_values = [np.nan if x is None else x for x in (person.person, person.second_person, person.score)]
+            mounted = None if person.box is None else person.box.mounted
+            known_values = (person.person, person.second_person, person.score, mounted)
+            person_values = [np.nan if value is None else value for value in known_values]
             for j, joint in enumerate(self.skeleton.joints):
                 joint_values = [np.nan if value is None else value[j] for value in values]
                 rows.append((number, person.id, joint, *person.pose.joints[j], *joint_values, *person_values))

@@ -14,13 +14,15 @@ import numpy as np
 
 from lidarpose.geometry import rotation_from_up, rotation_of_boxes, upright_axis
 from lidarpose.inference.checks import check_scan, origin_warning, rows_inside, unit_warning
-from lidarpose.inference.inputs import only_returns
+from lidarpose.inference.inputs import as_points, only_returns
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.io.files import file_error
 from lidarpose.io.point_cloud import read_points
 from lidarpose.sample import FARTHEST, Box
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
     from lidarpose.inference.predictor import Predictor
 
 
@@ -92,14 +94,18 @@ def _turned(points: np.ndarray, R: np.ndarray) -> np.ndarray:
     return points if np.array_equal(R, np.eye(3)) else points @ R.T
 
 
-def read_scan(scan: Scan, path: str | os.PathLike, columns: int | None) -> Scan:
-    """The scan with the returns of a file, its name and notes. Raises InputError where it has none."""
-    cloud = read_points(path, columns=columns)
-    points, notes = only_returns(cloud.points)
-    if not len(points):
+def read_scan(scan: Scan, points: str | os.PathLike | ArrayLike, columns: int | None) -> Scan:
+    """The scan with the returns of a file, its name and notes, or those of an array (n, 3+) m. Raises InputError for a
+    file without any."""
+    if not isinstance(points, str | os.PathLike):
+        returns, notes = only_returns(as_points(points))
+        return replace(scan, points=returns, warnings=tuple(notes))
+    cloud = read_points(points, columns=columns)
+    returns, notes = only_returns(cloud.points)
+    if not len(returns):
         problem = f"none within {FARTHEST:g} m" if cloud.points.any() else "only 0,0,0, which are no returns"
-        raise file_error(path, f"expected points in meters, got {problem}: export it again")
-    return replace(scan, points=points, warnings=(*cloud.warnings, *notes), source=os.fsdecode(path))
+        raise file_error(points, f"expected points in meters, got {problem}: export it again")
+    return replace(scan, points=returns, warnings=(*cloud.warnings, *notes), source=os.fsdecode(points))
 
 
 def pose_scan(scan: Scan, predictor: Predictor, *, skeleton: str | None = None, progress: bool = False) -> Poses:

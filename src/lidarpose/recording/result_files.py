@@ -70,7 +70,8 @@ def _tables(lines: Iterable[dict[str, Any]]) -> Iterator[Any]:
             table["id"] = table["id"].map(lambda id: None if id is None else str(id)).astype("string")
             for name in ("frame_id", "joint"):
                 table[name] = table[name].astype("string")
-            types = {"frame": "int64", "person": "int64", "track": "Int64", "filled": "bool", "in_range": "boolean"}
+            types = {"frame": "int64", "person": "int64", "track": "Int64", "filled": "bool"}
+            types |= {"in_range": "boolean", "mounted": "boolean"}
             float_columns = set(_COLUMNS) - set(types) - {"id", "frame_id", "joint"}
             yield table.astype(types | dict.fromkeys(float_columns, "float64"))
             chunk = list(islice(remaining, _ROWS_OF))
@@ -85,7 +86,7 @@ def _rows(line: dict[str, Any]) -> Iterator[tuple]:
             continue
         person_cells = (number, person["id"], person["track"], person["filled"])
         joint_values = [person[name] or [None] * len(joints) for name in ("confidence", "spread", "visible")]
-        person_values = (person["person"], person["second_person"], person["score"])
+        person_values = (person["person"], person["second_person"], person["score"], person["mounted"])
         for j, name in enumerate(joints):
             values = (*(value[j] for value in joint_values), name not in person["out_of_range"], *person_values)
             yield line["frame"], line["id"], line["time"], *person_cells, name, *person["joints"][j], *values
