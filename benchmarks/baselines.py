@@ -19,7 +19,7 @@ from lidarpose.train.data_loader import SyntheticSource
 from lidarpose.train.networks import PRETRAINED
 from lidarpose.train.objectives.objective import total
 from lidarpose.train.optim import optimizers
-from lidarpose.train.recipes import MODELS, Pretrain, recipe
+from lidarpose.train.recipes import MODELS, Pretrain, recipe, recipe_of_model
 from lidarpose.train.setup import objective_of
 
 ROUNDS = 2
@@ -40,7 +40,7 @@ def main() -> None:
     for name in options.models:
         model = next((model for model, sizes in MODELS.items() if name in sizes), name)
         size = "" if model == name else name
-        recipe_name = {"dapt": "paper", "ours": "default"}.get(model, model)
+        recipe_name = recipe_of_model(Pretrain, model)
         settings = recipe(Pretrain, recipe_name, model=model, size=size)
         config = PRETRAINED[settings.size][0]
         frames = getattr(config, "frames", 1)

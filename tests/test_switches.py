@@ -1,6 +1,7 @@
 """Switches that the paper's tables need: random weights, fields of the scene, recorded places, corpora as motion."""
 
 import pickle
+import shutil
 from dataclasses import replace
 
 import dataset_files
@@ -172,6 +173,9 @@ def test_a_corpus_without_parts_is_pointed_out(people, tmp_path):
     prepare("lipd", tmp_path / "raw", tmp_path / "corpus", progress=False)
     warnings = make_setup(Pretrain(shards=(str(tmp_path / "corpus"),))).warnings
     assert any("L_seg" in warning for warning in warnings)
+    shutil.copytree(tmp_path / "corpus", tmp_path / "second")
+    (warning,) = make_setup(Pretrain(shards=(str(tmp_path / "corpus"), str(tmp_path / "second")))).warnings
+    assert warning.startswith("no point of corpus, second has a body part")
     assert not make_setup(Pretrain(shards=(str(people),))).warnings
 
 

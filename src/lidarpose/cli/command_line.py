@@ -5,6 +5,7 @@ import os
 import sys
 import warnings
 from contextlib import suppress
+from typing import Any
 
 import lidarpose.cli.datasets as datasets
 import lidarpose.cli.evaluating as evaluating
@@ -88,6 +89,10 @@ def _failed(error: Exception) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
+    def __init__(self, **settings: Any):
+        # --keep of another command would be taken for --keep-anchors
+        super().__init__(**{"allow_abbrev": False} | settings)
+
     def error(self, message: str):
         """One line, as for every other wrong input."""
         self.exit(2, f"lidarpose: error: {message}; see {self.prog} --help\n")

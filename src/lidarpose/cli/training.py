@@ -90,7 +90,7 @@ def _add(parser, kind: type[Recipe]) -> None:
 
 def _train(options: argparse.Namespace) -> None:
     from lidarpose.train.loop import train
-    from lidarpose.train.recipes import RECIPES, recipe
+    from lidarpose.train.recipes import recipe, recipe_of_model
     from lidarpose.train.run_dir import latest, read_config
     from lidarpose.train.validation import draw_examples
 
@@ -127,8 +127,8 @@ def _train(options: argparse.Namespace) -> None:
         run_recipe = kind(**(read_config(Path(folder), kind)[0].to_dict() | changes))
     else:
         # as published, unless a recipe is named
-        model = {"dapt": "paper"}.get(changes.get("model", ""), changes.get("model"))
-        run_recipe = recipe(kind, options.recipe or (model if model in RECIPES[kind] else "default"), **changes)
+        recipe_name = options.recipe or recipe_of_model(kind, changes.get("model", ""))
+        run_recipe = recipe(kind, recipe_name, **changes)
     words = [f"--{key.replace('_', '-')} {_as_typed(value)}" for key, value in changes.items() if key != "data"]
     words += [f"--recipe {options.recipe}"] * (options.recipe not in (None, "default"))
     words += ["--resume"] * options.resume

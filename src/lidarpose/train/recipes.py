@@ -306,7 +306,15 @@ RECIPES: dict[type[Recipe], dict[str, dict[str, Any]]] = {
     },
     TrainDetector: {"default": {}},
 }
+# of a network named by --model whose recipe has another name
+_RECIPE_OF_MODEL = {"dapt": PAPER}
 AnyRecipe = TypeVar("AnyRecipe", bound=Recipe)
+
+
+def recipe_of_model(kind: type[Recipe], model: str) -> str:
+    """The name of the recipe by which a network of `MODELS` is trained as published; else "default"."""
+    name = _RECIPE_OF_MODEL.get(model, model)
+    return name if name in RECIPES[kind] else "default"
 
 
 def recipe(kind: type[AnyRecipe], name: str = "default", **changes: Any) -> AnyRecipe:

@@ -219,10 +219,15 @@ def _damage(dataset: InMemoryDataset) -> tuple[str, ...]:
 
 
 def _no_parts(dataset: InMemoryDataset) -> tuple[str, ...]:
-    """A warning where points have no body parts, of which half of the loss of pre-training is."""
-    if any(rows.num_rows and rows["part"].null_count < rows.num_rows for _, rows, _ in dataset.parts):
+    """A warning where a dataset's points have no body parts, of which half of the loss of pre-training is."""
+    is_known: dict[Path, bool] = {}
+    for reader, rows, _ in dataset.parts:
+        has_parts = bool(rows.num_rows) and rows["part"].null_count < rows.num_rows
+        is_known[reader.folder] = has_parts or is_known.get(reader.folder, False)
+    names = ", ".join(folder_names(str(folder) for folder, known in is_known.items() if not known))
+    if not names:
         return ()
-    return ("no point of these datasets has a body part: the loss of parts (the paper's L_seg) is absent",)
+    return (f"no point of {names} has a body part: the loss of parts (the paper's L_seg) is absent there",)
 
 
 def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
