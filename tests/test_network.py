@@ -175,7 +175,7 @@ def test_configurations_that_cannot_be(change, message):
         preset("huge")
 
 
-@pytest.mark.parametrize("size, parameters", [("tiny", TINY_PARAMETERS), ("small", 1_452_054), ("base", 5_691_877)])
+@pytest.mark.parametrize("size, parameters", [("tiny", TINY_PARAMETERS), ("small", 1_452_054), ("base", 5_509_087)])
 def test_sizes(size, parameters):
     config = preset(size)
     assert NetworkConfig(**config.to_dict()) == config

@@ -7,6 +7,7 @@ on. It is sorted in lanes, and a process takes whole lanes: no process makes exa
 all of them together are the same however many there are.
 """
 
+import gc
 import os
 import pickle
 import signal
@@ -275,7 +276,7 @@ def loader(chunks: Chunks, *, workers: int) -> Iterator[list[Any]]:
         num_workers=workers,
         prefetch_factor=4 if workers else None,
         collate_fn=_packed if workers else _unchanged,
-        worker_init_fn=partial(_end_with_parent, os.getpid()) if workers else None,
+        worker_init_fn=partial(_begin_worker, os.getpid()) if workers else None,
     )
     return map(_unpacked, data_loader) if workers else iter(data_loader)
 
@@ -317,8 +318,8 @@ def _starts(lengths: list[int]) -> list[int]:
     return [0, *accumulate(map(_aligned, lengths))][:-1]
 
 
-def _end_with_parent(parent: int, worker: int) -> None:
-    """Ends this worker when its parent is gone: a killed parent cannot stop it, and it would wait for ever."""
+def _begin_worker(parent: int, worker: int) -> None:
+    """Lets this worker end when its parent is gone: a killed parent cannot stop it, and it would wait for ever."""
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -330,3 +331,5 @@ def _end_with_parent(parent: int, worker: int) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=watch, daemon=True).start()
+    # what was made before this process is not looked through for garbage again: 5 % of the time of making people
+    gc.freeze()
