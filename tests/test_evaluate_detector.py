@@ -187,6 +187,23 @@ def test_mounted_people_are_told_apart_and_change_nothing_for_the_others():
     assert result.row("recall", "1")["value"] == 100 and result.row("recall", "1")["count"] == 2
     assert result.row("recall", "1", "mounted, all")["value"] == 50
     assert result.row("average_precision")["value"] == 100 and result.row("false_people", "10")["value"] == 0
+    assert result.row("said_mounted", "1", "mounted")["value"] == 0
+
+
+def test_who_is_said_to_ride_is_counted_of_those_who_do_and_of_the_others():
+    scans = scan_set([scan([5, {"x": 10, "mounted": True}, {"x": 15, "mounted": True}, 20])])
+    plain = answers([(5, 0.9), (10, 0.8), (15, 0.7), (20, 0.1), (30, 0.6)])
+
+    def detect(points, origin):
+        boxes, scores = plain(points, origin)
+        return [replace(box, mounted=box.center[0] in (10, 20, 30)) for box in boxes], scores
+
+    result = score_detector(detect, scans, default_score=0.5)
+    told = {group: result.row("said_mounted", "default", group) for group in ("mounted", "on foot")}
+    assert told["mounted"]["value"] == 50 and told["mounted"]["count"] == 2
+    # below the default score nobody is found
+    assert told["on foot"]["value"] == 0 and told["on foot"]["count"] == 1
+    assert result.row("said_mounted", "10", "on foot")["value"] == 50
 
 
 def test_calibration_is_of_people_and_false_ones():

@@ -99,6 +99,7 @@ def score_scan(
             "status": status.astype(object),
         }
         | {"mounted": is_match & np.append(scan.mounted, False)[of_person], "thing": _things(scan, boxes)}
+        | {"said_mounted": np.array([bool(box.mounted) for box in boxes], bool)}
     )
     return people[is_wanted], detections
 
@@ -254,6 +255,7 @@ def _figures(
             ends = _with_interval(draws, people.scan[mask].nunique())
             rows.append(_row("recall", at, group, of, **ends, unit="%", count=int(mask.sum())))
         rows += _false_rows(at, false_people[false_people.score > bounds[0]], scans)
+        rows += _mounted_rows(at, detections[(detections.status == PERSON) & (detections.score > bounds[0])])
     people_on_foot = people[~people.mounted]
     counted_detections = detections[(detections.status == FALSE) | (detections.status == PERSON) & ~detections.mounted]
     precision = 100 * average_precision(counted_detections, people_on_foot, weights)
@@ -365,3 +367,13 @@ def _pose_rows(people: pd.DataFrame, at: str, threshold: float, rng: np.random.G
         )
         low, high = aggregate.interval(values, rng, clusters=posed_people.scan.to_numpy()).stated
         yield _row(name, at, value=values.mean(), low=low, high=high, unit="mm", count=len(posed_people))
+
+
+def _mounted_rows(at: str, found_people: pd.DataFrame) -> Iterator[dict[str, Any]]:
+    """Of people who are found, the share of those who ride, and of the others, whose box says that they ride."""
+    for group, people in (
+        ("mounted", found_people[found_people.mounted]),
+        ("on foot", found_people[~found_people.mounted]),
+    ):
+        value = 100 * people.said_mounted.mean() if len(people) else None
+        yield _row("said_mounted", at, group, value=value, unit="%", count=len(people))
