@@ -22,6 +22,7 @@ from lidarpose.sample import center_of
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SCENES
+from lidarpose.train import data_loader
 from lidarpose.train.augment import disturbed
 from lidarpose.train.data_loader import BATCHES, Chunks, SyntheticSource, loader
 from lidarpose.train.objectives.objective import total
@@ -241,13 +242,16 @@ def whole():
     return list(chunks(RECIPE))
 
 
-def test_chunks_are_the_same_from_any_start_by_any_number_of_workers(whole):
+def test_chunks_are_the_same_from_any_start_by_any_number_of_workers(whole, monkeypatch):
     assert len(whole) == 3 and all(len(batches) == BATCHES for batches in whole)
     joints = np.concatenate([b["joints"] for batches in whole for b in batches])
     assert len(np.unique(joints[:, 5], axis=0)) == len(joints) == RECIPE.people
     for start in (1, 2):
         assert_same_chunks(whole[start:], chunks(RECIPE, start=start))
-    for workers in (1, 2):
+    for workers, shared in ((1, 0), (2, 0), (1, 2**60)):
+        # without enough shared memory they come through a pipe
+        monkeypatch.setattr(data_loader, "_SHARED_OF_WORKER", shared)
+        assert data_loader._has_shared_memory(workers) == (not shared and data_loader._SHARED_MEMORY.is_dir())
         assert_same_chunks(whole, chunks(RECIPE, workers))
     # the last one may be short
     short = list(chunks(RECIPE, steps=BATCHES + 3))

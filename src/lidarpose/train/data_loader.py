@@ -10,6 +10,7 @@ all of them together are the same however many there are.
 import gc
 import os
 import pickle
+import shutil
 import signal
 import threading
 import time
@@ -20,6 +21,7 @@ from functools import cached_property, lru_cache, partial
 from itertools import accumulate
 from math import floor, gcd
 from operator import attrgetter
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -54,7 +56,9 @@ BATCHES = 8
 LANES = 8
 # how often a worker checks that its parent lives, s
 _POLL = 1.0
-# bytes to whose multiples arrays are aligned
+# where Linux keeps shared memory, and how much a worker may need, bytes
+_SHARED_MEMORY, _SHARED_OF_WORKER = Path("/dev/shm"), 2**30
+# bytes to whose multiples arrays are aligned in it
 _ALIGNED = 64
 # scenes of which every sample is as the paper says, masked always
 _OF_ONE_DIFFICULTY = ("paper", "reference")
@@ -270,15 +274,16 @@ def lanes_of(batch: int, ranks: int = 1) -> int:
 
 def loader(chunks: Chunks, *, workers: int) -> Iterator[list[Any]]:
     """The chunks in order, made by `workers` processes (0: by this one)."""
+    is_packed = workers > 0 and _has_shared_memory(workers)
     data_loader = DataLoader(
         chunks,
         batch_size=None,
         num_workers=workers,
         prefetch_factor=4 if workers else None,
-        collate_fn=_packed if workers else _unchanged,
+        collate_fn=_packed if is_packed else _unchanged,
         worker_init_fn=partial(_begin_worker, os.getpid()) if workers else None,
     )
-    return map(_unpacked, data_loader) if workers else iter(data_loader)
+    return map(_unpacked, data_loader) if is_packed else iter(data_loader)
 
 
 def _unchanged(batches: list[Any]) -> list[Any]:
@@ -288,6 +293,11 @@ def _unchanged(batches: list[Any]) -> list[Any]:
 
 # ---- between processes a chunk's arrays lie in one block of shared memory: through a pipe, hundreds of megabytes take
 # longer than a GPU's steps
+
+
+def _has_shared_memory(workers: int) -> bool:
+    """Whether there is room for the chunks of so many workers; containers have 64 MB unless they are given more."""
+    return _SHARED_MEMORY.is_dir() and shutil.disk_usage(_SHARED_MEMORY).free > workers * _SHARED_OF_WORKER
 
 
 def _packed(batches: list[Any]) -> tuple[bytes, list[int], torch.Tensor]:
