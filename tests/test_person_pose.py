@@ -29,7 +29,8 @@ def test_the_score_of_a_box_is_that_of_its_person():
     assert person.score == 0.87654
     assert person.to_dict()["score"] == 0.8765 and person.to_dict()["mounted"] is False
     table = person.to_dataframe()
-    assert table.columns[-1] == "score" and (table["score"] == 0.87654).all()
+    assert table.columns[-1] == "mounted" and not table["mounted"].any()
+    assert (table["score"] == 0.87654).all()
     assert table["person_probability"].isna().all() and table["second_person"].isna().all()
 
 

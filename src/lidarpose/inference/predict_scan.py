@@ -28,7 +28,7 @@ CROP_SIZE = 4.0
 
 
 def predict(
-    points: "str | os.PathLike | ArrayLike",
+    path: "str | os.PathLike | ArrayLike",
     *,
     boxes: "str | os.PathLike | dict | Box | list | tuple | np.ndarray | None" = None,
     calib: str | os.PathLike | None = None,
@@ -48,7 +48,7 @@ def predict(
     """Poses of the people in a point file or in an array, in its own frame.
 
     Args:
-        points: a point file, or (n, 3+) m in any frame; "the file" below is either.
+        path: a point file, or the points themselves, (n, 3+) m in any frame; "the file" below is either.
         boxes: whatever `read_boxes` takes (a JSON file, a KITTI label, rows, a `Box` or several), their length and
             width level, their height and yaw along and about the up axis, or the axis nearest to a direction `up`.
         calib: of a KITTI label, None for `../calib/N.txt` beside it.
@@ -74,7 +74,7 @@ def predict(
         up = "z" if input_boxes is None else input_boxes.up
     rotation_from_up(up)
     scan = Scan(points=np.zeros((0, 3)), boxes=input_boxes, origin=as_origin(sensor_origin), up=up_text(up))
-    scan = read_scan(scan, points, columns)
+    scan = read_scan(scan, path, columns)
     if not len(scan.points):
         raise InputError("expected points (n, 3) in meters, got none, or only 0,0,0, which are no returns")
     find = find or boxes is None and not crop and is_wide(scan)
