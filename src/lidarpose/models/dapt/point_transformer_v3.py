@@ -62,7 +62,8 @@ class SubmanifoldConvolution(nn.Module):
         weights = self.weight.flatten(1, 3).unbind(1)
         out = F.linear(rows, weights[len(weights) // 2], self.bias)
         if near.table is not None:
-            # the row after the last is zero: an empty cell; the table has none for the middle tap, done above
+            # the row after the last is an empty cell, also of the middle tap, done above: it reads the voxel's own row,
+            # set to zero. One row for all of them would be read so often that its gradient takes most of a GPU's step
             count, width = near.table.shape
             is_empty = near.table == count
             own = torch.arange(count, device=rows.device)[:, None]
