@@ -199,10 +199,10 @@ def test_who_is_said_to_ride_is_counted_of_those_who_do_and_of_the_others():
         return [replace(box, mounted=box.center[0] in (10, 20, 30)) for box in boxes], scores
 
     result = score_detector(detect, scans, default_score=0.5)
-    told = {group: result.row("said_mounted", "default", group) for group in ("mounted", "on foot")}
-    assert told["mounted"]["value"] == 50 and told["mounted"]["count"] == 2
+    shares = {group: result.row("said_mounted", "default", group) for group in ("mounted", "on foot")}
+    assert shares["mounted"]["value"] == 50 and shares["mounted"]["count"] == 2
     # below the default score nobody is found
-    assert told["on foot"]["value"] == 0 and told["on foot"]["count"] == 1
+    assert shares["on foot"]["value"] == 0 and shares["on foot"]["count"] == 1
     assert result.row("said_mounted", "10", "on foot")["value"] == 50
 
 

@@ -300,32 +300,23 @@ def _has_shared_memory(workers: int) -> bool:
     return _SHARED_MEMORY.is_dir() and shutil.disk_usage(_SHARED_MEMORY).free > workers * _SHARED_OF_WORKER
 
 
-def _packed(batches: list[Any]) -> tuple[bytes, list[int], torch.Tensor]:
-    """A chunk: all but its arrays; their lengths in bytes; and the arrays, aligned one after the other, (n,) uint8."""
+def _packed(batches: list[Any]) -> tuple[bytes, list[tuple[int, int]], torch.Tensor]:
+    """A chunk: all but its arrays; where each of them begins and ends; and the block of them, (n,) uint8."""
     buffers: list[pickle.PickleBuffer] = []
     rest = pickle.dumps(batches, protocol=5, buffer_callback=buffers.append)
     arrays = [np.frombuffer(buffer.raw(), np.uint8) for buffer in buffers]
-    lengths = [len(array) for array in arrays]
-    block = torch.empty(sum(map(_aligned, lengths)), dtype=torch.uint8)
-    for array, start in zip(arrays, _starts(lengths), strict=True):
-        block.numpy()[start : start + len(array)] = array
-    return rest, lengths, block
+    *starts, size = accumulate((-(-len(array) // _ALIGNED) * _ALIGNED for array in arrays), initial=0)
+    spans = [(start, start + len(array)) for start, array in zip(starts, arrays, strict=True)]
+    block = torch.empty(size, dtype=torch.uint8)
+    for (start, end), array in zip(spans, arrays, strict=True):
+        block.numpy()[start:end] = array
+    return rest, spans, block
 
 
-def _unpacked(chunk: tuple[bytes, list[int], torch.Tensor]) -> list[Any]:
-    rest, lengths, block = chunk
+def _unpacked(chunk: tuple[bytes, list[tuple[int, int]], torch.Tensor]) -> list[Any]:
+    rest, spans, block = chunk
     memory = block.numpy().data
-    places = zip(_starts(lengths), lengths, strict=True)
-    return pickle.loads(rest, buffers=[memory[start : start + length] for start, length in places])
-
-
-def _aligned(length: int) -> int:
-    return -(-length // _ALIGNED) * _ALIGNED
-
-
-def _starts(lengths: list[int]) -> list[int]:
-    """Where arrays of these lengths begin in a block."""
-    return [0, *accumulate(map(_aligned, lengths))][:-1]
+    return pickle.loads(rest, buffers=[memory[start:end] for start, end in spans])
 
 
 def _begin_worker(parent: int, worker: int) -> None:

@@ -220,11 +220,9 @@ def _damage(dataset: InMemoryDataset) -> tuple[str, ...]:
 
 def _no_parts(dataset: InMemoryDataset) -> tuple[str, ...]:
     """A warning where a dataset's points have no body parts, of which half of the loss of pre-training is."""
-    is_known: dict[Path, bool] = {}
-    for reader, rows, _ in dataset.parts:
-        has_parts = bool(rows.num_rows) and rows["part"].null_count < rows.num_rows
-        is_known[reader.folder] = has_parts or is_known.get(reader.folder, False)
-    names = ", ".join(folder_names(str(folder) for folder, known in is_known.items() if not known))
+    folders = dict.fromkeys(str(reader.folder) for reader, _, _ in dataset.parts)
+    with_parts = {str(r.folder) for r, rows, _ in dataset.parts if rows["part"].null_count < rows.num_rows}
+    names = ", ".join(folder_names(folder for folder in folders if folder not in with_parts))
     if not names:
         return ()
     return (f"no point of {names} has a body part: the loss of parts (the paper's L_seg) is absent there",)

@@ -369,11 +369,8 @@ def _pose_rows(people: pd.DataFrame, at: str, threshold: float, rng: np.random.G
         yield _row(name, at, value=values.mean(), low=low, high=high, unit="mm", count=len(posed_people))
 
 
-def _mounted_rows(at: str, found_people: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    """Of people who are found, the share of those who ride, and of the others, whose box says that they ride."""
-    for group, people in (
-        ("mounted", found_people[found_people.mounted]),
-        ("on foot", found_people[~found_people.mounted]),
-    ):
+def _mounted_rows(at: str, matches: pd.DataFrame) -> Iterator[dict[str, Any]]:
+    """Of people's detections, the share whose box says that they ride: of those who do, and of the others."""
+    for group, people in (("mounted", matches[matches.mounted]), ("on foot", matches[~matches.mounted])):
         value = 100 * people.said_mounted.mean() if len(people) else None
         yield _row("said_mounted", at, group, value=value, unit="%", count=len(people))
