@@ -142,7 +142,7 @@ def noisy(frame, rng):
     return boxes
 
 
-def found(frame, least, below=1.1):
+def boxes_of_score(frame, least, below=1.1):
     return [Box(**box) for box in frame["boxes"] if least <= box["score"] < below]
 
 
@@ -251,8 +251,8 @@ def figures(recordings):
     rng = np.random.default_rng(0)
     no_boxes = [[[] for _ in frames] for frames in recordings]
     noisy_boxes = [[noisy(frame, rng) for frame in frames] for frames in recordings]
-    sure_boxes = [[found(frame, default_score) for frame in frames] for frames in recordings]
-    weak_boxes = [[found(frame, WEAK_SCORE, default_score) for frame in frames] for frames in recordings]
+    sure_boxes = [[boxes_of_score(frame, default_score) for frame in frames] for frames in recordings]
+    weak_boxes = [[boxes_of_score(frame, WEAK_SCORE, default_score) for frame in frames] for frames in recordings]
     rows = []
     for name, boxes, doubtful_boxes in (
         ("true, with noise and drop-outs", noisy_boxes, no_boxes),
