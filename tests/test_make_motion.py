@@ -52,6 +52,17 @@ def test_subjects_are_chosen_with_or_without_zeros_and_files_of_others_are_not_o
     assert list(both) == ["002_01", "002_10", "bd_squat1Reps_001"]
 
 
+def test_clips_are_left_out_and_cut_by_their_names(tmp_path, capsys):
+    write_archive(tmp_path / "archive")
+    words = [str(tmp_path / "archive"), "--out", str(tmp_path / "motion.npz"), "--without", "005*", "002_10"]
+    assert make_motion.main([*words, "--first", "0.7", "bd_*"]) == 0
+    motion = load_motion(tmp_path / "motion.npz")
+    assert motion.names == ("002_01", "bd_squat1Reps_001") and motion.length.tolist() == [3, 2]
+    for first in (["2", "bd_*"], ["bd_*"], ["0.5"], ["nan", "x"]):
+        assert make_motion.main([*words, "--first", *first]) == 2
+        assert "--first: expected a share" in capsys.readouterr().err
+
+
 def test_recordings_of_another_rate_are_resampled_by_it(tmp_path):
     write_archive(tmp_path)
     assert len(make_motion.read_clips([tmp_path], ["2"], fps=60)["002_01"]) == 5

@@ -1,4 +1,4 @@
-"""The file of captured motion that `--motion` takes, from the archives of motion capture as they are downloaded.
+r"""The file of captured motion that `--motion` takes, from the archives of motion capture as they are downloaded.
 
     python tools/make_motion.py cmu/subjects --subjects 2 5 --out cmu_motion.npz
 
@@ -6,9 +6,14 @@ FOLDER (several may be given) is searched for .amc beside its .asf, .bvh and .np
 `lidarpose.body.mocap.motion`: SMPL's 24 joints in meters, z up, at 10 frames a second. Positions are those of the mean
 adult body playing the motion; retargeting them once more moves a joint by 4 mm on average.
 
-The bundled weights learned from subjects 2, 5, 13 and 14 of the CMU database, bd and dg of HDM05 and eight people of
-ReActIdle. The benches have poses of CMU 6 and 7, HDM05 bk and ReActIdle 014 and 015: leave these out of training.
-Nothing is downloaded here. Archives, and what a clip of theirs is called:
+The bundled weights learned from subjects 2, 5, 13 and 14 of the CMU database, bd and dg of HDM05 and the first third of
+clips of eight people of ReActIdle, here in npz files whose clips are called 013_acted, 013_genuine, ...:
+
+    python tools/make_motion.py FILES --subjects 2 5 13 14 bd dg 0 1 3 4 9 10 --without 014_acted 014_genuine \
+        --first 0.3334 "*_acted" "*_genuine" --out wide_motion.npz
+
+The benches have poses of CMU 6 and 7, HDM05 bk and ReActIdle 014 and 015: leave these out of training. Nothing is
+downloaded here. Archives, and what a clip of theirs is called:
 
     CMU         mocap.cs.cmu.edu, subjects/02/02.asf and 02_01.amc          002_01
     HDM05       resources.mpi-inf.mpg.de/HDM05, HDM_bd.asf and              bd_squat1Reps_001
@@ -21,6 +26,9 @@ A subject is the part of a clip's name before the first `_`; numbers may be give
 import argparse
 import io
 import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -50,13 +58,19 @@ def is_of(name: str, subjects: list[str]) -> bool:
 
 
 def read_clips(
-    folders: list[Path], subjects: list[str], *, fps: float | None = None, up: str | None = None
+    folders: list[Path],
+    subjects: list[str],
+    *,
+    without: Sequence[str] = (),
+    fps: float | None = None,
+    up: str | None = None,
 ) -> dict[str, np.ndarray]:
     """Joints of the mean adult by the clip's name.
 
     Args:
         folders: searched for files of `SUFFIXES`.
         subjects: whose clips are read; all clips if empty.
+        without: patterns of clips that are left out.
         fps: frames a second of recordings that do not say it; None: 120, CMU's and HDM05's.
         up: the recordings' up axis, None: as `load_motion` finds it.
 
@@ -76,7 +90,7 @@ def read_clips(
                 continue
             motion = load_motion(path, hz=HZ, fps=fps, up=up)
             for c, name in enumerate(map(clip_name, motion.names)):
-                if not is_of(name, subjects):
+                if not is_of(name, subjects) or is_like(name, without):
                     continue
                 if name in clips:
                     raise InputError(f"{path}: there are two clips {name}; give each recording once")
@@ -89,10 +103,24 @@ def read_clips(
     return dict(sorted(clips.items()))
 
 
+def is_like(name: str, patterns: Sequence[str]) -> bool:
+    return any(fnmatchcase(name, pattern) for pattern in patterns)
+
+
 def mean_adult(rotations: np.ndarray, translation: np.ndarray) -> np.ndarray:
     """(frames, 24, 3) float32 m: the joints of the mean adult in these poses."""
     rest = mean_adult_joints()[None].astype(np.float32)
     return forward_kinematics(SMPL24.parents, rest, rotations, translation)[1].astype(np.float32)
+
+
+def first_share(words: list[str]) -> float:
+    """The share of `--first SHARE CLIP ...`. Raises InputError for something else."""
+    if not words:
+        return 1.0
+    with suppress(ValueError):
+        if 0 < float(words[0]) <= 1 and words[1:]:
+            return float(words[0])
+    raise InputError(f"--first: expected a share above 0 and at most 1, and clips, got {' '.join(words)}")
 
 
 def save_clips(path: Path, clips: dict[str, np.ndarray]) -> None:
@@ -114,12 +142,20 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
     parser.add_argument("--subjects", nargs="+", default=[], metavar="SUBJECT", help="default: everybody")
+    parser.add_argument("--without", nargs="+", default=[], metavar="CLIP", help="clips to leave out; may have * and ?")
+    first_help = "keep only the first share, above 0 and at most 1, of the frames of these clips"
+    parser.add_argument("--first", nargs="+", default=[], metavar=("SHARE", "CLIP"), help=first_help)
     parser.add_argument("--fps", type=float, help="frames a second of recordings that do not say it (default: 120)")
     parser.add_argument("--up", help="up axis of the recordings (default: what their format says)")
     parser.add_argument("--out", required=True, type=Path, metavar="FILE.npz")
     args = parser.parse_args(arguments)
     try:
-        clips = read_clips(args.folders, args.subjects, fps=args.fps, up=args.up)
+        share = first_share(args.first)
+        clips = read_clips(args.folders, args.subjects, without=args.without, fps=args.fps, up=args.up)
+        clips = {
+            name: joints[: max(int(share * len(joints)), 1)] if is_like(name, args.first[1:]) else joints
+            for name, joints in clips.items()
+        }
         save_clips(args.out, clips)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
