@@ -145,7 +145,41 @@ def test_the_second_softmax_flattens_the_loss_of_parts():
     assert terms[True]["part"] > np.log(1 + 15 / np.e) - 1e-3
 
 
+def test_distances_are_divided_by_all_joints_where_that_is_asked_for():
+    example = replace(person(30), joints=np.where(np.arange(26)[:, None] % 2, np.nan, person(30).joints))
+    terms = {}
+    for divide in (False, True):
+        objective = BaselineObjective(config=replace(LPFORMER, divide_by_all_joints=divide))
+        torch.manual_seed(0)
+        arrays = objective.collate([example])
+        terms[divide] = objective.terms(objective.network().eval(), arrays)["joints"]
+    labels = np.isfinite(arrays["joints"]).all(-1)
+    assert 0 < labels.mean() < 1
+    torch.testing.assert_close(terms[True], terms[False] * labels.mean(), rtol=1e-5, atol=0, check_dtype=False)
+
+
 # ---- fast paths
+
+
+def test_missing_neighbors_of_zeros_take_part_until_the_last_step():
+    torch.manual_seed(0)
+    attention = GroupedVectorAttention(12, 3).train()
+    x, xyz = torch.randn(5, 12), torch.randn(5, 3)
+    neighbors = torch.tensor([[0, 1, 2], [1, -1, -1], [2, 4, -1], [3, 0, -1], [4, 2, 0]])
+    attention.missing_in_softmax = True
+    out = attention(x, xyz, neighbors)
+    # as the published code: zeros in place of what is missing, a mask after the softmax
+    exists = (neighbors >= 0)[..., None]
+    gathered = {name: getattr(attention, name)(x)[neighbors] * exists for name in ("key", "value")}
+    offset = (xyz[neighbors] - xyz[:, None]) * exists
+    bias = attention.position[1](attention.position[0](offset.flatten(0, 1))).unflatten(0, (5, 3))
+    relation = gathered["key"] - attention.query(x)[:, None] + bias
+    scores = attention.weight((relation * attention.group_weight).unflatten(-1, (3, 4)).sum(-1).flatten(0, 1))
+    weight = scores.unflatten(0, (5, 3)).softmax(1) * exists
+    values = (gathered["value"] + bias).unflatten(-1, (3, 4)) * weight[..., None]
+    torch.testing.assert_close(out, values.sum(1).flatten(1))
+    attention.missing_in_softmax = False
+    assert (attention(x, xyz, neighbors)[1] - out[1]).abs().max() > 1e-3
 
 
 def test_attention_in_groups_as_by_definition():

@@ -29,6 +29,7 @@ from lidarpose.sample import center_of, facing
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.train import loop, run_dir
+from lidarpose.train.recipes import RECIPES, Finetune
 from lidarpose.viz.person_view import facing_of
 
 _ROWS = ["scratch", "laser-masking"]
@@ -527,3 +528,18 @@ def test_an_out_folder_of_something_else_is_refused(tmp_path):
     with pytest.raises(InputError, match="expected a new or empty folder"):
         steps.check_out(tmp_path)
     assert report.SCHEMA == "lidarpose.paper/1"
+
+
+def test_raw_files_of_lidarhuman26m_become_a_row_of_table_1(tmp_path, smpl, monkeypatch):
+    """Every step as a user types it; so few frames teach nothing."""
+    monkeypatch.setitem(RECIPES[Finetune]["lidarcap"], "epochs", 8.0)
+    raw, prepared, out = tmp_path / "raw", tmp_path / "set", tmp_path / "paper"
+    write_lidarhuman26m(raw, smpl, sequences=("5", "7"), frames=16)
+    assert main(["prepare", "lidarhuman26m", str(raw), str(prepared), "--smpl", str(smpl)]) == 0
+    words = ["--data", f"lidarhuman26m={prepared}", "--size", "paper-tiny", "--rows", "lidarcap", "--out", str(out)]
+    assert main(["paper", "table1", *words]) == 0
+    (cell,) = _content(out, "table1")["cells"]
+    assert (cell["row"], cell["column"], cell["state"]) == ("LiDARCap", "lidarhuman26m", "done")
+    assert cell["people_seen"] == 8 * 16 and cell["people_scored"] == 16 and cell["undertrained"]
+    assert len(cell["joints"]) == 24 and cell["mpjpe"] > 0 and cell["mean_pose"] > 0
+    assert "| LiDARCap | " in (out / "table1.md").read_text()

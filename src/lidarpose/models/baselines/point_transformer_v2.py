@@ -65,9 +65,9 @@ def linear_norm(in_channels: int, out_channels: int, *, bias: bool) -> nn.Sequen
 
 
 class PointTransformerV2(nn.Module):
-    """xyz of each row -> features (M, 48) of each row; divisor: see `PrnConfig`."""
+    """xyz of each row -> features (M, 48) of each row; divisor, missing_in_softmax: see `PrnConfig`."""
 
-    def __init__(self, divisor: int = 1):
+    def __init__(self, divisor: int = 1, missing_in_softmax: bool = False):
         super().__init__()
         embedding, *encoder = (width // divisor for width in (EMBEDDING, *ENCODER))
         decoder = [width // divisor for width in DECODER]
@@ -80,6 +80,9 @@ class PointTransformerV2(nn.Module):
         self.up = nn.ModuleList(linear_norm(c, width, bias=True) for c, width in zip(coarse, decoder, strict=True))
         self.skip = nn.ModuleList(linear_norm(s, width, bias=True) for s, width in zip(widths, decoder, strict=False))
         self.decoder = _stages(decoder, DECODER_GROUPS, DECODER_DEPTH)
+        for module in self.modules():
+            if isinstance(module, GroupedVectorAttention):
+                module.missing_in_softmax = missing_in_softmax
 
     def forward(self, rows: Rows) -> Tensor:
         # nearest first, so fewer are the first ones
@@ -124,7 +127,12 @@ class Block(nn.Module):
 
 
 class GroupedVectorAttention(nn.Module):
-    """Wu et al., Point Transformer V2, Eq. 4 to 6: a weight for each neighbor and group of channels."""
+    """Wu et al., Point Transformer V2, Eq. 4 to 6: a weight for each neighbor and group of channels.
+
+    missing_in_softmax: a neighbor that does not exist is one of zeros at the row's own place in all but the last step.
+    """
+
+    missing_in_softmax = False
 
     def __init__(self, channels: int, groups: int):
         super().__init__()
@@ -138,15 +146,22 @@ class GroupedVectorAttention(nn.Module):
 
     def forward(self, x: Tensor, xyz: Tensor, neighbors: Tensor) -> Tensor:
         """x (M, C), xyz (M, 3), neighbors (M, k), -1 for none -> (M, C)."""
+        exists = neighbors >= 0
         # rows of neighbors that exist, all in one list: batch norms see no others
-        row, slot = (neighbors >= 0).nonzero(as_tuple=True)
+        row, slot = (exists | self.missing_in_softmax).nonzero(as_tuple=True)
         neighbor = neighbors[row, slot]
-        bias = self.position[1](self.position[0](xyz[neighbor] - xyz[row]))
+        offset = (xyz[neighbor] - xyz[row]).masked_fill(neighbor[:, None] < 0, 0)
+        bias = self.position[1](self.position[0](offset))
         # of relation = key - query + bias, summed within groups: keys and queries before they are copied to neighbors
         key, query = self._summed(self.key(x)), self._summed(self.query(x))
+        all_values = self.value(x)
+        if self.missing_in_softmax:
+            # the last row, which is that of -1
+            key, all_values = (nn.functional.pad(rows, (0, 0, 0, 1)) for rows in (key, all_values))
         scores = self.weight(key[neighbor] - query[row] + self._summed(bias))
         weight = scores.new_full((*neighbors.shape, self.groups), -torch.inf).index_put((row, slot), scores).softmax(1)
-        value = (self.value(x)[neighbor] + bias).unflatten(1, (self.groups, -1))
+        weight = weight * exists[..., None]
+        value = (all_values[neighbor] + bias).unflatten(1, (self.groups, -1))
         weighted_values = (value * weight[row, slot][..., None]).flatten(1)
         return torch.zeros_like(x).index_add(0, row, weighted_values)
 

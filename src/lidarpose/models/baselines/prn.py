@@ -38,7 +38,7 @@ class Prn(nn.Module):
         super().__init__()
         self.config = config
         joints, channels = len(config.joints), EMBEDDING // config.width_divisor
-        self.backbone = PointTransformerV2(config.width_divisor)
+        self.backbone = PointTransformerV2(config.width_divisor, config.missing_in_softmax)
         # a classifier that the published network has and does not read
         self.unused = nn.Sequential(
             nn.Linear(channels, channels), nn.BatchNorm1d(channels), nn.ReLU(), nn.Linear(channels, joints + 1)

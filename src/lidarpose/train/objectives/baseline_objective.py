@@ -142,9 +142,11 @@ def frame_losses(
     label, offset = point_labels(points, valid, joints, known)
     label, distance = label[valid], mean_distance(outputs.joints, joints, known, share)
     if isinstance(outputs, LpformerOutputs):
+        assert isinstance(config, LpformerConfig)
+        if config.divide_by_all_joints:
+            distance = distance * at_least_one(share(known.sum())) / share(torch.ones_like(known).sum())
         # of probabilities instead of logits, as published
-        is_softmax = isinstance(config, LpformerConfig) and config.second_softmax
-        parts = (outputs.parts.softmax(-1) if is_softmax else outputs.parts)[valid]
+        parts = (outputs.parts.softmax(-1) if config.second_softmax else outputs.parts)[valid]
         # zero, of the head without a loss: processes that average gradients wait for all heads
         return {"joints": distance + 0 * outputs.visible.sum(), "part": _cross_entropy(parts, label, share)}
     is_body = label < joints.shape[1]
