@@ -53,7 +53,7 @@ $ lidarpose predict street.mcap --every 2 --format parquet
 [output]
 --out PATH = .  a folder, a .json or .csv file (default: the current folder); - prints the JSON
 --picture  also draw STEM.poses.png, or FILE.png
---html  also write STEM.poses.html: everybody in 3D, the scan too
+--html  also write STEM.poses.html: everybody in 3D, the scan too; a recording is played
 --skeleton NAME  smpl24, human15, waymo14, itop14 or body26 (default smpl24, else the network's own)
 [network]
 --weights NAME|FILE = {DEFAULT}  {NAMES}, a checkpoint, or an exported .onnx

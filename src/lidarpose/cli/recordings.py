@@ -42,8 +42,8 @@ def _predict(predict_scan: Callable[[argparse.Namespace], None], options: argpar
         predict_scan(options)
         return
     formats = (options.format,) if options.format else ("jsonl", "csv", "parquet")
-    result, picture, _ = output_paths(options, _name_of(options.source), formats)
-    _predict_recording(options, result, picture, prediction_options(options))
+    outputs = output_paths(options, _name_of(options.source), formats)
+    _predict_recording(options, *outputs, prediction_options(options))
 
 
 def _is_recording(options: argparse.Namespace) -> bool:
@@ -66,17 +66,20 @@ def _name_of(paths: Sequence[str]) -> str:
 
 
 def _predict_recording(
-    options: argparse.Namespace, result: Path | None, picture: Path | None, posing_options: dict[str, Any]
+    options: argparse.Namespace,
+    result: Path | None,
+    picture: Path | None,
+    page: Path | None,
+    posing_options: dict[str, Any],
 ) -> None:
-    """Poses all frames, and says what came of it. asked: as of `FramePredictor`."""
+    """Poses all frames, and says what came of it. posing_options: as of `FramePredictor`."""
     from lidarpose.io.files import write_atomic
     from lidarpose.io.sources import open_source
     from lidarpose.recording.output import write_recording
+    from lidarpose.recording.page import RecordingPage
     from lidarpose.recording.picture import WaysPicture
     from lidarpose.recording.predict_recording import FramePredictor
 
-    if options.html:
-        raise InputError("--html is of one scan: name one file, or draw a recording with --picture")
     if len(options.source) > 1 and any(map(os.path.isdir, options.source)):
         raise InputError(f"expected one folder, or files, got {len(options.source)}: run the command for each folder")
     frames = {name: getattr(options, name) for name in ("columns", "topic", "meta", "rate", "start", "end")}
@@ -86,18 +89,27 @@ def _predict_recording(
         _print_lines(options, source, steps)
         return
     tracks_picture = None if picture is None else WaysPicture(steps.up)
+    frames_page = None if page is None else RecordingPage(steps.up)
+    views = [view for view in (tracks_picture, frames_page) if view is not None]
+
+    def on_line(line: dict[str, Any]) -> None:
+        for view in views:
+            view.add(line)
+
     summary = write_recording(
         source,
         steps,
         result,
         command=_command(options),
         world=options.world,
-        on_line=None if tracks_picture is None else tracks_picture.add,
+        on_line=on_line,
         tell=lambda text: tell(f"lidarpose: {text}"),
     )
     if tracks_picture is not None and picture is not None:
         write_atomic(picture, tracks_picture.draw(source, steps.wanted, title=Path(source.name).name))
-    _report(source, steps, summary, f" -> {' and '.join(str(path) for path in (result, picture) if path)}")
+    if frames_page is not None and page is not None:
+        write_atomic(page, frames_page.render(source, steps.wanted, title=Path(source.name).name))
+    _report(source, steps, summary, f" -> {' and '.join(str(path) for path in (result, picture, page) if path)}")
 
 
 def _print_lines(options: argparse.Namespace, source, steps) -> None:

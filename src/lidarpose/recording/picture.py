@@ -19,6 +19,24 @@ from lidarpose.viz.person_view import Panel
 _FRAMES = 8
 
 
+def in_fixed_frame(line: dict[str, Any], fixed: FixedFrame) -> tuple[np.ndarray, list[dict[str, Any]]]:
+    """T_fixed_sensor (4, 4) of the next line, and its people with joints (J, 3) m and `Box` there, None where it has
+    none."""
+    T_fixed_sensor = fixed.from_sensor(line["T_world_sensor"])
+    # lines may hold people in the world's frame already
+    is_moved = line.get("coordinates") == "world"
+    T, R_upright = (np.eye(4), None) if is_moved else (T_fixed_sensor, fixed.R_upright)
+    people = []
+    for person in line["people"]:
+        joints, box = person["joints"], person["box"]
+        if box is not None:
+            center, yaw = transform_points(T, np.array(box["center"])), moved_yaw(box["yaw"], T, R_upright)
+            box = Box(center=center, size=np.array(box["size"]), yaw=yaw, id=person["id"])
+        joints = None if joints is None else transform_points(T, np.array(joints))
+        people.append(person | {"joints": joints, "box": box})
+    return T_fixed_sensor, people
+
+
 class WaysPicture:
     """Collects where people are, line by line of the result, in the fixed frame."""
 
@@ -34,24 +52,15 @@ class WaysPicture:
     def add(self, line: dict[str, Any]) -> None:
         if line["error"] is not None:
             return
-        T_fixed_sensor = self._fixed.from_sensor(line["T_world_sensor"])
+        T_fixed_sensor, self._people = in_fixed_frame(line, self._fixed)
         self._frames.append(line["frame"])
         self._to_fixed.append(T_fixed_sensor)
-        # lines may hold people in the world's frame already
-        is_moved = line.get("coordinates") == "world"
-        T, R_upright = (np.eye(4), None) if is_moved else (T_fixed_sensor, self._fixed.R_upright)
-        self._people = []
-        for person in line["people"]:
+        for person in self._people:
             joints, box = person["joints"], person["box"]
-            if box is not None:
-                center, yaw = transform_points(T, np.array(box["center"])), moved_yaw(box["yaw"], T, R_upright)
-                box = Box(center=center, size=np.array(box["size"]), yaw=yaw, id=person["id"])
             if joints is not None:
-                joints = transform_points(T, np.array(joints))
                 self._ways.setdefault(person["track"], []).append((joints.min(0) + joints.max(0)) / 2)
                 if box is not None:
                     self._yaws[person["track"]] = box.yaw
-            self._people.append(person | {"joints": joints, "box": box})
 
     def draw(self, source: Source, skeleton: Skeleton, *, title: str) -> bytes:
         """The PNG; the source is read again for the points of some frames."""

@@ -36,6 +36,8 @@ class ScanPanel:
         places: (K, 2) or (K, 3), of people whom nobody knows apart.
         label: printed above.
         sensor: x, y of the sensor, None where nobody knows it.
+        names: of the P people, in place of their numbers.
+        frames: of the same place over time, each with its people and their points; step: ms between them.
     """
 
     points: np.ndarray
@@ -46,6 +48,9 @@ class ScanPanel:
     places: np.ndarray | None = None
     label: str = ""
     sensor: tuple[float, float] | None = (0.0, 0.0)
+    names: Sequence[str] = ()
+    frames: Sequence["ScanPanel"] = ()
+    step: float = 100.0
 
 
 def draw_scans(panels: Sequence[ScanPanel], path: str | Path | None = None, *, title: str = "") -> bytes:

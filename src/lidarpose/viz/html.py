@@ -31,6 +31,8 @@ from lidarpose.viz.person_view import (
 
 MAX_POINTS = 60_000  # of all people together: about 0.9 MB of text
 _FEWEST_POINTS = 150  # a person keeps these, however many people there are
+# people near whom points are kept, where there are many over time
+_FEW_BOXES = 100
 # of all scans, and of each at least: points, half of them so many m about its people; and how far about all of them the
 # scan is shown, m
 _SCAN_POINTS, _FEWEST_SCAN_POINTS, _NEAR, _SCAN_REACH = 40_000, 15_000, 1.0, 15.0
@@ -63,7 +65,8 @@ def render_report(people: list[Panel], *, title: str, summary: list[dict], scans
     """The text of `write_report`'s file; the same input gives the same text."""
     people = list(people)
     skeletons = {pose.skeleton.name: pose.skeleton for p in people for pose in (p.pose, p.truth) if pose is not None}
-    skeletons |= {scan.poses.skeleton.name: scan.poses.skeleton for scan in scans if scan.poses is not None}
+    panels = [panel for scan in scans for panel in (scan, *scan.frames)]
+    skeletons |= {panel.poses.skeleton.name: panel.poses.skeleton for panel in panels if panel.poses is not None}
     limit = max(_FEWEST_POINTS, MAX_POINTS // max(len(people), 1))
     people_data = [_person_data(p, limit) for p in people]
     data = {
@@ -122,12 +125,13 @@ def _person_data(person: Panel, limit: int) -> dict:
 def _scan_data(scan: ScanPanel, limit: int) -> dict:
     """As of a person, but with everybody's pose, about the middle of all; of at most `limit` points."""
     points = scan.points[within_reach(scan.points)]
-    centers = np.array([box.center for box in scan.boxes])
+    boxes = [box for panel in (scan, *scan.frames) for box in panel.boxes]
+    centers = np.array([box.center for box in boxes])
     if len(centers):
         low, high = centers.min(0) - _SCAN_REACH, centers.max(0) + _SCAN_REACH
         points = points[((points[:, :2] > low[:2]) & (points[:, :2] < high[:2])).all(1)]
     is_near = np.zeros(len(points), bool)
-    for box in scan.boxes:
+    for box in scan.boxes or boxes[:: max(len(boxes) // _FEW_BOXES, 1)]:
         is_near |= box.contains(points, margin=_NEAR)
     rows = [np.flatnonzero(is_near), np.flatnonzero(~is_near)]
     rows = [group[thinned(len(group), limit // 2)] for group in rows]
@@ -135,12 +139,20 @@ def _scan_data(scan: ScanPanel, limit: int) -> dict:
     if not len(centers):
         centers = points if len(points) else np.zeros((1, 3))
     center = np.median(centers, axis=0)
-    poses = []
-    if scan.poses is not None:
-        poses = [Pose(joints=joints, skeleton=scan.poses.skeleton) for joints in scan.poses.joints]
-    pose_entries = [data for pose in poses if (data := _pose_data(pose, center)) is not None]
-    data = {"points": _millimeters(points, center), "facing": None, "pose": None, "truth": None, "poses": pose_entries}
-    return data | {"labeled": scan.labeled}
+    entry = {"facing": None, "pose": None, "truth": None, "labeled": scan.labeled}
+    frames = [_frame_data(panel, panel.points, center) | {"label": panel.label} for panel in scan.frames]
+    return entry | _frame_data(scan, points, center) | ({"frames": frames, "step": scan.step} if frames else {})
+
+
+def _frame_data(panel: ScanPanel, points: np.ndarray, center: np.ndarray) -> dict:
+    """Points and everybody's pose, about a center (3,) m."""
+    entries = []
+    if panel.poses is not None:
+        for k, joints in enumerate(panel.poses.joints):
+            data = _pose_data(Pose(joints=joints, skeleton=panel.poses.skeleton), center)
+            if data is not None:
+                entries.append(data | ({"name": panel.names[k]} if panel.names else {}))
+    return {"points": _millimeters(points, center), "poses": entries}
 
 
 # a letter a part: n = background, else the body side's
@@ -170,14 +182,23 @@ def _card(i: int, person: Panel, num_drawn: int) -> str:
 
 
 def _scan_card(key: str, scan: ScanPanel) -> str:
-    return _figure(key, "card scan", scan.label, f"{len(scan.points):,} points, not all are drawn", [])
+    caption = f"{len(scan.points):,} points, not all are drawn"
+    return _figure(
+        key, "card scan", scan.label, caption, [], _PLAYER.format(len(scan.frames) - 1) if scan.frames else ""
+    )
 
 
-def _figure(key: str, kind: str, label: str, caption: str, notes: list[str]) -> str:
+_PLAYER = (
+    '<div class="player"><button type="button">play</button>'
+    '<input type="range" min="0" max="{}" value="0" aria-label="frame"><output></output></div>'
+)
+
+
+def _figure(key: str, kind: str, label: str, caption: str, notes: list[str], player: str = "") -> str:
     note = "".join(f'<p class="note">{escape(n)}</p>' for n in notes)
     return (
         f'<figure class="{kind}"><canvas data-person="{key}" tabindex="0" role="img" '
-        f'aria-label="3D view of {escape(label)}"></canvas>{note}<figcaption><strong>{escape(label)}</strong>'
+        f'aria-label="3D view of {escape(label)}"></canvas>{note}{player}<figcaption><strong>{escape(label)}</strong>'
         f"<span>{escape(caption)}</span></figcaption></figure>"
     )
 

@@ -40,8 +40,9 @@
     }
     if (!isFinite(low[0])) return null;
     if (person.poses) {   // of a scan the people, all of it where there are none
-      const joints = person.poses.flatMap((pose) => pose.joints.filter((joint) => joint));
-      const end = (of, k) => of(...joints.map((joint) => joint[k]));
+      const poses = [person, ...(person.frames || [])].flatMap((one) => one.poses);
+      const joints = poses.flatMap((pose) => pose.joints.filter((joint) => joint));
+      const end = (of, k) => joints.reduce((best, joint) => of(best, joint[k]), joints[0][k]);
       const a = joints.length ? low.map((_, k) => end(Math.min, k)) : low;
       const b = joints.length ? high.map((_, k) => end(Math.max, k)) : high;
       const wide = Math.max(Math.hypot(b[0] - a[0], b[1] - a[1]) + 2000, 6000);
@@ -57,6 +58,7 @@
     const person = scan ? data.scans[+key.slice(4)] : data.people[+key];
     const start = scan ? ABOVE : {...START, turn: START.turn + (person.facing || 0)};
     const view = {canvas, person, span: bounds(person), ...start, touched: scan, visible: true, hover: null};
+    if (person.frames) makePlayer(view);
     const fingers = new Map();
     let pinch = 0;
     view.reset = () => Object.assign(view, start, {touched: scan, hover: null});
@@ -106,6 +108,23 @@
     return view;
   }
 
+  // people over time: a slider, and a button that plays
+  function makePlayer(view) {
+    const {frames, step} = view.person, player = view.canvas.parentElement.querySelector(".player");
+    const [button, slider, text] = ["button", "input", "output"].map((name) => player.querySelector(name));
+    let timer = null;
+    const show = (k) => { view.frame = k; slider.value = k; text.textContent = frames[k].label; ask(view); };
+    const stop = () => { clearInterval(timer); timer = null; button.textContent = "play"; };
+    button.addEventListener("click", () => {
+      if (timer !== null) { stop(); return; }
+      button.textContent = "pause";
+      timer = setInterval(() => show((view.frame + 1) % frames.length), step);
+    });
+    slider.addEventListener("input", () => { stop(); show(+slider.value); });
+    view.frame = 0;
+    text.textContent = frames[0].label;
+  }
+
   function draw(view) {
     const {canvas, person, span} = view, pen = canvas.getContext("2d");
     const ratio = Math.min(devicePixelRatio || 1, 2), width = canvas.clientWidth, height = canvas.clientHeight;
@@ -135,7 +154,11 @@
     const line = (a, b) => { pen.beginPath(); pen.moveTo(a[0], a[1]); pen.lineTo(b[0], b[1]); pen.stroke(); };
     pen.lineCap = "round";
     if (!person.poses) drawGround(view, pen, place, line);
-    if (toggles.points.checked) drawPoints(view, pen, place);
+    const moving = person.frames ? person.frames[view.frame] : null;
+    if (toggles.points.checked) {
+      drawPoints(view, pen, place, person);
+      if (moving) drawPoints(view, pen, place, moving);
+    }
     if (toggles.truth.checked && person.truth) {
       const at = person.truth.joints.map((j) => j && place(...j));
       pen.strokeStyle = color.truth;
@@ -144,7 +167,7 @@
       for (const [a, b] of data.skeletons[person.truth.skeleton].bones) if (at[a] && at[b]) line(at[a], at[b]);
       pen.setLineDash([]);
     }
-    const poses = person.poses || (person.pose ? [person.pose] : []);
+    const poses = moving ? moving.poses : person.poses || (person.pose ? [person.pose] : []);
     const toggle = person.labeled ? toggles.truth : toggles.pose;
     if (toggle.checked) for (const pose of poses) drawPose(view, pose, pen, place, line);
   }
@@ -171,8 +194,8 @@
     pen.fill();
   }
 
-  function drawPoints(view, pen, place) {
-    const {points: p, sides, poses} = view.person, reach = poses ? view.span.wide / 2 : SHADE_SPAN;
+  function drawPoints(view, pen, place, of) {
+    const {points: p, sides, poses} = of, reach = poses ? view.span.wide / 2 : SHADE_SPAN;
     const shades = Array.from({length: SHADES}, () => []);
     for (let i = 0; i < p.length; i += 3) {
       const at = place(p[i], p[i + 1], p[i + 2]);
@@ -223,6 +246,13 @@
       pen.fill();
     });
     pen.globalAlpha = 1;
+    if (pose.name) {
+      const top = at.filter((spot) => spot).reduce((a, b) => (b[1] < a[1] ? b : a));
+      pen.fillStyle = color.ink;
+      pen.font = "600 13px system-ui, sans-serif";
+      pen.textAlign = "center";
+      pen.fillText(pose.name, top[0], top[1] - 10);
+    }
     if (view.hover) drawHover(view, pen, at, pose, truth, skeleton);
   }
 

@@ -1,0 +1,124 @@
+"""The page of a recording: its people in 3D, frame by frame, to be played and turned."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lidarpose.errors import counted
+from lidarpose.geometry import transform_points
+from lidarpose.io.sources import Frame, Source
+from lidarpose.recording.coordinates import FixedFrame
+from lidarpose.recording.picture import in_fixed_frame
+from lidarpose.sample import Pose
+from lidarpose.skeleton import Skeleton
+from lidarpose.viz.bird_eye import ScanPanel
+from lidarpose.viz.html import render_report
+from lidarpose.viz.person_view import thinned
+
+# frames that are shown at most, and points of each person in each
+_MOST_FRAMES, _PERSON_POINTS = 300, 200
+# frames of whose points the surroundings are made, without what lies so near to people's boxes, m
+_SURROUNDINGS, _NEAR = 4, 0.3
+# ms that a frame is shown where nobody knows, and the shortest and longest
+_STEP, _STEPS = 100.0, (30.0, 1000.0)
+
+
+@dataclass
+class _Track:
+    """frames: in which the person has a pose; first, last: their times, s, or frames; way: level, m; place: the last
+    (2,)."""
+
+    frames: int
+    first: float
+    last: float
+    way: float
+    place: np.ndarray
+
+
+class RecordingPage:
+    """Collects people line by line of the result, in the fixed frame; of a long recording every so manieth frame."""
+
+    def __init__(self, up: str):
+        self._fixed = FixedFrame(up)
+        self._lines: list[tuple[dict[str, Any], np.ndarray, list[dict[str, Any]]]] = []
+        self._count, self._every = 0, 1
+        self._tracks: dict[int, _Track] = {}
+
+    def add(self, line: dict[str, Any]) -> None:
+        if line["error"] is not None:
+            return
+        T_fixed_sensor, people = in_fixed_frame(line, self._fixed)
+        if self._count % self._every == 0:
+            about = {name: line[name] for name in ("frame", "time")}
+            self._lines.append((about, T_fixed_sensor, people))
+        self._count += 1
+        if len(self._lines) > _MOST_FRAMES:
+            self._lines, self._every = self._lines[::2], 2 * self._every
+        time = line["frame"] if line["time"] is None else line["time"]
+        for person in people:
+            if person["track"] is not None and person["joints"] is not None:
+                self._follow(person["track"], person["joints"][:, :2].mean(0), time)
+
+    def _follow(self, id: int, place: np.ndarray, time: float) -> None:
+        track = self._tracks.setdefault(id, _Track(0, time, time, 0.0, place))
+        track.way += float(np.linalg.norm(place - track.place))
+        track.frames, track.last, track.place = track.frames + 1, time, place
+
+    def render(self, source: Source, skeleton: Skeleton, *, title: str) -> bytes:
+        """The HTML; the source is read again for the points of what is shown."""
+        shown = {about["frame"]: k for k, (about, _, _) in enumerate(self._lines)}
+        is_surroundings = set(np.linspace(0, len(shown) - 1, _SURROUNDINGS).astype(int).tolist())
+        panels: dict[int, ScanPanel] = {}
+        surroundings: list[np.ndarray] = []
+        for frame in source.frames(min(shown, default=0)):
+            if len(panels) == len(shown):
+                break
+            if not isinstance(frame, Frame) or frame.index not in shown:
+                continue
+            k = shown[frame.index]
+            about, T_fixed_sensor, people = self._lines[k]
+            points = transform_points(T_fixed_sensor, frame.points)
+            near_points, is_far = self._of_people(points, people)
+            panels[k] = self._panel(about, near_points, people, skeleton)
+            if k in is_surroundings:
+                surroundings.append(points[is_far])
+        panel = ScanPanel(
+            points=np.concatenate([*surroundings, np.zeros((0, 3))]),
+            frames=[panels[k] for k in sorted(panels)],
+            step=self._step(),
+            label=f"{counted(len(panels), 'frame')} of {self._count:,}",
+        )
+        rows = [
+            {"track": id, "frames": track.frames, "from": track.first, "to": track.last, "way, m": track.way}
+            for id, track in sorted(self._tracks.items())
+        ]
+        return render_report([], title=title, summary=rows, scans=[panel]).encode("utf-8", "replace")
+
+    def _of_people(self, points: np.ndarray, people: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
+        """Some points (m, 3) m of people's boxes, and which of the points (n, 3) are in nobody's: (n,) bool."""
+        is_far, clouds = np.ones(len(points), bool), [np.zeros((0, 3))]
+        for box in (person["box"] for person in people if person["box"] is not None):
+            is_far &= ~box.contains(points, margin=_NEAR)
+            own_points = points[box.contains(points)]
+            clouds.append(own_points[thinned(len(own_points), _PERSON_POINTS)])
+        return np.concatenate(clouds), is_far
+
+    def _panel(
+        self, about: dict[str, Any], points: np.ndarray, people: list[dict[str, Any]], skeleton: Skeleton
+    ) -> ScanPanel:
+        posed = [person for person in people if person["joints"] is not None]
+        joints = np.stack([person["joints"] for person in posed]) if posed else None
+        time = f"frame {about['frame']}" if about["time"] is None else f"{about['time']:.2f} s"
+        return ScanPanel(
+            points=points,
+            boxes=[person["box"] for person in people if person["box"] is not None],
+            poses=None if joints is None else Pose(joints=joints, skeleton=skeleton),
+            names=[str(person["id"] if person["track"] is None else person["track"]) for person in posed],
+            label=f"{time}, {counted(len(people), 'person', 'people')}",
+        )
+
+    def _step(self) -> float:
+        """ms between two frames that are shown."""
+        times = np.array([about["time"] for about, _, _ in self._lines if about["time"] is not None])
+        return float(np.clip(1e3 * np.median(np.diff(times)), *_STEPS)) if len(times) > 1 else _STEP
