@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from functools import cache
 from pathlib import Path
 
 # before numpy starts its threads
@@ -45,16 +46,17 @@ def worker(file: str) -> None:
     import lidarpose
     from lidarpose.inference import detection, verification
     from lidarpose.inference.scan import Scan
-    from lidarpose.models import weights_path
+    from lidarpose.models import weights_file
     from lidarpose.models.detector.detector import Detector
 
     points = np.load(file)
     detector, predictor = Detector(threads=1), lidarpose.load("small", threads=1, tta=1)
-    # until 0.2 and some time after detections were posed by tiny
-    name = getattr(verification, "VERIFIER", "tiny")
-    verifier = verification.OnnxBackend(weights_path(name).with_suffix(".onnx"), threads=1)
     # those of the package take all processors
-    detection._detector, verification._verifier = lambda: detector, lambda: verifier
+    detection._detector = lambda: detector
+    backend = cache(lambda name: verification.OnnxBackend(weights_file(f"{name}.onnx"), threads=1))
+    # before there was a network that only verifies
+    verification._bundled = backend
+    verification._verifier = lambda: backend(verification.VERIFIER)
     origin = np.zeros(3)
 
     def predict():

@@ -29,7 +29,7 @@ from against_paper import WAYS
 
 from lidarpose.eval.scores import BASELINE, MetricRow, Scores, published, read_scores
 from lidarpose.io.files import content_digest, write_atomic
-from lidarpose.models import BUNDLED, DEFAULT, bundled_path
+from lidarpose.models import BUNDLED, DEFAULT, VERIFIER, bundled_path, weights_file
 from lidarpose.models.checkpoint import read_header, runs_of
 from lidarpose.paper import report
 
@@ -39,8 +39,10 @@ SCORES = DOCS / "scores"
 PAGES = (
     ROOT / "README.md",
     *(DOCS / f"{page}.md" for page in ("results", "evaluate", "method", "recordings")),
-    *(DOCS / "cards" / f"{name}.md" for name in BUNDLED),
+    *(DOCS / "cards" / f"{name}.md" for name in (*BUNDLED, "detector")),
 )
+# the networks that find people
+FINDING = ("detector", VERIFIER)
 RUNS = "ablations"
 # people of the longer runs that ask again what the first ones do
 LONGER = 98_304
@@ -222,6 +224,24 @@ def card(model: str) -> str:
     return table(("", ""), rows)
 
 
+def finding_card(name: str) -> str:
+    """How a network that finds people was made, as its file says."""
+    path = weights_file(f"{name}.safetensors")
+    runs = runs_of(read_header(path).card)
+    onnx = path.with_suffix(".onnx")
+    files = f"`{onnx.name}`, {onnx.stat().st_size / 1e6:.2f} MB; `{path.name}`, {path.stat().st_size / 1e6:.2f} MB"
+    rows = [("files", files)]
+    for run in runs:
+        if "scans_seen" in run:
+            rows.append(("command", f"`{run['command']}`"))
+            rows.append(("scans shown, hours", f"{run['scans_seen']:,}, {run['hours']:.2f}"))
+            rows.append(("people missed in validation", f"{run['validation_missed']:.1f} %"))
+        else:
+            rows.append(("begun with", f"weights of {run['people_seen']:,} people: `{run['command']}`"))
+            break
+    return table(("", ""), rows)
+
+
 def progress(model: str) -> str:
     """What the runs of a bundled model brought one after the other, as its file says."""
     rows, people, hours = [], 0, 0.0
@@ -335,6 +355,22 @@ def detected_boxes() -> str:
     return table(("people found at", "people", "MPJPE in found boxes, mm", "in labeled boxes", "difference"), rows)
 
 
+def background() -> str:
+    """People found with and without a learned background; see background.py."""
+    rows = [
+        (
+            "the default" if row["score"] is None else f"{row['score']:g}",
+            row["background"],
+            f"{row['false'] / row['frames']:.2f}",
+            f"{row['moving_found']} of {row['moving']}",
+            f"{row['found']} of {row['people']}",
+        )
+        for row in _read("background")["rows"]
+    ]
+    header = ("least score", "background", "false people a scan", "who move are found", "all are found")
+    return table(header, rows)
+
+
 def calibration() -> str:
     """Whether confidence and visibility can be taken at their word; see calibration.py."""
     rows = [(entry["what"], f"{entry['ece']:.3f}", f"{entry['auroc']:.3f}") for entry in _read("calibration")["stated"]]
@@ -407,7 +443,7 @@ def tables() -> dict[str, Callable[[], str]]:
     makers["speed"] = lambda: table(*timed.medians(_read("speed")))
     makers["speed ratios"] = lambda: table(*timed.ratios(_read("speed")["targets"]))
     makers |= {"calibration": calibration, "spread": spread, "real moved": moved, "clips": clips}
-    for group in ("points", "kind", "sensor", "activity", "condition", "distance, m"):
+    for group in ("points", "kind", "sensor", "activity", "condition", "distance, m", "height", "tilt"):
         recall_groups = (
             ("all", "points", "mounted, all") if group == "points" else (group, f"{group}, 50 points and more")
         )
@@ -415,6 +451,7 @@ def tables() -> dict[str, Callable[[], str]]:
             f"detector {name} by {group}": partial(detector, name, *recall_groups) for name in ("heldout", "real")
         }
     makers |= {"visibility": visibility, "real": real, "tracks": tracks, "detected boxes": detected_boxes}
+    makers |= {"background": background} | {f"{name} card": partial(finding_card, name) for name in FINDING}
     makers |= {f"paper {path.stem}": partial(paper, path.stem) for path in sorted((SCORES / "paper").glob("*.json"))}
     makers["headline"] = partial(headline, "lidarpose-bench", **_FIRST)
     makers["headline bench-2"] = partial(headline, "lidarpose-bench-2", **_SECOND)

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,12 +10,13 @@ import pytest
 import lidarpose.train.detector.calibrate as module
 from lidarpose.eval.detector.detection_scores import match
 from lidarpose.geometry import rotation_about
-from lidarpose.inference.verification import final_score
+from lidarpose.inference.verification import final_logit, final_score, surest_rows
 from lidarpose.models.checkpoint import save_checkpoint
 from lidarpose.models.detector.detector_config import DetectorConfig
 from lidarpose.models.detector.network import DetectorNet
+from lidarpose.sample import Box
 from lidarpose.synth.detection_scene import detection_scene
-from lidarpose.train.detector.calibrate import fit, logistic, monotone, passing_score
+from lidarpose.train.detector.calibrate import ScanTable, fit, logistic, monotone, passing_score
 
 
 def test_a_logistic_regression_finds_its_weights():
@@ -55,18 +57,46 @@ def test_a_score_that_so_many_false_people_pass():
     assert passing_score(np.zeros(0), 5) == 0.5
 
 
+def made_tables(rng, scans):
+    """Scans of 2 people, each detected twice, and of 8 other detections."""
+    tables = []
+    for _ in range(scans):
+        people = rng.uniform(-30, 30, (2, 2))
+        places = np.concatenate([people, people + 0.1, rng.uniform(100, 200, (8, 2))])
+        is_person = np.arange(12) < 4
+        features = np.column_stack([rng.normal(is_person * 2.0, 2), rng.normal(is_person * 4.0, 2), np.ones(12)])
+        features[-1, 1] = np.nan
+
+        def verify(header, least, features=features, places=places):
+            scores, logits = final_score(features, header), final_logit(features, header)
+            pelvises = np.column_stack([places, np.where(scores < least, np.nan, 0)])
+            rows = surest_rows(scores, pelvises, logits)
+            boxes = [Box(center=pelvises[row], size=np.ones(3), score=scores[row], id=row) for row in rows]
+            return SimpleNamespace(boxes=boxes, logits=logits[rows])
+
+        detections = SimpleNamespace(centers=np.column_stack([places, np.zeros(12)]))
+        tables.append(ScanTable(detections=detections, features=features, people=people, verify=verify))
+    return tables
+
+
 def test_the_default_score_lets_one_false_person_a_scan_pass():
-    rng = np.random.default_rng(0)
-    scans, labels = 100, rng.random(1500) < 0.3
-    mounted = rng.random(1500) < 0.1
-    of_pose = rng.normal(size=(1500, 4))
-    features = np.column_stack([rng.normal(labels * 4.0, 2), of_pose[:, :3], mounted, of_pose[:, 3]])
-    features[:5, 2] = np.nan
-    header = fit(features, labels, scans)
-    passing = (final_score(features, header) >= header["default_score"]) & ~labels
-    assert 60 <= passing.sum() <= 100
+    tables = made_tables(np.random.default_rng(0), 100)
+    header = fit(tables)
+    boxes = [box for table in tables for box in table.verify(header, header["default_score"]).boxes]
+    # of people one detection each: the other one is neither a person nor a mistake
+    assert 70 <= sum(box.id >= 4 for box in boxes) <= 100 and 150 <= sum(box.id < 4 for box in boxes) <= 200
     assert set(header) == {"calibration", "verification", "default_score"}
+    assert set(header["verification"]) == {"bias", "logit", "verifier", "log_points", "calibration"}
     assert json.loads(json.dumps(header)) == header
+
+
+def test_a_score_is_the_share_of_people_among_those_that_are_left():
+    header = fit(made_tables(np.random.default_rng(0), 400))
+    boxes = [box for table in made_tables(np.random.default_rng(1), 400) for box in table.verify(header, 0.01).boxes]
+    scores, labels = np.array([box.score for box in boxes]), np.array([box.id < 4 for box in boxes])
+    for low, high in ((0.0, 0.2), (0.2, 0.5), (0.5, 0.8), (0.8, 1.0)):
+        rows = (scores >= low) & (scores <= high)
+        assert rows.sum() > 30 and abs(scores[rows].mean() - labels[rows].mean()) < 0.08
 
 
 def test_scores_are_fitted_on_level_scans_as_detection_sees_them(tmp_path, monkeypatch):
@@ -82,7 +112,7 @@ def test_scores_are_fitted_on_level_scans_as_detection_sees_them(tmp_path, monke
         return real(self, points, origin, **options)
 
     monkeypatch.setattr(module.Detector, "detect", detect)
-    monkeypatch.setattr(module, "fit", lambda features, is_person, scans: {"default_score": 0.5})
+    monkeypatch.setattr(module, "fit", lambda tables: {"default_score": 0.5})
     network = DetectorNet(DetectorConfig(channels=(8, 8, 16), coarse_channels=(4, 8), hidden=16))
     save_checkpoint(tmp_path / module.MODEL, network, card={})
     module.calibrate(tmp_path, 1)

@@ -17,6 +17,7 @@ from lidarpose.inference import detection, verification
 from lidarpose.lidar.raycast import scan
 from lidarpose.models.detector.detector import Detector
 from lidarpose.synth.bodies import draw_bodies
+from lidarpose.synth.detection_scene import detection_scene
 from lidarpose.synth.environment.mesh import Mesh, box, quad, union
 
 # feet of people who stand alone, and of two beside each other, m
@@ -106,7 +107,8 @@ def test_fewer_are_found_where_fewer_are_asked_for(scene):
     assert len(lidarpose.detect(points, min_score=bound)) == sum(found.score >= bound for found in boxes)
     near = lidarpose.detect(points, max_range=6.7)
     assert near and all(np.hypot(*found.center[:2]) < 7 for found in near)
-    assert len(lidarpose.detect(points, min_score=0)) > len(boxes)
+    everybody = [found.score for found in lidarpose.detect(points, min_score=0)]
+    assert everybody[: len(boxes)] == [found.score for found in boxes]
 
 
 def test_one_person_is_found_once(scene, fake, monkeypatch):
@@ -338,26 +340,20 @@ def test_around_a_sensor_that_cannot_stand_at_zero_all_of_a_map_is_searched(scen
 
 
 def test_the_final_score_is_what_the_header_says():
-    features = np.array([[2.0, 0.8, -3.0, 5.0, 0.25, 1.5], [np.nan, 0.5, -1.0, 4.0, 0.0, 2.0]])
-    weights = {"bias": 0.5, "logit": 1.5, "confidence": 2.0, "log_spread": -1.0, "log_points": 0.1, "mounted": 0.7}
-    weights |= {"mounted_confidence": -1.0, "mounted_log_spread": 0.4, "person": 0.6, "mounted_person": -0.8}
-    logit = 0.5 + 3.0 + 1.6 + 3.0 + 0.5 + 0.175 - 0.2 - 0.3 + 0.9 - 0.3
-    header = {"verification": weights | {"calibration": [[0.0, 10.0], [0.0, 1.0]]}}
-    np.testing.assert_allclose(verification.final_score(features, header), [logit / 10, 0])
-    # without weights: the scorer's logit, less where the pose is unsure of somebody who stands
-    header = {"calibration": [[-10.0, 10.0], [0.0, 1.0]]}
-    spread = np.log([0.1, 0.3, 0.3])
-    rows = np.column_stack([np.zeros(3), np.ones(3), spread, np.ones(3), [0, 0, 1], np.zeros(3)])
-    np.testing.assert_allclose(
-        verification.final_score(rows, header), 0.5 - np.array([0, 0.075 * np.log(3), 0]), atol=1e-12
-    )
+    features = np.array([[2.0, 1.5, 5.0], [np.nan, 0.5, 4.0], [1.0, np.nan, 4.0]])
+    header = {"verification": {"bias": 0.5, "logit": 1.5, "verifier": 2.0, "log_points": 0.1}}
+    header["verification"]["calibration"] = [[0.0, 10.0], [0.0, 1.0]]
+    np.testing.assert_allclose(verification.final_score(features, header), [(0.5 + 3 + 3 + 0.5) / 10, 0, 0])
+    # weights of before there was a verifier are of other features
+    header = {"calibration": [[-10.0, 10.0], [0.0, 1.0]], "verification": {"bias": 9.0, "logit": 1.0, "person": 1.0}}
+    np.testing.assert_allclose(verification.final_score(features[:1], header), 0.5 + 1.75 / 20)
 
 
 def test_a_detector_that_is_not_calibrated_scores_as_its_network_does(scene, fake, monkeypatch):
     """As `lidarpose evaluate detector --detector` meets it after an export."""
-    rows = np.column_stack([[-2.0, 0.0, 3.0, np.nan], np.zeros(4), np.full(4, np.log(0.1)), np.zeros((4, 3))])
-    scores = verification.final_score(rows, {})
-    np.testing.assert_allclose(scores, [*(1 / (1 + np.exp(-rows[:3, 0]))), 0])
+    features = np.array([[-2.0, -2, 4], [0, 0, 4], [3, 3, 4], [np.nan, 1, 4]])
+    scores = verification.final_score(features, {})
+    np.testing.assert_allclose(scores, [*(1 / (1 + np.exp(-features[:3, 0]))), 0], atol=1e-4)
     monkeypatch.setattr(fake, "header", {"version": "raw"})
     searched = detection.find_people(detection.Scan(points=scene[0]), detection.Search(min_score=0.0, detector=fake))
     assert len(searched.boxes) >= len(PLACES)
@@ -500,3 +496,45 @@ def test_people_in_real_sweeps_are_found(bundled, sweep):
     found = sum(bool((np.linalg.norm(centers - box.center[:2], axis=1) < 0.5).any()) for box in labels)
     # all but one, and few who have no label
     assert found >= len(labels) - 1 and len(boxes) - found <= 5 and boxes.warnings == ()
+
+
+def test_who_cannot_reach_the_least_score_is_neither_verified_nor_posed(monkeypatch):
+    scene = detection_scene(5, 5)
+    points, origin = scene.points, scene.origin
+    detections = Detector(threads=1).detect(points, origin, limit=60)
+    header = {"verification": {"bias": -1.0, "logit": 1.0, "verifier": 0.5, "log_points": 0.1}}
+    run, verified = verification.Crops._run, []
+    monkeypatch.setattr(
+        verification.Crops,
+        "_run",
+        lambda self, rows, backend: verified.append((rows, backend)) or run(self, rows, backend),
+    )
+    features = verification.verification_features(detections, points, origin)
+    scores, logits = verification.final_score(features, header), verification.final_logit(features, header)
+    assert features.shape == (len(detections), 3)
+    highest = verification._highest_score(detections, header)
+    assert (highest >= scores).all() and 2 <= (scores >= 0.6).sum() < (highest >= 0.6).sum() < len(detections)
+    verified.clear()
+    people = verification.verified(detections, points, origin, header, 0.6)
+    (_, verifier), (posed, poser) = verified
+    assert verifier is not poser and set(posed) == set(np.flatnonzero(scores >= 0.6))
+    best = [np.argmin(np.abs(scores - box.score)) for box in people.boxes]
+    np.testing.assert_allclose(people.logits, logits[best])
+    assert len(people.boxes) >= 2 and (np.diff([box.score for box in people.boxes]) <= 0).all()
+    # nobody is most of somebody surer
+    owned = set()
+    for rows in people.rows:
+        assert len(owned & set(rows.tolist())) <= 0.75 * len(rows)
+        owned |= set(rows.tolist())
+
+
+def test_of_two_whose_pelvises_meet_the_surer_one_stays():
+    pelvises = np.array([[0.0, 0, 0], [0.25, 0, 0], [0.5, 0, 0], [np.nan, 0, 0], [5, 0, 0]])
+    none = np.zeros(5)
+    assert verification.surest_rows(np.array([0.5, 0.9, 0.4, 1.0, 0.1]), pelvises, none) == [1, 4]
+    # who is near somebody that has gone stays
+    assert verification.surest_rows(np.array([0.9, 0.8, 0.7, 1.0, 0.1]), pelvises, none) == [0, 2, 4]
+    # of equal scores by what they rise with
+    ties = np.array([1.0, 2.0, np.nan, 0.0, 0.0])
+    assert verification.surest_rows(np.array([0.9, 0.9, 0.9, 0.9, 0.1]), pelvises, ties) == [1, 4]
+    assert verification.surest_rows(np.zeros(0), np.zeros((0, 3)), np.zeros(0)) == []

@@ -13,7 +13,7 @@ from lidarpose.cli import main
 from lidarpose.geometry import UP_AXES, rigid_transform, rotation_about
 from lidarpose.io.sources.frame import Frame, FrameSource, IndexedRecording, Sweep
 from lidarpose.lidar.raycast import scan
-from lidarpose.recording import output, picture, result_files
+from lidarpose.recording import output, page, picture, result_files
 from lidarpose.recording.coordinates import in_world
 from lidarpose.recording.frame_boxes import FrameBoxes
 from lidarpose.recording.predict_recording import FramePredictor
@@ -255,10 +255,13 @@ def test_known_people_are_not_verified_again_and_keep_their_score(clouds, model,
     from lidarpose.inference import verification
 
     posed = []
-    verify = verification._posed
-    monkeypatch.setattr(
-        verification, "_posed", lambda d, chosen, *rest: posed.append(d.centers[chosen, :2]) or verify(d, chosen, *rest)
-    )
+
+    class Crops(verification.Crops):
+        def __init__(self, detections, clouds, origin):
+            posed.append(detections.centers[list(clouds), :2])
+            super().__init__(detections, clouds, origin)
+
+    monkeypatch.setattr(verification, "Crops", Crops)
     frames = list(lidarpose.predict_recording(moving_source(clouds), track=True, model=model))
     assert len(posed[0]) >= 2
     for places, frame in zip(posed[2:], frames[2:], strict=True):
@@ -391,6 +394,45 @@ def test_of_a_recording_of_one_frame_the_people_are_drawn(drive, tmp_path, monke
         assert panel.label == f"{person['id']} · score {person['score']:.2f}"
         np.testing.assert_allclose(panel.pose.joints, person["joints"], atol=1e-9)
         assert abs(len(panel.points) - person["num_points"]) <= 2 and panel.box.contains(panel.points).all()
+
+
+def page_data(path):
+    """What a page shows."""
+    return json.loads(path.read_text("utf-8").split('id="data">')[1].split("</script>")[0])
+
+
+def test_the_page_of_a_recording_is_played_frame_by_frame(drive, tmp_path):
+    assert main(["predict", str(drive), "--track", "--html", "--out", str(tmp_path / "a.jsonl")]) == 0
+    lines = [json.loads(text) for text in open(tmp_path / "a.jsonl")]
+    lines = [line for line in lines if line["error"] is None]
+    text, data = (tmp_path / "a.html").read_text("utf-8"), page_data(tmp_path / "a.html")
+    (scan,) = data["scans"]
+    assert f'max="{len(lines) - 1}"' in text and not data["people"] and not scan["poses"]
+    assert len(scan["frames"]) == len(lines) and 30 <= scan["step"] <= 1000
+    nearest = np.inf
+    for shown, line in zip(scan["frames"], lines, strict=True):
+        assert [pose["name"] for pose in shown["poses"]] == [str(person["track"]) for person in line["people"]]
+        assert shown["label"].startswith(f"{line['time']:.2f} s")
+        joints = [np.array(pose["joints"]) for pose in shown["poses"]]
+        for own in joints:
+            points = np.reshape(shown["points"], (-1, 3))
+            nearest = min(nearest, np.linalg.norm(points[:, None] - own, axis=-1).min())
+    assert nearest < 100
+    # what stands still is without people, who would stay where they were
+    still = np.reshape(scan["points"], (-1, 3))
+    pelvis = np.array([pose["joints"][0] for pose in scan["frames"][-1]["poses"]])
+    assert len(still) and np.linalg.norm(still[:, None] - pelvis, axis=-1).min() > 300
+    assert "<th scope=col>track</th>" in text.replace(' class="number"', "")
+
+
+def test_of_a_long_recording_the_page_shows_some_frames(drive, tmp_path, monkeypatch):
+    monkeypatch.setattr(page, "_MOST_FRAMES", 2)
+    assert main(["predict", str(drive), "--html", "--out", str(tmp_path / "a.jsonl")]) == 0
+    lines = [json.loads(text) for text in open(tmp_path / "a.jsonl")]
+    times = [line["time"] for line in lines if line["error"] is None]
+    labels = [frame["label"].split(",")[0] for frame in page_data(tmp_path / "a.html")["scans"][0]["frames"]]
+    # every fourth: of six frames, each second one is too many
+    assert labels == [f"{time:.2f} s" for time in times[::4]] and len(labels) == 2
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """The detector's network: its file, what it learns from, its runs, and what its scores mean."""
 
 import json
-from copy import deepcopy
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -18,7 +17,7 @@ from lidarpose.models.detector.candidates import Candidates
 from lidarpose.models.detector.detector import detector_path, open_detector
 from lidarpose.models.detector.detector_config import OUTPUT, OUTPUTS, DetectorConfig
 from lidarpose.models.detector.ground import estimate_up
-from lidarpose.models.detector.network import DetectorNet, revive
+from lidarpose.models.detector.network import DetectorNet
 from lidarpose.models.detector.render import Augmentation
 from lidarpose.models.export import export, export_detector
 from lidarpose.models.onnx import open_network
@@ -140,46 +139,6 @@ def test_a_candidate_s_answer_is_its_own():
         alone = torch.cat([network(*(values[k : k + 1] for values in inputs)) for k in range(6)])
     assert together.shape == (6, len(OUTPUTS)) and together.std(0).min() > 0
     torch.testing.assert_close(together, alone, atol=1e-5, rtol=1e-4)
-
-
-def test_dead_units_are_drawn_anew_and_answers_stay():
-    torch.manual_seed(0)
-    network = DetectorNet(SMALL).eval()
-    inputs = [torch.as_tensor(array) for array in random_inputs(40, SMALL).values()]
-    dead_from_birth = revive(deepcopy(network), inputs)
-    first, *_, last = (layer for layer in network.fine.layers if hasattr(layer, "down"))
-    with torch.no_grad():
-        network.last.weight.normal_()
-        network.hidden.bias[[1, 5, 6]] = -1e4
-        network.context.placed.bias[[0, 7]] = -1e4
-        for block, channel in ((first, 2), (last, 3)):
-            block.down.bias[channel] = block.same.bias[channel] = -1e4
-            block.gain[channel] = 1.0
-    before = network(*inputs)
-    revived = deepcopy(network)
-    assert 7 <= revive(revived, inputs) <= dead_from_birth + 7
-    torch.testing.assert_close(revived(*inputs), before)
-    assert revive(deepcopy(revived), inputs) <= dead_from_birth
-    # what reads them has a gradient to grow by
-    revived(*inputs).square().sum().backward()
-    assert (revived.last.weight.grad[:, [1, 5, 6]].abs().sum(0) > 0).all()
-    assert (network.hidden.weight[1] != revived.hidden.weight[1]).any()
-    assert torch.equal(network.hidden.weight[2, -4:], revived.hidden.weight[2, -4:])
-
-
-def test_reviving_is_of_weights_to_begin_with(quick_scans, monkeypatch, tmp_path):
-    with refused("revive is of weights to begin with: add --init detector"):
-        setup.make_setup(replace(RECIPE, revive=True))
-    monkeypatch.setattr(setup, "scan_example", candidate_source.scan_example)
-    path = tmp_path / "detector.safetensors"
-    torch.manual_seed(0)
-    network = DetectorNet(SMALL)
-    with torch.no_grad():
-        network.hidden.bias[3] = -1e4
-    save_checkpoint(path, network, card={})
-    begun = setup.make_setup(replace(RECIPE, init=str(path), revive=True)).network()
-    assert begun.hidden.bias[3] == 0 and (begun.last.weight[:, 3] == 0).all()
-    assert setup.make_setup(replace(RECIPE, init=str(path))).network().hidden.bias[3] == -1e4
 
 
 def test_the_file_gives_what_the_network_gives(tmp_path):

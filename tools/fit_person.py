@@ -18,24 +18,17 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from lidarpose.inference.detection import MAX_RANGE, MOST_POSED
-from lidarpose.inference.tta import IDENTITY, apply
-from lidarpose.inference.verification import inside_column
 from lidarpose.io.files import atomic_path
 from lidarpose.metrics import auroc
 from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
-from lidarpose.models.detector.detector import Detector
 from lidarpose.models.onnx import voxelize_people
 from lidarpose.models.posenet import Batch, PoseNet
-from lidarpose.sample import MIN_POINTS
-from lidarpose.synth.detection_scene import detection_scene
 from lidarpose.train.augment import second_person_label
 from lidarpose.train.data_loader import SyntheticSource
+from lidarpose.train.detector.candidate_source import NOBODY
+from lidarpose.train.detector.crop_source import scan_crops
 
 SEED = 9101
-# a detection nearer than this to a person is of that person; beyond the second distance, with at most this share of its
-# points on people, it is of nobody; others teach nothing, m
-OWN, OTHER, NOBODYS = 0.35, 0.7, 0.02
 MOST_POINTS = 1024
 EPOCHS, BATCH, RATE, HELD_OUT = 40, 512, 2e-3, 0.1
 
@@ -44,29 +37,12 @@ Crop = tuple[np.ndarray, np.ndarray, np.ndarray, int]
 
 def scene_crops(index: int) -> list[Crop]:
     """Points (n, 3) m about the center, view (5,), labels (2,), group 1, of the detections of a scene."""
-    scene = detection_scene(SEED, index)
-    detections = Detector(threads=1).detect(scene.points, scene.origin, max_range=MAX_RANGE, limit=MOST_POSED)
-    visible_people = np.flatnonzero(
-        np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes)) >= MIN_POINTS
-    )
-    people = np.array([scene.boxes[row].center[:2] for row in visible_people]).reshape(-1, 2)
-    crops: list[Crop] = []
-    for center, size in zip(detections.centers, detections.sizes, strict=True):
-        is_inside = inside_column(scene.points, center, size)
-        if is_inside.sum() < MIN_POINTS:
-            continue
-        distances = np.hypot(*(people - center[:2]).T)
-        owner = scene.person[is_inside]
-        if len(distances) and distances.min() < OWN:
-            num_others = int(((owner >= 0) & (owner != visible_people[distances.argmin()])).sum())
-            label = (1.0, second_person_label(num_others, len(owner)))
-        elif distances.min(initial=np.inf) > OTHER and (owner >= 0).mean() <= NOBODYS:
-            label = (0.0, 0.0)
-        else:
-            continue
-        (cloud,), view = apply(IDENTITY, [scene.points[is_inside]], center[None], scene.origin)
-        crops.append((cloud, view[0], np.array(label), 1))
-    return crops
+    scan = scan_crops(SEED, index)
+    labels = [
+        np.array([1.0, second_person_label(others, len(cloud))]) if person != NOBODY else np.zeros(2)
+        for cloud, person, others in zip(scan.clouds, scan.person, scan.num_others, strict=True)
+    ]
+    return [(cloud, view, label, 1) for cloud, view, label in zip(scan.clouds, scan.view, labels, strict=True)]
 
 
 def sample_crops(index: int, *, source: SyntheticSource) -> list[Crop]:

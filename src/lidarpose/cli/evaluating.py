@@ -24,8 +24,10 @@ _OPTIONS = """
 --tta N = 1  test-time augmentation: average N predictions of each person, 1 (default) to 8; protocol clean only
 --stability  also perturb the points and draw the curves
 --legacy  also score with the released code's arithmetic
---sensor-unknown  hide the sensor's position from the network
+--sensor-unknown  hide the sensor's position
 """
+# of these, those of the detector too
+_OF_BOTH = ("limit", "seed", "sensor_unknown")
 # in place of a network: what finds people; and its own options
 DETECTOR = "detector"
 _DETECTOR = """
@@ -113,7 +115,7 @@ def _evaluate_detector(options: argparse.Namespace) -> None:
     from lidarpose.eval.detector.labeled_scans import HELDOUT
 
     for name in option_names(_OPTIONS):
-        if name not in ("limit", "seed") and getattr(options, name) != options.defaults[name]:
+        if name not in _OF_BOTH and getattr(options, name) != options.defaults[name]:
             raise InputError(f"{_flag(name)} is of networks, got the detector: leave it out")
     if set(options.datasets) - {HELDOUT}:
         raise InputError(
@@ -121,7 +123,7 @@ def _evaluate_detector(options: argparse.Namespace) -> None:
         )
     folder = evaluation.new_folder(f"{DETECTOR}.onnx") if options.out is None else evaluation.check_folder(options.out)
     pictures = None if options.pictures is None else evaluation.check_folder(options.pictures)
-    settings = {name: value for name in ("limit", "seed") if (value := getattr(options, name)) is not None}
+    settings = {name: value for name in _OF_BOTH if (value := getattr(options, name)) is not None}
     settings |= {"method": options.method or DETECTOR, "max_range": 40.0 if options.range is None else options.range}
     network = {None: DEFAULT, "none": None}.get(options.network, options.network)
     with ExitStack() as stack:

@@ -1,4 +1,4 @@
-"""`lidarpose pretrain`, `finetune` and `train-detector`."""
+"""`lidarpose pretrain`, `finetune`, `train-detector` and `train-verifier`."""
 
 import argparse
 import os
@@ -10,7 +10,7 @@ from typing import Any
 
 from lidarpose.cli.terminal import KEEP, add_command, add_options, names, scene_changes
 from lidarpose.errors import InputError
-from lidarpose.train.recipes import TYPES, Finetune, PoseRecipe, Pretrain, Recipe, TrainDetector
+from lidarpose.train.recipes import TYPES, Finetune, PoseRecipe, Pretrain, Recipe, TrainDetector, TrainVerifier
 
 _RUN = """
  The run's folder holds config.json, log.jsonl, model.safetensors, best.safetensors, pictures, and state.safetensors to
@@ -40,6 +40,12 @@ $ lidarpose train-detector runs/train-detector-001 --calibrate 300 --scans label
 --scans DIR  with --calibrate: labeled real scans, as evaluate detector takes them; the default score lets one false
  person a scan pass there too
 """
+_VERIFIER = f"""
+train the network that tells people from the detector's mistakes
+Trains on what the bundled detector finds in synthesized scans.{_RUN.replace("COMMAND", "train-verifier")}
+$ lidarpose train-verifier --scenes 5000
+$ lidarpose train-verifier runs/train-verifier-001 --resume
+"""
 # a value of a setting from its text, by type; others are texts
 _BOOLS = {"true": True, "false": False}
 _PARSERS: dict[Any, Callable] = {
@@ -52,9 +58,17 @@ _PARSERS: dict[Any, Callable] = {
 }
 
 
+_TEXTS: dict[type[Recipe], str] = {
+    Pretrain: _PRETRAIN,
+    Finetune: _FINETUNE,
+    TrainDetector: _DETECTOR,
+    TrainVerifier: _VERIFIER,
+}
+
+
 def add(commands) -> None:
     """Adds the commands to the parser's."""
-    for kind, text in ((Pretrain, _PRETRAIN), (Finetune, _FINETUNE), (TrainDetector, _DETECTOR)):
+    for kind, text in _TEXTS.items():
         _add(add_command(commands, kind.kind, _train, text), kind)
 
 
@@ -66,7 +80,7 @@ def _add(parser, kind: type[Recipe]) -> None:
     options = f"""
 {folder_option}  a new folder for the run (default runs/{kind.kind}-001, -002, ...); with --resume that of the run
 --resume  continue an interrupted run (default: the latest)
---recipe NAME  {"default" if kind is TrainDetector else recipe_help}
+--recipe NAME  {"default" if kind in (TrainDetector, TrainVerifier) else recipe_help}
 --device NAME  cpu (default: a GPU if there is one)
 --tracker NAME  also log to tensorboard or wandb, if installed
 """

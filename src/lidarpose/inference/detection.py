@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 # how far from the sensor people are searched, m
 MAX_RANGE = 40.0
-# detections that may be posed
-MOST_POSED = 40
+# detections that may be verified, and posed
+MOST_POSED = 60
 # a scan of more points is thinned, of an unknown sensor and of a known one; what is farther away than this beyond the
 # range goes first, m; points looked at in one go, and bins of their distances
 _MOST_POINTS, _MOST_AROUND, _BEYOND = 1_500_000, 400_000, 15.0

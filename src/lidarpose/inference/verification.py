@@ -1,27 +1,24 @@
-"""Which detections are people: each is posed by the default network. How sure it is of the pose, and whether it sees a
-person at all, goes into the score.
+"""Which detections are people: a small network says so of each. Those that are are posed by the default network, and
+boxes are drawn about their poses.
 
 Legend: D detections.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import product
 
 import numpy as np
 
 from lidarpose.geometry import Strips, rotation_about
-from lidarpose.inference.backend import Backend, OnnxBackend, estimates
+from lidarpose.inference.backend import Backend, OnnxBackend, Raw, estimates
 from lidarpose.inference.tta import TTATransform, apply
-from lidarpose.models import DEFAULT, weights_path
+from lidarpose.models import DEFAULT, VERIFIER, weights_file
 from lidarpose.models.decode import decoder, sigmoid
 from lidarpose.models.detector.detector import Detections
 from lidarpose.sample import MIN_POINTS, Box, Pose, facing
 
-# what poses detections
-VERIFIER = DEFAULT
-# detections that are posed at once, of like size: a batch costs as much as if all were its largest
+# detections that are verified or posed at once, of like size: a batch costs as much as if all were its largest
 _BATCH = 16
 # what is posed: a column so wide, and so far below and above the detection's box, m
 _COLUMN, _BELOW, _ABOVE = 0.6, 0.15, 0.25
@@ -32,26 +29,19 @@ _AROUND = 2.5
 _ROOM, _LEAST_ROOM, _HALF_BODY = 0.15, 0.1, 0.25
 # of two people whose pelvises are nearer than this the less certain one is the same person, m
 _SAME_PERSON = 0.3
-# what the final score is made of, by detection: the scorer's logit; means over the joints of confidence and of the log
-# of spread, m; log of 1 + the points of the column; probability that the person is mounted; log odds that the network
-# sees a person, 0 of a network that does not say
-FEATURES = ("logit", "confidence", "log_spread", "log_points", "mounted", "person")
-# those that mean something else where the person is mounted: riders are posed badly
-_OF_MOUNTED = ("confidence", "log_spread", "person")
-# weights of the features and of products with "mounted", for a detector without its own
-_FALLBACK_WEIGHTS = {
-    "bias": -1.5 * np.log(10),
-    "logit": 1.0,
-    "log_spread": -1.5,
-    "mounted": 1.5 * np.log(10),
-    "mounted_log_spread": 1.5,
-}
-# log odds beyond this say no more
-_MOST_ODDS = 6.0
-# what joints can be at best, the fewest and most points, and the odds, between which a score is bounded before anybody
-# is posed: the least mean spread of a person's joints seen is 0.022 m
-_CONFIDENCES, _LOG_SPREADS, _LOG_POINTS = (0.0, 1.0), (np.log(0.012), 0.0), (np.log1p(MIN_POINTS), np.log1p(1e5))
-_ODDS = (-_MOST_ODDS, _MOST_ODDS)
+# places that are posed for each person that is asked for at most: some are the same person
+_PLACES = 2
+# so is who shares more than this with surer people, of the points in the box
+_SHARED = 0.75
+# what the final score is made of, by detection: the scorer's logit; the verifier's log odds of a person; log of 1 + the
+# points of the column
+FEATURES = ("logit", "verifier", "log_points")
+# their weights for a detector without its own
+_FALLBACK_WEIGHTS = {"logit": 0.5, "verifier": 0.5}
+# log odds beyond this say hardly more: they count only by this share
+_MOST_ODDS, _BEYOND_MOST = 6.0, 0.01
+# the fewest and most points, between which a score is bounded before anybody is verified
+_LOG_POINTS = (np.log1p(MIN_POINTS), np.log1p(1e5))
 # a detection so near to where somebody is expected is that person, m, if no other is expected within the second
 # distance
 _EXPECTED, _ALONE = 0.5, 1.0
@@ -90,42 +80,46 @@ class KnownPlaces:
 
 
 @cache
-def _verifier() -> Backend:
-    return OnnxBackend(weights_path(VERIFIER).with_suffix(".onnx"))
+def _bundled(name: str) -> Backend:
+    return OnnxBackend(weights_file(f"{name}.onnx"))
 
 
-def verification_features(
-    detections: Detections, points: np.ndarray, origin: np.ndarray | None
-) -> tuple[np.ndarray, Pose]:
-    """What the final score of detections in points (n, 3) m, level, from a sensor at origin (3,) or None is made of,
-    with poses by the bundled default network.
-
-    Returns:
-        features (D, 6) in the order of `FEATURES`, and the poses, joints (D, 26, 3) m in the frame of the points; of
-        fewer than 5 points they are NaN.
-    """
-    detection_rows = np.arange(len(detections))
-    clouds = [points[rows] for rows in _rows_near(detections.centers, points)]
-    return _posed(detections, detection_rows, clouds, origin, _verifier())
+def verification_features(detections: Detections, points: np.ndarray, origin: np.ndarray | None) -> np.ndarray:
+    """What the final score of detections in points (n, 3) m, level, from a sensor at origin (3,) or None is made of:
+    (D, 3) in the order of `FEATURES`, NaN of fewer than 5 points."""
+    near_rows = _rows_near(detections.centers, points)
+    return Crops(detections, dict(enumerate(points[rows] for rows in near_rows)), origin).verdicts()[0]
 
 
 def final_score(features: np.ndarray, header: dict) -> np.ndarray:
-    """features (D, 6) -> (D,) in [0, 1]: the probability that a detection is a person, by the detector's header."""
+    """features (D, 3) -> (D,) in [0, 1]: the probability that a detection is a person, by the detector's header; 0 of
+    what could not be verified."""
     verification = header.get("verification") or {}
-    weights = verification if "logit" in verification else _FALLBACK_WEIGHTS
-    logit = np.full(len(features), float(weights.get("bias", 0.0)))
-    for name, values in score_terms(features).items():
-        logit += weights.get(name, 0.0) * values
+    logit = final_logit(features, header)
     calibration = verification.get("calibration") or header.get("calibration")
     # of a network that is not calibrated yet as it comes
     probability = sigmoid(logit) if calibration is None else np.interp(logit, *calibration)
-    return np.nan_to_num(probability)
+    # as boxes state it
+    return np.nan_to_num(probability).round(_DECIMALS)
 
 
-def score_terms(features: np.ndarray) -> dict[str, np.ndarray]:
-    """What the logit of the final score is linear in, by name (D,): features (D, 6), and products with "mounted"."""
-    terms = dict(zip(FEATURES, features.T, strict=True))
-    return terms | {f"mounted_{name}": terms["mounted"] * terms[name] for name in _OF_MOUNTED}
+def final_logit(features: np.ndarray, header: dict) -> np.ndarray:
+    """features (D, 3) -> (D,): what the final score rises with, which ends at some probability."""
+    verification = header.get("verification") or {}
+    # the scores of detectors before 0.3 were of poses
+    weights = verification if "verifier" in verification else _FALLBACK_WEIGHTS
+    return features @ [weights.get(name, 0.0) for name in FEATURES] + weights.get("bias", 0.0)
+
+
+def surest_rows(scores: np.ndarray, pelvises: np.ndarray, logits: np.ndarray) -> list[int]:
+    """Of detections with scores (D,) and pelvises (D, 3) m, NaN where there is none, the rows of different people, the
+    surest first; of equal scores by logits (D,)."""
+    rows: list[int] = []
+    for i in np.lexsort((-logits, -scores)).tolist():
+        is_same = (np.linalg.norm(pelvises[rows] - pelvises[i], axis=1) < _SAME_PERSON).any()
+        if not is_same and not np.isnan(pelvises[i]).any():
+            rows.append(i)
+    return rows
 
 
 def inside_column(points: np.ndarray, center: np.ndarray, size: np.ndarray) -> np.ndarray:
@@ -135,54 +129,62 @@ def inside_column(points: np.ndarray, center: np.ndarray, size: np.ndarray) -> n
     return is_inside & (np.hypot(*(points[:, :2] - center[:2]).T) < _COLUMN)
 
 
-def _posed(
-    detections: Detections, rows: np.ndarray, clouds: list[np.ndarray], origin: np.ndarray | None, backend: Backend
-) -> tuple[np.ndarray, Pose]:
-    """As `verification_features`, of the detections in `rows` (C,) and the points (n, 3) m near each of these; of
-    the others what comes from points is NaN."""
-    columns = [np.zeros((0, 3))] * len(detections)
-    for i, cloud in zip(rows.tolist(), clouds, strict=True):
-        columns[i] = cloud[inside_column(cloud, detections.centers[i], detections.sizes[i])]
-    posed_rows = sorted(
-        (i for i, column in enumerate(columns) if len(column) >= MIN_POINTS), key=lambda i: len(columns[i])
-    )
-    skeleton = backend.header.skeleton
-    joints = np.full((len(columns), len(skeleton), 3), np.nan)
-    confidence, spread = np.full((2, *joints.shape[:2]), np.nan)
-    odds = np.full(len(columns), np.nan)
-    for start in range(0, len(posed_rows), _BATCH):
-        batch = posed_rows[start : start + _BATCH]
-        clouds, view = apply(TTATransform(), [columns[i] for i in batch], detections.centers[batch], origin)
-        raw = backend.run(clouds, view)
-        pose = estimates(raw, decoder("window"), skeleton)
-        joints[batch] = pose.joints + detections.centers[batch][:, None]
-        confidence[batch], spread[batch] = pose.confidence, pose.spread
-        odds[batch] = 0 if raw.person is None else np.clip(raw.person[:, 0], -_MOST_ODDS, _MOST_ODDS)
-    log_points = np.log1p([len(column) for column in columns])
-    with np.errstate(invalid="ignore"):
-        features = (detections.logit, confidence.mean(1), np.log(spread).mean(1), log_points, detections.mounted, odds)
-    poses = Pose(joints=joints, skeleton=skeleton, confidence=confidence, spread=spread)
-    return np.stack(features, -1).reshape(-1, len(FEATURES)), poses
+class Crops:
+    """The columns about detections, of which those of `MIN_POINTS` and more are run through networks."""
+
+    def __init__(self, detections: Detections, clouds: Mapping[int, np.ndarray], origin: np.ndarray | None):
+        """clouds: by rows of `detections`, the points (n, 3) m near each; origin (3,) m: the sensor, None: unknown."""
+        self.detections, self.origin = detections, origin
+        self.columns = [np.zeros((0, 3))] * len(detections)
+        for i, cloud in clouds.items():
+            self.columns[i] = cloud[inside_column(cloud, detections.centers[i], detections.sizes[i])]
+
+    def verdicts(self) -> tuple[np.ndarray, np.ndarray]:
+        """features (D, 3), see `FEATURES`, and by the verifier the probability that whoever is there rides or sits in a
+        wheelchair (D,); of too few points NaN."""
+        logits = np.full((len(self.detections), 2), np.nan)
+        for rows, raw in self._run(np.arange(len(self.detections)), _bundled(VERIFIER)):
+            logits[rows] = raw.person
+        odds = np.clip(logits[:, 0], -_MOST_ODDS, _MOST_ODDS) + _BEYOND_MOST * logits[:, 0]
+        log_points = np.log1p([len(column) for column in self.columns])
+        return np.column_stack([self.detections.logit, odds, log_points]), sigmoid(logits[:, 1])
+
+    def poses(self, rows: np.ndarray) -> Pose:
+        """By the default network, joints (D, 26, 3) m; NaN of all but the rows (C,), and of too few points."""
+        backend, centers = _bundled(DEFAULT), self.detections.centers
+        skeleton = backend.header.skeleton
+        joints = np.full((len(centers), len(skeleton), 3), np.nan)
+        for batch, raw in self._run(rows, backend):
+            joints[batch] = estimates(raw, decoder("window"), skeleton).joints + centers[batch][:, None]
+        return Pose(joints=joints, skeleton=skeleton)
+
+    def _run(self, rows: np.ndarray, backend: Backend) -> Iterator[tuple[list[int], Raw]]:
+        """Batches of those among the rows that have enough points, and what a network says of them."""
+        enough = (i for i in rows.tolist() if len(self.columns[i]) >= MIN_POINTS)
+        ordered = sorted(enough, key=lambda i: len(self.columns[i]))
+        for start in range(0, len(ordered), _BATCH):
+            batch = ordered[start : start + _BATCH]
+            columns = [self.columns[i] for i in batch]
+            clouds, view = apply(TTATransform(), columns, self.detections.centers[batch], self.origin)
+            yield batch, backend.run(clouds, view)
 
 
 def _highest_score(detections: Detections, header: dict) -> np.ndarray:
-    """(D,): what `final_score` can be at most, whatever the pose. The score's logit is linear in what is unknown."""
-    highest_scores = np.zeros(len(detections))
-    for confidence, log_spread, log_points, odds in product(_CONFIDENCES, _LOG_SPREADS, _LOG_POINTS, _ODDS):
-        pose_features = np.broadcast_to([confidence, log_spread, log_points], (len(detections), 3))
-        columns = (detections.logit, pose_features, detections.mounted, np.full(len(detections), odds))
-        highest_scores = np.maximum(highest_scores, final_score(np.column_stack(columns), header))
-    return highest_scores
+    """(D,): what `final_score` can be at most, whatever the verifier says."""
+    odds = _MOST_ODDS + 1
+    columns = (np.broadcast_arrays(detections.logit, odds, log_points) for log_points in _LOG_POINTS)
+    return np.max([final_score(np.stack(own, -1), header) for own in columns], axis=0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class People:
-    """N people, level, surest first: boxes, rows of their points, pelvises (N, 3) m, verified (N,) bool; rejected
-    (R, 3) m: detections that were nobody."""
+    """N people, level, surest first: boxes, rows of their points, pelvises (N, 3) m, verified (N,) bool, logits (N,),
+    which scores rise with, NaN of known people; rejected (R, 3) m: detections that were nobody."""
 
     boxes: list[Box]
     rows: list[np.ndarray]
     pelvises: np.ndarray
+    logits: np.ndarray
     verified: np.ndarray
     rejected: np.ndarray
 
@@ -211,44 +213,52 @@ def verified(
         thresholds = _least_scores(detections, known_index, least_score, known)
     possible_rows = np.flatnonzero(highest_scores >= thresholds)
     near_rows = dict(zip(possible_rows.tolist(), _rows_near(detections.centers[possible_rows], points), strict=True))
-    posed_rows = possible_rows[known_index[possible_rows] < 0]
-    features, poses = _posed(
-        detections, posed_rows, [points[near_rows[i]] for i in posed_rows.tolist()], origin, _verifier()
-    )
+    new_rows = possible_rows[known_index[possible_rows] < 0]
+    crops = Crops(detections, {i: points[near_rows[i]] for i in new_rows.tolist()}, origin)
+    features, mounted = crops.verdicts()
     scores = final_score(features, header)
+    logits = final_logit(features, header)
+    posed_rows = new_rows[scores[new_rows] >= thresholds[new_rows]]
+    if max_people is not None:
+        posed_rows = posed_rows[np.lexsort((-logits[posed_rows], -scores[posed_rows]))][: _PLACES * max_people]
+    poses = crops.poses(posed_rows)
     pelvises = poses.joints[:, poses.skeleton.index("pelvis")].copy()
-    rejected = detections.centers[posed_rows][scores[posed_rows] < _NOBODY * least_score]
+    rejected = detections.centers[new_rows][scores[new_rows] < _NOBODY * least_score]
     if known is not None:
         known_rows = np.flatnonzero(known_index >= 0)
         scores[known_rows] = [known.boxes[k].score for k in known_index[known_rows].tolist()]
         pelvises[known_rows] = known.pelvises[known_index[known_rows]]
-    person_rows: list[int] = []
-    for i in np.argsort(-scores, kind="stable").tolist():
-        is_new = not (np.linalg.norm(pelvises[person_rows] - pelvises[i], axis=1) < _SAME_PERSON).any()
-        if scores[i] >= thresholds[i] and is_new and not np.isnan(pelvises[i]).any():
-            person_rows.append(i)
+    pelvises[scores < thresholds] = np.nan
+    person_rows = surest_rows(scores, pelvises, logits)
+    is_owned = np.zeros(len(points), bool)
     boxes: list[Box] = []
     rows: list[np.ndarray] = []
     kept_rows: list[int] = []
     for i in person_rows:
         if known is not None and known_index[i] >= 0:
             box = known.boxes[known_index[i]]
-            crop_box, mounted = replace(box, size=box.size + 2 * _MOVED), box.mounted
+            crop_box, is_mounted = replace(box, size=box.size + 2 * _MOVED), box.mounted
         else:
             distances = [
                 np.hypot(*(pelvises[k] - pelvises[i])[:2]) for k in person_rows if k != i and scores[k] >= least_score
             ]
             nearest_distance = min(distances, default=np.inf)
             box = crop_box = _box_about(Pose(joints=poses.joints[i], skeleton=poses.skeleton), nearest_distance)
-            mounted = bool(detections.mounted[i] > 0.5)
-        is_inside = crop_box.contains(points[near_rows[i]])
-        if is_inside.sum() < MIN_POINTS or len(boxes) == max_people:
+            is_mounted = bool(mounted[i] > 0.5)
+        own_rows = near_rows[i][crop_box.contains(points[near_rows[i]])]
+        if len(own_rows) < MIN_POINTS or is_owned[own_rows].mean() > _SHARED or len(boxes) == max_people:
             continue
-        boxes.append(replace(box, id=len(boxes), score=round(float(scores[i]), _DECIMALS), mounted=mounted))
-        rows.append(near_rows[i][is_inside])
+        is_owned[own_rows] = True
+        boxes.append(replace(box, id=len(boxes), score=float(scores[i]), mounted=is_mounted))
+        rows.append(own_rows)
         kept_rows.append(i)
     return People(
-        boxes=boxes, rows=rows, pelvises=pelvises[kept_rows], verified=known_index[kept_rows] < 0, rejected=rejected
+        boxes=boxes,
+        rows=rows,
+        pelvises=pelvises[kept_rows],
+        logits=logits[kept_rows],
+        verified=known_index[kept_rows] < 0,
+        rejected=rejected,
     )
 
 

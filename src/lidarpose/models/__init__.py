@@ -68,6 +68,8 @@ NETWORKS = {
 BUNDLED = ("tiny", "small")
 # what is taken where nothing is named: the best whose two files are at most 6 MB
 DEFAULT = "small"
+# the network that tells people from what the detector takes for people; it poses nobody
+VERIFIER = "verifier"
 # the same, for help texts
 NAMES = ", ".join(f"{name} (default)" if name == DEFAULT else name for name in BUNDLED)
 

@@ -320,7 +320,9 @@ class JointHead(nn.Module):
 
 class PersonHead(nn.Module):
     """Whether a crop shows a person, and a second one: from the means of anchors and voxels and what the joints' head
-    says of every joint. It learns nothing of its inputs, which are the joints' alone."""
+    says of every joint. detached: it learns nothing of its inputs, which are the joints' alone."""
+
+    detached = True
 
     def __init__(self, channels: int, voxel_channels: int, joints: int):
         super().__init__()
@@ -333,5 +335,7 @@ class PersonHead(nn.Module):
         (B, 2) logits."""
         weight = valid.to(voxels.dtype)[..., None]
         mean = (voxels * weight).sum(1) / weight.sum(1).clamp(min=1)
-        features = self.norm(torch.cat([anchors.mean(1), mean], -1).detach())
-        return self.out(self.hidden(torch.cat([features, *(value.detach() for value in certainty)], -1)))
+        inputs = [torch.cat([anchors.mean(1), mean], -1), *certainty]
+        if self.detached:
+            inputs = [value.detach() for value in inputs]
+        return self.out(self.hidden(torch.cat([self.norm(inputs[0]), *inputs[1:]], -1)))

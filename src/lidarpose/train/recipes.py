@@ -252,7 +252,23 @@ class TrainDetector(Recipe):
     scenes: int = _setting(20_000, "scans that are made")
     uses: int = _setting(4, "how often each scan is shown, each time changed anew")
     init: str = _setting("", "weights to begin with: detector (the bundled one), or a checkpoint", "NAME|FILE")
-    revive: bool = _setting(False, "with --init: units that answer to no candidate are drawn anew")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainVerifier(Recipe):
+    """Training of the network that tells people from the detector's mistakes, on what it finds in synthesized scans."""
+
+    kind: ClassVar[str] = "train-verifier"
+
+    batch: int = _setting(4, "scans a step, in all processes together")
+    rate: float = _setting(1e-3, "peak learning rate of AdamW", "RATE")
+    schedule: str = _setting("cosine", "plateau (rise, stay, fall), cosine or constant")
+    warmup: float = _setting(0.1, "share of the run in which the rate rises", "SHARE")
+    validate: int = _setting(0, "scans shown between two validations; 0: twenty in the run")
+    workers: int = _setting(1, "processes that make scans, of each process that trains")
+    scenes: int = _setting(5_000, "scans that are made")
+    uses: int = _setting(3, "how often each scan is shown, each time changed anew")
+    init: str = _setting("tiny", "weights to begin with", "NAME|FILE")
 
 
 # the released OneCycle schedule, AdamW on everything, neither mean of weights nor clipping
@@ -305,6 +321,7 @@ RECIPES: dict[type[Recipe], dict[str, dict[str, Any]]] = {
         "ne": _CLIPS_DATA | {"model": "ne"},
     },
     TrainDetector: {"default": {}},
+    TrainVerifier: {"default": {}},
 }
 # of a network named by --model whose recipe has another name
 _RECIPE_OF_MODEL = {"dapt": PAPER}

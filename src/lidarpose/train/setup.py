@@ -13,28 +13,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from torch import nn
 
 from lidarpose.data.dataset_card import read_card
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
-from lidarpose.models import NETWORKS
+from lidarpose.models import NETWORKS, weights_path
 from lidarpose.models.baselines.baseline_config import LidarcapConfig
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.dapt.dapt_config import DaptConfig
 from lidarpose.models.detector.detector import detector_path
-from lidarpose.models.detector.detector_config import INPUTS, DetectorConfig
-from lidarpose.models.detector.network import DetectorNet, revive
+from lidarpose.models.detector.detector_config import DetectorConfig
+from lidarpose.models.posenet import PoseNet, expand_weights
 from lidarpose.skeleton import Skeleton, skeleton
 from lidarpose.synth.scene import scene_config
 from lidarpose.train.augment import Augmentation, ClipExample, Example, augmentation, augmented
 from lidarpose.train.data_loader import BATCHES, ClipSource, MixedSource, Source, StoredSource, SyntheticSource
-from lidarpose.train.detector.candidate_source import CandidateSource, scan_example, validation_scans
+from lidarpose.train.detector.candidate_source import CandidateSource, validation_scans
+from lidarpose.train.detector.crop_source import CropSource, validation_crops
 from lidarpose.train.networks import Config, expanded_network, finetuned_network, initial_network, pretraining_network
 from lidarpose.train.objectives.detector_objective import DetectorObjective, missed_people
 from lidarpose.train.objectives.objective import Objective
-from lidarpose.train.recipes import Finetune, PoseRecipe, Pretrain, Recipe, TrainDetector
+from lidarpose.train.objectives.verifier_objective import VerifierObjective, missed_by_verifier
+from lidarpose.train.recipes import Finetune, PoseRecipe, Pretrain, Recipe, TrainDetector, TrainVerifier
 from lidarpose.train.run_dir import folder_names
 from lidarpose.train.torch_dataset import InMemoryDataset
 from lidarpose.train.validation import validate
@@ -49,8 +50,6 @@ _NO_VALIDATION = (
 _LEAST_SEQUENCES = 3
 # chunks of a run between two times that a scan is shown: divides by the usual numbers of workers
 _LAG = 12
-# scans of which no candidate excites a dead unit of the detector
-_SCANS_TO_REVIVE = 8
 # share of objects among the synthesized people of fine-tuning, for a network that says whether somebody is there
 _OBJECTS = 0.2
 
@@ -111,6 +110,8 @@ def make_setup(recipe: Recipe, *, on_cpu: bool = True) -> TrainSetup:
     layout = "ragged" if on_cpu else "padded"
     if isinstance(recipe, TrainDetector):
         return _detection(recipe)
+    if isinstance(recipe, TrainVerifier):
+        return _verification(recipe)
     if isinstance(recipe, Pretrain):
         return _pretraining(recipe, layout)
     assert isinstance(recipe, Finetune)
@@ -126,14 +127,11 @@ def _detection(recipe: TrainDetector) -> TrainSetup:
         trained, header = load_checkpoint(path)
         if header.config != objective.config:
             raise file_error(path, f"expected a detector as train-detector makes it, got a network {header.network}")
-        network = partial(_revived, trained, recipe.seed) if recipe.revive else partial(deepcopy, trained)
+        network = partial(deepcopy, trained)
         card["init_card"] = header.card
-    elif recipe.revive:
-        raise InputError("revive is of weights to begin with: add --init detector, or a checkpoint")
     return TrainSetup(
         objective=objective,
-        # a worker shows each scan again that it has made, for all usual numbers of workers
-        source=CandidateSource(seed=recipe.seed, uses=recipe.uses, lag=_LAG * BATCHES * recipe.batch // recipe.uses),
+        source=CandidateSource(seed=recipe.seed, uses=recipe.uses, lag=_lag(recipe)),
         people=recipe.scenes * recipe.uses,
         network=network,
         validation=partial(validation_scans, _VALIDATION_SEED),
@@ -145,13 +143,38 @@ def _detection(recipe: TrainDetector) -> TrainSetup:
     )
 
 
-def _revived(trained: DetectorNet, seed: int) -> DetectorNet:
-    """A copy, in which units that answer to no candidate of the first scans are drawn anew."""
-    network = deepcopy(trained)
-    scans = [scan_example(seed, number) for number in range(_SCANS_TO_REVIVE)]
-    arrays = DetectorObjective(config=network.config).collate(scans)
-    revive(network, [torch.as_tensor(arrays[name]).float() for name in INPUTS])
-    return network
+def _verification(recipe: TrainVerifier) -> TrainSetup:
+    trained, header = load_checkpoint(weights_path(recipe.init))
+    if not isinstance(trained, PoseNet):
+        problem = f"expected one of the package's own networks, which the verifier is, got a network {header.network}"
+        raise file_error(recipe.init, problem)
+    config = replace(trained.config, size="verifier", person=True)
+
+    def network() -> nn.Module:
+        verifier = expand_weights(trained, config)
+        # poses do not matter to it
+        assert verifier.person is not None
+        verifier.person.detached = False
+        return verifier
+
+    return TrainSetup(
+        objective=VerifierObjective(config=config),
+        source=CropSource(seed=recipe.seed, uses=recipe.uses, lag=_lag(recipe)),
+        people=recipe.scenes * recipe.uses,
+        network=network,
+        validation=partial(validation_crops, _VALIDATION_SEED),
+        joints=None,
+        card={"init_card": header.card},
+        unit="scans",
+        validate=missed_by_verifier,
+        error_unit="missed",
+    )
+
+
+def _lag(recipe: TrainDetector | TrainVerifier) -> int:
+    """Scenes between two times that one is shown: a worker shows each scan again that it has made, for all usual
+    numbers of workers."""
+    return _LAG * BATCHES * recipe.batch // recipe.uses
 
 
 def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:

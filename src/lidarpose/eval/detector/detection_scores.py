@@ -32,6 +32,8 @@ DISTANCE_EDGES = (0.0, 10.0, 20.0, 30.0, np.inf)
 # conditions: another person or a thing so near, m, and people who are less tall, m
 _COMPANY, _TOUCHING, _LOW = 1.0, 0.3, 1.4
 CONDITIONS = ("person within 1 m", "thing within 0.3 m", "under 1.4 m tall", "none of these")
+# what is known of a whole scan
+OF_SCAN = ("sensor", "kind", "height", "tilt")
 INDOORS = ("room", "corridor", "hall")
 _REPEATS, _BINS = 1000, 10
 # what a detection is of
@@ -81,7 +83,7 @@ def score_scan(
     is_match = np.append(is_wanted, False)[of_person]
     detection = np.full(len(positions), -1)
     detection[of_person[of_person >= 0]] = np.flatnonzero(of_person >= 0)
-    scan_columns = {"scan": number, "sensor": scan.sensor, "kind": scan.kind}
+    scan_columns = {"scan": number} | {name: getattr(scan, name) for name in OF_SCAN}
     people = pd.DataFrame(
         scan_columns
         | {"person": np.arange(len(positions)), "points": scan.num_points, "distance": distance}
@@ -165,6 +167,7 @@ def score_detector(
     max_range: float = 40.0,
     default_score: float | None = None,
     predictor: Predictor | None = None,
+    sensor_unknown: bool = False,
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> DetectorResult:
@@ -174,6 +177,7 @@ def score_detector(
         detect: see `Detect`; its boxes should come with all scores, low ones too.
         max_range: people farther from the sensor, m, are neither wanted nor false.
         default_score: also an operating point, "default".
+        sensor_unknown: where the sensor is is not told.
         predictor: poses matched people in found and in labeled boxes, where joints are known.
         seed: of the intervals.
     """
@@ -181,11 +185,11 @@ def score_detector(
     progress(0, len(scans.loaders))
     for number, load in enumerate(scans.loaders):
         scan = load()
-        boxes, scores = detect(scan.points, scan.origin)
+        boxes, scores = detect(scan.points, None if sensor_unknown else scan.origin)
         people, detections = score_scan(number, scan, boxes, np.asarray(scores, float), max_range=max_range)
         if predictor is not None and scan.joints is not None:
             people = people.assign(**_pose_errors(people, scan, boxes, predictor))
-        scan_info = {"sensor": scan.sensor, "kind": scan.kind, "changed": scan.changed}
+        scan_info = {name: getattr(scan, name) for name in (*OF_SCAN, "changed")}
         scan_results.append((people, detections, boxes, scan_info))
         progress(number + 1, len(scans.loaders))
     *tables, all_boxes, rows_about = zip(*scan_results, strict=True)
@@ -307,7 +311,7 @@ def _groups_of_people(people: pd.DataFrame) -> Iterator[tuple[str, str, np.ndarr
         for name, rows in aggregate.span_rows(points, POINT_EDGES).items():
             yield f"{prefix}points", name, mask & rows
     for suffix, mask in (("", is_on_foot), (", 50 points and more", is_on_foot & (points >= 50))):
-        for column in ("sensor", "kind", "activity"):
+        for column in (*OF_SCAN, "activity"):
             for name in sorted(set(people[column]) - {""}):
                 yield f"{column}{suffix}", name, mask & (people[column] == name).to_numpy()
         yield f"kind{suffix}", "indoors", mask & people.kind.isin(INDOORS).to_numpy()
@@ -322,7 +326,7 @@ def _false_rows(at: str, false_people: pd.DataFrame, scans: pd.DataFrame) -> Ite
     counts = false_people.scan.value_counts().reindex(scans.index, fill_value=0)
     yield _row("false_people", at, value=counts.mean(), unit="a scan", count=len(scans))
     yield _row("false_people", at, "worst", "scan", value=counts.max(), unit="a scan", count=1)
-    for column in ("sensor", "kind"):
+    for column in OF_SCAN:
         for name, group_counts in counts.groupby(scans[column]):
             if name:
                 yield _row(

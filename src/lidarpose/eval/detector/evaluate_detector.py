@@ -77,6 +77,7 @@ def run_detector(
     max_range: float = 40.0,
     network: str | None = None,
     limit: int | None = None,
+    sensor_unknown: bool = False,
     seed: int = 0,
     detect: Detect | None = None,
     progress: Callable[[str, int, int], None] = lambda dataset, done, total: None,
@@ -90,6 +91,7 @@ def run_detector(
         max_range: m, people farther away do not count.
         network: whose poses in found boxes are compared with those in labeled boxes; None leaves this out.
         limit: so many scans of each set, evenly spread.
+        sensor_unknown: where the sensor is is not told, so that people at any distance are looked for.
     """
     check_name("method", method, METHODS)
     if limit is not None:
@@ -103,7 +105,13 @@ def run_detector(
         detect = detector_of(method, detector, max_range=max_range)
     predictor = None if network is None else load(network, tta=1)
     score = partial(
-        score_detector, detect, max_range=max_range, predictor=predictor, seed=seed, default_score=default_score
+        score_detector,
+        detect,
+        max_range=max_range,
+        default_score=default_score,
+        predictor=predictor,
+        sensor_unknown=sensor_unknown,
+        seed=seed,
     )
     return [score(scans, progress=partial(progress, scans.name)) for scans in sets], sets
 

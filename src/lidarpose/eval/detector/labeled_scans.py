@@ -22,6 +22,8 @@ from lidarpose.sample import Box
 
 HELDOUT = "heldout"
 _HELDOUT_FILE = "detector-heldout-1.json"
+# between what heights of sensors, m, and tilts, degrees, figures are told apart
+_HEIGHTS, _TILTS = (1.0, 2.2), (3.0, 10.0)
 # what labels call people on foot, and people with wheels; other things, as strollers and dogs, are no people
 _ON_FOOT = ("pedestrian", "person", "people", "signaler", "human", "adult", "child")
 _MOUNTED = ("cycl", "rider", "wheelchair", "mounted")
@@ -33,7 +35,8 @@ class LabeledScan:
 
     points (n, 3) m; origin: the sensor's position (3,) m, None where nobody knows it; boxes: P; num_points (P,): how
     many points each person has; is_person (P,) bool: False where something else is labeled; mounted (P,) bool: riders
-    and wheelchairs; activities: P names; sensor, kind of scene: "" where it is not known; thing (n,): the kind of thing
+    and wheelchairs; activities: P names; sensor, kind of scene, the sensor's height above the ground and its tilt, in
+    words: "" where it is not known; thing (n,): the kind of thing
     that a point lies on, an index of `things`, or -1; person (n,): an index of `boxes`, or -1; joints (P, 26, 3) m,
     body26; changed: the scan is not what it was when its list was frozen.
     """
@@ -48,6 +51,8 @@ class LabeledScan:
     activities: Sequence[str] | None = None
     sensor: str = ""
     kind: str = ""
+    height: str = ""
+    tilt: str = ""
     thing: np.ndarray | None = None
     things: Sequence[str] = ()
     person: np.ndarray | None = None
@@ -83,8 +88,18 @@ def synthetic_scan(seed: int, index: int, family: str = HELDOUT, digest: str | N
         num_points=np.bincount(scene.person[scene.person >= 0], minlength=people),
         is_person=np.ones(people, bool),
         changed=digest not in (None, scene.points_digest()),
+        height=_in_words(scene.height, _HEIGHTS, "m"),
+        tilt=_in_words(np.degrees(np.arccos(min(scene.up[2], 1.0))), _TILTS, "degrees"),
         **{name: getattr(scene, name) for name in field_names},
     )
+
+
+def _in_words(value: float, edges: tuple[float, float], unit: str) -> str:
+    """Between which of the two edges a value lies."""
+    low, high = edges
+    if value < low:
+        return f"under {low:g} {unit}"
+    return f"{low:g} to {high:g} {unit}" if value < high else f"{high:g} {unit} and more"
 
 
 def labeled_scans(folder: str | os.PathLike, limit: int | None = None) -> ScanSet:

@@ -3,8 +3,6 @@
 Legend: K candidates, C channels.
 """
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor, nn
 
@@ -80,61 +78,3 @@ class DetectorNet(nn.Module):
     def forward(self, fine: Tensor, range_view: Tensor, context: Tensor, scalars: Tensor) -> Tensor:
         branches = [self.fine(fine), self.range_view(range_view), self.context(context), scalars]
         return self.last(torch.relu(self.hidden(torch.cat(branches, 1))))
-
-
-# ---- units that never answer, as high rates leave them behind: drawn anew, and read by zero until training finds a use
-
-
-@torch.no_grad()
-def revive(network: DetectorNet, inputs: Sequence[Tensor]) -> int:
-    """Draws the units anew that are zero for every one of these candidates, in place; answers stay as they are.
-
-    inputs: as `DetectorNet.forward` takes them, of many candidates. What is drawn comes from torch's global generator.
-    Returns how many units there were.
-    """
-    active: dict[nn.Module, Tensor] = {}
-    blocks = [module for module in network.modules() if isinstance(module, _Block)]
-    watched = [*blocks, *(block.down for block in blocks), *(b.placed for b in _branches(network)), network.hidden]
-
-    def note(module: nn.Module, _: object, out: Tensor) -> None:
-        active[module] = (out.transpose(0, 1).flatten(1) > 0).any(1)
-
-    hooks = [module.register_forward_hook(note) for module in watched]
-    network(*inputs)
-    for hook in hooks:
-        hook.remove()
-    for block in blocks:
-        # what only the block's second convolution reads is of use too
-        active[block] |= active.pop(block.down)
-    column = 0
-    for branch in _branches(network):
-        blocks = [layer for layer in branch.layers if isinstance(layer, _Block)]
-        for block, reader in zip(blocks, [*(block.down for block in blocks[1:]), branch.placed], strict=True):
-            dead = ~active[block]
-            block.same.weight[:, dead] = 0
-            reader.weight[:, dead] = 0
-            block.gain[dead] = _GAIN
-            for layer in (block.down, block.same):
-                _draw_anew(layer, dead)
-        width = len(active[blocks[-1]])
-        network.hidden.weight[:, column : column + width][:, ~active[blocks[-1]]] = 0
-        dead = ~active[branch.placed]
-        _draw_anew(branch.placed, dead)
-        cells = dead.repeat_interleave((branch.features - width) // _PLACED)
-        network.hidden.weight[:, column + width : column + branch.features][:, cells] = 0
-        column += branch.features
-    dead = ~active[network.hidden]
-    _draw_anew(network.hidden, dead)
-    network.last.weight[:, dead] = 0
-    return sum(int((~units).sum()) for units in active.values())
-
-
-def _branches(network: DetectorNet) -> tuple[_Branch, ...]:
-    return network.fine, network.range_view, network.context
-
-
-def _draw_anew(layer: nn.Conv2d | nn.Linear, rows: Tensor) -> None:
-    new_weight = nn.init.kaiming_normal_(torch.empty_like(layer.weight), nonlinearity="relu")
-    layer.weight[rows] = new_weight[rows]
-    assert layer.bias is not None
-    layer.bias[rows] = 0

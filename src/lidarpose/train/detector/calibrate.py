@@ -1,19 +1,23 @@
 """What a trained detector's scores mean: fitted on scans of what training never shows, and written beside the network.
 
-Legend: D detections of all scans, F features.
+Legend: D detections of a scan, F features.
 """
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from lidarpose.errors import InputError, check_int
-from lidarpose.eval.detector.detection_scores import match
+from lidarpose.eval.detector.detection_scores import MATCH_RADIUS, match
 from lidarpose.eval.detector.evaluate_detector import run_detector
 from lidarpose.inference.detection import MAX_RANGE, MOST_POSED
-from lidarpose.inference.verification import final_score, score_terms, verification_features
+from lidarpose.inference.verification import FEATURES, People, verification_features, verified
 from lidarpose.models.checkpoint import load_checkpoint
-from lidarpose.models.detector.detector import Detector
+from lidarpose.models.detector.detector import Detections, Detector
 from lidarpose.models.detector.network import DetectorNet
 from lidarpose.models.export import export_detector
 from lidarpose.progress import Progress
@@ -26,6 +30,8 @@ DETECTOR = "detector.onnx"
 _SEED = 2**31 - 11
 # false people a scan at the default score
 FALSE = 1.0
+# who is less likely is not posed to learn what scores mean
+_LEAST_SCORE = 0.01
 # of the logistic, on standardized features; of the piecewise linear curve, its knots at most
 _RIDGE, _KNOTS = 1e-3, 16
 
@@ -47,21 +53,19 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
     export_detector(network, out, card=header.card)
     detector = Detector(out)
 
-    tables: list[tuple[np.ndarray, ...]] = []
+    tables: list[ScanTable] = []
     with Progress(scans, unit="scans") as bar:
         for number in range(scans):
             scene = detection_scene(_SEED, number, family="heldout")
             scene = as_detected(scene, scene.origin)
             box_rows = np.unique(scene.person[scene.person >= 0])
-            people = np.array([scene.boxes[row].center for row in box_rows]).reshape(-1, 3)
+            people = np.array([scene.boxes[row].center[:2] for row in box_rows]).reshape(-1, 2)
             detections = detector.detect(scene.points, scene.origin, max_range=MAX_RANGE, limit=MOST_POSED)
-            features, _ = verification_features(detections, scene.points, scene.origin)
-            # the strongest first
-            matches = match(detections.centers[:, :2], detections.logit, people[:, :2], np.ones(len(people), bool))
-            tables.append((features, matches >= 0))
+            features = verification_features(detections, scene.points, scene.origin)
+            verify = partial(verified, detections, scene.points, scene.origin)
+            tables.append(ScanTable(detections=detections, features=features, people=people, verify=verify))
             bar.update(number + 1)
-    features, is_person = (np.concatenate(column) for column in zip(*tables, strict=True))
-    card = header.card | fit(features, is_person, scans) | {"calibrated_on": scans}
+    card = header.card | fit(tables) | {"calibrated_on": scans}
     export_detector(network, out, card=card)
     if labeled is not None:
         (result,), _ = run_detector(weights=out, heldout=False, folders=[labeled], max_range=MAX_RANGE)
@@ -70,21 +74,51 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
     return out
 
 
-def fit(features: np.ndarray, is_person: np.ndarray, scans: int) -> dict:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ScanTable:
+    """D detections in a scan of P people: features (D, F), see `verification_features`; people (P, 2) m; verify: header
+    and least score -> the people among them, as `verified` finds them."""
+
+    detections: Detections
+    features: np.ndarray
+    people: np.ndarray
+    verify: Callable[[dict, float], People]
+
+    def is_near(self) -> np.ndarray:
+        """(D,): whether somebody is there, be it who another detection is of, too."""
+        distance = np.linalg.norm(self.detections.centers[:, None, :2] - self.people[None], axis=-1)
+        return (distance < MATCH_RADIUS).any(1)
+
+    def is_first(self, scores: np.ndarray, centers: np.ndarray) -> np.ndarray:
+        """(K,): whether boxes with these scores (K,) and centers (K, 3) m are the surest of a person."""
+        return match(centers[:, :2], scores, self.people, np.ones(len(self.people), bool)) >= 0
+
+
+def fit(tables: Sequence[ScanTable]) -> dict:
     """The entries "calibration", "verification" and "default_score" of a header.
 
-    features: (D, 6) of detections in so many scans, see `inference.verification.FEATURES`, NaN of those that could not
-    be posed; is_person: (D,). The default score lets `FALSE` false people a scan pass.
+    What is learned to be told from mistakes are all detections of people: of those of one person all but one go later,
+    and are no mistakes. What the score means, and the default score, which lets `FALSE` false people a scan pass, is
+    fitted to those that are left.
     """
-    is_posed = np.isfinite(features).all(1)
-    posed_features, labels = features[is_posed], is_person[is_posed]
-    terms = score_terms(posed_features)
-    table = np.column_stack(list(terms.values()))
-    bias, weights = logistic(table, labels)
-    verification = {"bias": bias, **dict(zip(terms, weights.tolist(), strict=True))}
-    verification["calibration"] = monotone(bias + table @ weights, labels)
-    header = {"calibration": monotone(features[:, 0], is_person), "verification": verification}
-    return header | {"default_score": passing_score(final_score(posed_features, header)[~labels], scans)}
+    features = np.concatenate([table.features for table in tables])
+    is_near = np.concatenate([table.is_near() for table in tables])
+    is_verified = np.isfinite(features).all(1)
+    bias, weights = logistic(features[is_verified], is_near[is_verified])
+    verification: dict[str, Any] = {"bias": bias, **dict(zip(FEATURES, weights.tolist(), strict=True))}
+    logits: list[np.ndarray] = []
+    labels: list[np.ndarray] = []
+    for table in tables:
+        people = table.verify({"verification": verification}, _LEAST_SCORE)
+        centers = np.array([box.center for box in people.boxes]).reshape(-1, 3)
+        logits.append(people.logits)
+        labels.append(table.is_first(people.logits, centers))
+    logit, is_person = np.concatenate(logits), np.concatenate(labels)
+    verification["calibration"] = monotone(logit, is_person)
+    is_first = np.concatenate([table.is_first(table.features[:, 0], table.detections.centers) for table in tables])
+    header = {"calibration": monotone(features[:, 0], is_first), "verification": verification}
+    false = np.interp(logit[~is_person], *verification["calibration"])
+    return header | {"default_score": passing_score(false, len(tables))}
 
 
 def passing_score(false: np.ndarray, scans: int) -> float:

@@ -9,6 +9,7 @@ Legend: K candidates, P people of a scan.
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -37,6 +38,8 @@ VALIDATION = 30
 NOBODY, UNCLEAR = -1, -2
 # what boxes have beyond the body on each side, m
 _MARGIN = 0.05
+
+Scan = TypeVar("Scan")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +108,7 @@ def moved(labels: Labels, augmentation: Augmentation) -> Labels:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CandidateSource:
+class SceneSource(Generic[Scan]):
     """Each scene of `detection_scene` of a seed `uses` times, `lag` scenes between two times.
 
     Scene j is example uses * j the first time. Where no scene is old enough yet, a younger one stands in.
@@ -115,19 +118,44 @@ class CandidateSource:
     uses: int
     lag: int
 
+    def made(self, number: int) -> Scan:
+        """What is learned from in a scene."""
+        raise NotImplementedError
+
+    def shown(self, scan: Scan, rng: np.random.Generator) -> Scan:
+        """An example of it, drawn anew."""
+        raise NotImplementedError
+
     def __getstate__(self) -> dict:
         return {name: value for name, value in vars(self).items() if name != "_kept"}
 
     @cached_property
-    def _kept(self) -> dict[int, DetectorExample]:
+    def _kept(self) -> dict[int, Scan]:
         """The scans of this process by their numbers."""
         return {}
 
-    def example(self, index: int) -> DetectorExample:
+    def example(self, index: int) -> Scan:
         newest_scene, use = divmod(index, self.uses)
         number = newest_scene - use * self.lag
         scan = self._scan(newest_scene // (use + 1) if number < 0 else number, newest_scene)
-        rng = np.random.default_rng([self.seed, RandomStream.CANDIDATES, index])
+        return self.shown(scan, np.random.default_rng([self.seed, RandomStream.CANDIDATES, index]))
+
+    def _scan(self, number: int, newest_scene: int) -> Scan:
+        scans = self._kept
+        if number not in scans:
+            for old_number in [old_number for old_number in scans if old_number < newest_scene - self.uses * self.lag]:
+                del scans[old_number]
+            scans[number] = self.made(number)
+        return scans[number]
+
+
+class CandidateSource(SceneSource[DetectorExample]):
+    """Candidates of scenes: all of people, and some of nobody."""
+
+    def made(self, number: int) -> DetectorExample:
+        return scan_example(self.seed, number)
+
+    def shown(self, scan: DetectorExample, rng: np.random.Generator) -> DetectorExample:
         person = scan.labels.person
         negatives = np.flatnonzero(person == NOBODY)
         negatives = rng.choice(negatives, min(NEGATIVES, len(negatives)), replace=False)
@@ -136,22 +164,10 @@ class CandidateSource:
         labels = moved(scan.labels.take(rows), augmentation)
         return DetectorExample(candidates=scan.candidates.take(rows), labels=labels, augmentation=augmentation)
 
-    def _scan(self, number: int, newest_scene: int) -> DetectorExample:
-        scans = self._kept
-        if number not in scans:
-            for old_number in [old_number for old_number in scans if old_number < newest_scene - self.uses * self.lag]:
-                del scans[old_number]
-            scans[number] = scan_example(self.seed, number)
-        return scans[number]
-
 
 def scan_example(seed: int, number: int, *, family: str = "train") -> DetectorExample:
     """All candidates of a scene, found as in any scan: leveled first where it is tilted."""
-    scene = detection_scene(seed, number, family=family)
-    rng = np.random.default_rng([seed, RandomStream.CANDIDATES, number, 0])
-    is_blind = rng.random() < BLIND
-    scene = as_detected(scene, None if is_blind else scene.origin)
-    origin = None if is_blind else scene.origin
+    scene, origin = scene_to_search(seed, number, family)
     points = scene.points[_distance(scene.points, scene) < RANGE + _BEYOND]
     ground = estimate_ground(points, origin) or without_ground(points, origin)
     heights = heights_above(points, ground)
@@ -159,6 +175,15 @@ def scan_example(seed: int, number: int, *, family: str = "train") -> DetectorEx
     centers = centers[_distance(centers, scene) < RANGE]
     candidates = SceneIndex(points, ground, origin, heights=heights).candidates(centers)
     return DetectorExample(candidates=candidates, labels=labels_of(candidates, scene))
+
+
+def scene_to_search(seed: int, number: int, family: str) -> tuple[DetectionScene, np.ndarray | None]:
+    """A scene as people are looked for in it, and the place of its sensor (3,) m, None where it is not known."""
+    scene = detection_scene(seed, number, family=family)
+    rng = np.random.default_rng([seed, RandomStream.CANDIDATES, number, 0])
+    is_blind = rng.random() < BLIND
+    scene = as_detected(scene, None if is_blind else scene.origin)
+    return scene, None if is_blind else scene.origin
 
 
 def validation_scans(seed: int) -> list[DetectorExample]:

@@ -125,7 +125,13 @@ def missed_people(
         false_logits.append(logit[rows][person[rows] == NOBODY])
         people = np.unique(person[person >= 0])
         best_logits.append(np.array([logit[rows][person[rows] == number].max(initial=-np.inf) for number in people]))
+    return share_missed(false_logits, best_logits), None
+
+
+def share_missed(false_logits: Sequence[np.ndarray], best_logits: Sequence[np.ndarray]) -> float:
+    """Per cent of people who are missed at `FALSE` false ones a scan, by the logits of the false ones and the best of
+    each person, (n,) of each scan."""
     false_ranking = np.sort(np.concatenate([*false_logits, [-np.inf]]))[::-1]
-    threshold = false_ranking[min(round(FALSE * len(examples)), len(false_ranking) - 1)]
-    person_logits = np.concatenate(best_logits)
-    return float((person_logits <= threshold).mean() * 100) if len(person_logits) else 0.0, None
+    threshold = false_ranking[min(round(FALSE * len(false_logits)), len(false_ranking) - 1)]
+    person_logits = np.concatenate([*best_logits, np.zeros(0)])
+    return float((person_logits <= threshold).mean() * 100) if len(person_logits) else 0.0

@@ -1,0 +1,100 @@
+"""`VerifierObjective`: whether a detection is a person, and whether they ride, by a network that learns nothing else.
+
+Legend: K detections of a batch of scans, G groups of them.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from lidarpose.models.config import NetworkConfig
+from lidarpose.models.posenet import Batch, PoseNet
+from lidarpose.models.voxelize import voxelize
+from lidarpose.train.detector.candidate_source import NOBODY
+from lidarpose.train.detector.crop_source import CropExample
+from lidarpose.train.objectives.detector_objective import average_precision, share_missed
+from lidarpose.train.objectives.objective import Share, alone, at_least_one
+from lidarpose.train.objectives.posenet_objective import MAX_VOXELS
+
+# weight of whether people ride or sit in wheelchairs
+MOUNTED = 0.5
+# detections of like size that are computed together: a batch costs as much as if all were its largest
+_GROUP = 32
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerifierObjective:
+    """The objective of a `PoseNet` of which `person` alone is used: logits of a person, and of one who is mounted."""
+
+    config: NetworkConfig
+
+    def network(self) -> PoseNet:
+        return PoseNet(self.config)
+
+    def collate(self, examples: list[CropExample]) -> list[dict[str, np.ndarray]]:
+        """G groups of the detections of all scans, by size: the arrays of a `VoxelPyramid`, and "person" (K, 2)
+        float32: 1 for people, and for those who are mounted."""
+        clouds = [cloud for example in examples for cloud in example.clouds]
+        view = np.concatenate([example.view for example in examples])
+        person = np.concatenate([example.person for example in examples]) != NOBODY
+        mounted = np.concatenate([example.mounted for example in examples])
+        labels = np.stack([person, mounted], 1).astype(np.float32)
+        seeds = np.concatenate([example.seed + np.arange(example.size) for example in examples])
+        order = np.argsort([len(cloud) for cloud in clouds], kind="stable")
+        groups = []
+        for start in range(0, len(order), _GROUP):
+            rows = order[start : start + _GROUP]
+            pyramid = voxelize(
+                np.concatenate([clouds[row] for row in rows]),
+                np.array([len(clouds[row]) for row in rows]),
+                grid=self.config.grid,
+                max_voxels=MAX_VOXELS,
+                view=view[rows],
+                seeds=seeds[rows],
+                neighbors=self.config.convolution > 0,
+            )
+            groups.append(pyramid.arrays() | {"person": labels[rows]})
+        return groups
+
+    def terms(
+        self, network: Callable, arrays: list[dict], *, device: torch.device | str = "cpu", share: Share = alone
+    ) -> dict[str, Tensor]:
+        """Cross entropy of the K detections, and of people's being mounted."""
+        logits = torch.cat([self._logits(network, group, device) for group in arrays])
+        labels = torch.cat([torch.as_tensor(group["person"]).to(device) for group in arrays])
+        person, mounted = F.binary_cross_entropy_with_logits(logits, labels, reduction="none").unbind(1)
+        is_person = labels[:, 0]
+        return {
+            "person": person.sum() / at_least_one(share(torch.ones_like(is_person).sum())),
+            "mounted": MOUNTED * (mounted * is_person).sum() / at_least_one(share(is_person.sum())),
+            "ap": average_precision(logits[:, 0].detach(), is_person > 0),
+        }
+
+    @torch.no_grad()
+    def scores(self, network: Callable, example: CropExample, *, device: torch.device | str = "cpu") -> np.ndarray:
+        """(K, 2) logits of the detections of a scan, in its order."""
+        order = np.argsort([len(cloud) for cloud in example.clouds], kind="stable")
+        logits = [self._logits(network, group, device).cpu().numpy() for group in self.collate([example])]
+        return np.concatenate([*logits, np.zeros((0, 2))])[np.argsort(order)]
+
+    def _logits(self, network: Callable, group: dict, device: torch.device | str) -> Tensor:
+        return network(Batch.from_arrays(group, device)).person.float()
+
+
+def missed_by_verifier(
+    objective: VerifierObjective, network: nn.Module, examples: Sequence[CropExample], batch: int
+) -> tuple[float, None]:
+    """Per cent of the people among the detections who are missed at `detector_objective.FALSE` false people a scan, by
+    the verifier alone. batch: is not used."""
+    device = next(network.parameters()).device
+    false_logits: list[np.ndarray] = []
+    best_logits: list[np.ndarray] = []
+    for example in examples:
+        logit, person = objective.scores(network, example, device=device)[:, 0], example.person
+        false_logits.append(logit[person == NOBODY])
+        best_logits.append(np.array([logit[person == number].max() for number in np.unique(person[person >= 0])]))
+    return share_missed(false_logits, best_logits), None
