@@ -25,7 +25,7 @@ from lidarpose.eval.detector.detection_scores import (
     score_detector,
     score_scan,
 )
-from lidarpose.eval.detector.labeled_scans import LabeledScan, ScanSet, heldout_scans, labeled_scans
+from lidarpose.eval.detector.labeled_scans import LabeledScan, ScanSet, heldout_scans, labeled_scans, synthetic_scan
 from lidarpose.models.detector.detector import Detector
 from lidarpose.sample import Box
 
@@ -399,3 +399,23 @@ def test_labels_without_a_scan_and_wrong_ones_are_named(tmp_path):
         path.write_text(json.dumps(changed))
         with pytest.raises(InputError, match=rf"b\.json.*{message}"):
             labeled_scans(tmp_path / "labeled").loaders[0]()
+
+
+def test_figures_by_the_sensor_s_mount_and_without_its_place():
+    scans = [scan([8.0, 12.0], height="under 1 m", tilt="under 3 degrees"), scan([9.0], height="1 to 2.2 m")]
+    origins = []
+
+    def detect(points, origin):
+        origins.append(origin)
+        return [box(8.0, 0.0), box(9.0, 0.0)], np.array([0.9, 0.8])
+
+    result = score_detector(detect, scan_set(scans), sensor_unknown=True)
+    assert origins == [None, None]
+    recall = {name: result.row("recall", "10", "height", name)["value"] for name in ("under 1 m", "1 to 2.2 m")}
+    assert recall == {"under 1 m": 50.0, "1 to 2.2 m": 100.0}
+    assert result.row("recall", "10", "tilt", "under 3 degrees")["count"] == 2
+    score_detector(detect, scan_set(scans))
+    assert all(origin is not None for origin in origins[2:])
+    # of synthesized scenes it is known
+    made = synthetic_scan(0, 3)
+    assert made.height.endswith(("m", "more")) and "degrees" in made.tilt
