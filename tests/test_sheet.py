@@ -19,7 +19,7 @@ from lidarpose.synth import shard_job
 from lidarpose.synth.shard_job import Job, write_dataset
 from lidarpose.synth.street import street
 from lidarpose.viz import contact_sheet
-from lidarpose.viz.bird_eye import MAX_SCANS, ScanPanel, _window, draw_scans
+from lidarpose.viz.bird_eye import MAX_SCANS, ScanPanel, _window, draw_scans, label_offsets
 from lidarpose.viz.contact_sheet import _spread, draw_dataset
 
 PNG = b"\x89PNG\r\n"
@@ -201,3 +201,16 @@ def test_view_of_streets_shows_them_from_above(tmp_path, monkeypatch):
         path.unlink()
     with pytest.raises(InputError, match="holds no shard yet"):
         draw_dataset(tmp_path / "s", out=tmp_path / "s.png")
+
+
+def test_numbers_of_people_who_stand_together_do_not_cover_each_other():
+    rng = np.random.default_rng(0)
+    centers = np.concatenate([[[0.0, 0.0], [900.0, 0.0]], 300 + rng.uniform(-25, 25, (6, 2))])
+    offsets = label_offsets(centers)
+    # who is alone has it to the upper right, near
+    assert (offsets[:2] > 0).all() and (np.linalg.norm(offsets[:2], axis=1) < 16).all()
+    places = centers + offsets
+    apart = np.linalg.norm(places[:, None] - places, axis=-1) + 99 * np.eye(len(places))
+    plain = np.linalg.norm((centers + [11, 11])[:, None] - (centers + [11, 11]), axis=-1) + 99 * np.eye(len(centers))
+    assert apart.min() > 12 > plain.min()
+    assert label_offsets(np.zeros((0, 2))).shape == (0, 2)

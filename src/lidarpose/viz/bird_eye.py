@@ -19,6 +19,7 @@ from lidarpose.viz.person_view import bone_pairs, bone_sides, box_edges, finite,
 MAX_SCANS = 12
 _MAX_POINTS = 120_000  # a scan; more only cover each other at this size
 _DPI, _PANEL, _TITLE = 110, 7.6, 0.6  # inches
+_LABEL_RADII, _LABEL_SIZE = (15.0, 26.0, 38.0), 13.0  # points from a box to its number, and about what a number takes
 _MARGIN, _LEAST_SPAN = 3.0, 16.0  # m about the people, and of a view's side at least
 _BELOW, _ABOVE = 0.25, 2.5  # heights above the lowest points over which the colors run, m
 _GROUND, _HIGH, _INK, _FAINT, _BOX = "#d5d9de", "#eceff2", "#1f2328", "#7a828c", "#b3261e"
@@ -116,8 +117,10 @@ def _draw_panel(ax, panel: ScanPanel) -> None:
         ax.plot(*track[-1, :2], ls="", marker="o", ms=2.5, color=_BOX, zorder=4)
     if panel.places is not None and len(panel.places):
         ax.plot(panel.places[:, 0], panel.places[:, 1], ls="", marker="o", ms=2.5, color=_BOX, alpha=0.5, zorder=4)
-    for box in panel.boxes:
-        _draw_box(ax, box)
+    centers = np.array([box.center[:2] for box in panel.boxes]).reshape(-1, 2)
+    offsets = label_offsets(centers * 72 * (_PANEL - 0.7) / span)
+    for box, offset in zip(panel.boxes, offsets.tolist(), strict=True):
+        _draw_box(ax, box, offset)
     if is_known(panel.poses):
         skeleton = panel.poses.skeleton
         bones = panel.poses.joints.reshape(-1, len(skeleton), 3)[:, bone_pairs(skeleton), :2]
@@ -163,8 +166,23 @@ def _draw_points(ax, points: np.ndarray, ground: Ground | None) -> None:
     bar.outline.set_visible(False)
 
 
-def _draw_box(ax, box: Box) -> None:
-    """Its outline, the way it faces, and its id."""
+def label_offsets(centers: np.ndarray) -> np.ndarray:
+    """Where numbers are written, from the centers (B, 2) of their boxes, in points: away from other boxes and numbers
+    that are there already, else to the upper right."""
+    angles = np.pi / 4 * (1 + np.arange(8))
+    directions = np.stack([np.cos(angles), np.sin(angles)], -1)
+    candidates = np.concatenate([radius * directions for radius in _LABEL_RADII])
+    effort = np.repeat(np.array(_LABEL_RADII) / _LABEL_RADII[0], 8) * 0.05
+    offsets = np.zeros((len(centers), 2))
+    for i, center in enumerate(centers):
+        others = np.concatenate([np.delete(centers, i, 0), centers[:i] + offsets[:i]])
+        distance = np.linalg.norm(others[:, None] - (center + candidates), axis=-1)
+        offsets[i] = candidates[np.argmin(np.exp(-((distance / _LABEL_SIZE) ** 2)).sum(0).round(3) + effort)]
+    return offsets
+
+
+def _draw_box(ax, box: Box, offset: tuple[float, float]) -> None:
+    """Its outline, the way it faces, and its id, so many points from the center."""
     from matplotlib.collections import LineCollection
 
     ax.add_collection(LineCollection(list(box_edges(box)[..., :2]), colors=_BOX, lw=1.1, zorder=5))
@@ -172,6 +190,7 @@ def _draw_box(ax, box: Box) -> None:
     ax.annotate("", arrow_tip, box.center[:2], arrowprops={"arrowstyle": "->", "color": _BOX, "lw": 1.1}, zorder=5)
     if box.id is not None:
         ax.annotate(
-            str(box.id), box.center[:2], (9, 9), textcoords="offset points", fontsize=9, weight="bold", color=_BOX,
+            str(box.id), box.center[:2], offset, textcoords="offset points", fontsize=9, weight="bold", color=_BOX,
             zorder=7, parse_math=False, bbox={"fc": "white", "ec": "none", "alpha": 0.7, "pad": 0.8},
+            ha="center", va="center", arrowprops={"arrowstyle": "-", "color": _BOX, "lw": 0.4, "shrinkB": 6},
         )  # fmt: skip
