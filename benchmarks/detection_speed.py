@@ -6,7 +6,7 @@ Scans are files of points around a sensor at 0, 0, 0; without any, a street of t
 100,000 points, and with --million the same ten times over with 1 cm of noise. One thread. A row is a step:
 
 - detector: from points to scored places: thinning, leveling, proposals and scorer;
-- detect: `lidarpose.detect`, with the poses that verify people;
+- detect: `lidarpose.detect`, with verification and the poses of those who are found;
 - predict: `lidarpose.predict` of the ten surest people by `small` at one look, with detection.
 
 States take turns, scan by scan, each in a process of its own; cells are CPU milliseconds, the best round (the median).

@@ -81,7 +81,7 @@ def test_the_crops_are_those_that_are_verified(monkeypatch):
             )
 
     monkeypatch.setattr(verification, "_bundled", lambda name: Backend())
-    rows = verification._rows_near(detections.centers, scene.points)
+    rows = verification.rows_near(detections.centers, scene.points)
     clouds = {i: scene.points[near] for i, near in enumerate(rows)}
     verification.Crops(detections, clouds, origin).verdicts()
     assert 0 < crops.size <= len(shown)

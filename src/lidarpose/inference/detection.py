@@ -1,7 +1,7 @@
-"""`detect`: the people in a whole scan. The detector scores places where somebody may stand; the default network poses
-the best of them, and how sure it is of a pose goes into the score.
+"""`detect`: the people in a whole scan. The detector scores places where somebody may stand, the verifier says which of
+the best are people, and the default network poses these.
 
-Legend: D detections, V those that were posed.
+Legend: D detections.
 """
 
 import os

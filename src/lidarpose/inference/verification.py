@@ -87,7 +87,7 @@ def _bundled(name: str) -> Backend:
 def verification_features(detections: Detections, points: np.ndarray, origin: np.ndarray | None) -> np.ndarray:
     """What the final score of detections in points (n, 3) m, level, from a sensor at origin (3,) or None is made of:
     (D, 3) in the order of `FEATURES`, NaN of fewer than 5 points."""
-    near_rows = _rows_near(detections.centers, points)
+    near_rows = rows_near(detections.centers, points)
     return Crops(detections, dict(enumerate(points[rows] for rows in near_rows)), origin).verdicts()[0]
 
 
@@ -115,11 +115,16 @@ def surest_rows(scores: np.ndarray, pelvises: np.ndarray, logits: np.ndarray) ->
     """Of detections with scores (D,) and pelvises (D, 3) m, NaN where there is none, the rows of different people, the
     surest first; of equal scores by logits (D,)."""
     rows: list[int] = []
-    for i in np.lexsort((-logits, -scores)).tolist():
+    for i in _surest_first(scores, logits).tolist():
         is_same = (np.linalg.norm(pelvises[rows] - pelvises[i], axis=1) < _SAME_PERSON).any()
         if not is_same and not np.isnan(pelvises[i]).any():
             rows.append(i)
     return rows
+
+
+def _surest_first(scores: np.ndarray, logits: np.ndarray) -> np.ndarray:
+    """(D,): rows by falling score, of equal ones by logits."""
+    return np.lexsort((-logits, -scores))
 
 
 def inside_column(points: np.ndarray, center: np.ndarray, size: np.ndarray) -> np.ndarray:
@@ -212,7 +217,7 @@ def verified(
         known_index = _expected(detections, highest_scores >= least_score, known)
         thresholds = _least_scores(detections, known_index, least_score, known)
     possible_rows = np.flatnonzero(highest_scores >= thresholds)
-    near_rows = dict(zip(possible_rows.tolist(), _rows_near(detections.centers[possible_rows], points), strict=True))
+    near_rows = dict(zip(possible_rows.tolist(), rows_near(detections.centers[possible_rows], points), strict=True))
     new_rows = possible_rows[known_index[possible_rows] < 0]
     crops = Crops(detections, {i: points[near_rows[i]] for i in new_rows.tolist()}, origin)
     features, mounted = crops.verdicts()
@@ -220,7 +225,7 @@ def verified(
     logits = final_logit(features, header)
     posed_rows = new_rows[scores[new_rows] >= thresholds[new_rows]]
     if max_people is not None:
-        posed_rows = posed_rows[np.lexsort((-logits[posed_rows], -scores[posed_rows]))][: _PLACES * max_people]
+        posed_rows = posed_rows[_surest_first(scores[posed_rows], logits[posed_rows])][: _PLACES * max_people]
     poses = crops.poses(posed_rows)
     pelvises = poses.joints[:, poses.skeleton.index("pelvis")].copy()
     rejected = detections.centers[new_rows][scores[new_rows] < _NOBODY * least_score]
@@ -313,7 +318,7 @@ def rounded(box: Box) -> Box:
     return replace(box, center=center, size=size, yaw=round(box.yaw, _DECIMALS))
 
 
-def _rows_near(centers: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
+def rows_near(centers: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
     """Of each center the rows (k,) of the points (n, 3) m about it, ascending."""
     strips, rows = Strips(points[:, 0]), []
     for x, y in centers[:, :2]:

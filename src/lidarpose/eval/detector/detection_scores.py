@@ -177,7 +177,7 @@ def score_detector(
         detect: see `Detect`; its boxes should come with all scores, low ones too.
         max_range: people farther from the sensor, m, are neither wanted nor false.
         default_score: also an operating point, "default".
-        sensor_unknown: where the sensor is is not told.
+        sensor_unknown: the sensor's position is hidden.
         predictor: poses matched people in found and in labeled boxes, where joints are known.
         seed: of the intervals.
     """

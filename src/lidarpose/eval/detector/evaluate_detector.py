@@ -91,7 +91,7 @@ def run_detector(
         max_range: m, people farther away do not count.
         network: whose poses in found boxes are compared with those in labeled boxes; None leaves this out.
         limit: so many scans of each set, evenly spread.
-        sensor_unknown: where the sensor is is not told, so that people at any distance are looked for.
+        sensor_unknown: the sensor's position is hidden, so that people at any distance are looked for.
     """
     check_name("method", method, METHODS)
     if limit is not None:

@@ -22,7 +22,7 @@ from lidarpose.sample import Box
 
 HELDOUT = "heldout"
 _HELDOUT_FILE = "detector-heldout-1.json"
-# between what heights of sensors, m, and tilts, degrees, figures are told apart
+# edges of the groups of sensors by height, m, and by tilt, degrees
 _HEIGHTS, _TILTS = (1.0, 2.2), (3.0, 10.0)
 # what labels call people on foot, and people with wheels; other things, as strollers and dogs, are no people
 _ON_FOOT = ("pedestrian", "person", "people", "signaler", "human", "adult", "child")

@@ -7,6 +7,7 @@ as after `--resume`, makes it again.
 Legend: K candidates, P people of a scan.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Generic, TypeVar
@@ -108,7 +109,7 @@ def moved(labels: Labels, augmentation: Augmentation) -> Labels:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneSource(Generic[Scan]):
+class SceneSource(ABC, Generic[Scan]):
     """Each scene of `detection_scene` of a seed `uses` times, `lag` scenes between two times.
 
     Scene j is example uses * j the first time. Where no scene is old enough yet, a younger one stands in.
@@ -118,13 +119,13 @@ class SceneSource(Generic[Scan]):
     uses: int
     lag: int
 
+    @abstractmethod
     def made(self, number: int) -> Scan:
         """What is learned from in a scene."""
-        raise NotImplementedError
 
+    @abstractmethod
     def shown(self, scan: Scan, rng: np.random.Generator) -> Scan:
         """An example of it, drawn anew."""
-        raise NotImplementedError
 
     def __getstate__(self) -> dict:
         return {name: value for name, value in vars(self).items() if name != "_kept"}

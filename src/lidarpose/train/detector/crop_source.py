@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarpose.inference.detection import MAX_RANGE, MOST_POSED
 from lidarpose.inference.tta import IDENTITY, apply
-from lidarpose.inference.verification import inside_column
+from lidarpose.inference.verification import inside_column, rows_near
 from lidarpose.models.detector.detector import Detector
 from lidarpose.sample import MIN_POINTS
 from lidarpose.train.detector.candidate_source import NOBODY, UNCLEAR, SceneSource, scene_to_search
@@ -81,8 +81,9 @@ def scan_crops(seed: int, number: int, *, family: str = "train") -> CropExample:
     centers = np.array([scene.boxes[row].center[:2] for row in visible_people]).reshape(-1, 2)
     rng = np.random.default_rng([seed, number])
     clouds, kept_centers, person, num_others = [], [], [], []
-    for center, size in zip(detections.centers, detections.sizes, strict=True):
-        rows = np.flatnonzero(inside_column(scene.points, center, size))
+    near_rows = rows_near(detections.centers, scene.points)
+    for center, size, near in zip(detections.centers, detections.sizes, near_rows, strict=True):
+        rows = near[inside_column(scene.points[near], center, size)]
         if len(rows) < MIN_POINTS:
             continue
         label = _label(np.hypot(*(centers - center[:2]).T), visible_people, scene.person[rows])
