@@ -16,11 +16,12 @@ from lidarpose.models.baselines.point_transformer_v2 import GroupedVectorAttenti
 from lidarpose.models.baselines.prn import BareAttention
 from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
 from lidarpose.models.voxelize import view_features
+from lidarpose.sample import SEEN, LabeledSample, Pose
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
-from lidarpose.train.augment import Example
+from lidarpose.train.augment import AUGMENTATIONS, Example, augmented
 from lidarpose.train.data_loader import SyntheticSource
 from lidarpose.train.networks import PRETRAINED, _with_options, networks
-from lidarpose.train.objectives.baseline_objective import BaselineObjective, point_labels, with_joints
+from lidarpose.train.objectives.baseline_objective import LABEL_RADIUS, BaselineObjective, point_labels, with_joints
 from lidarpose.train.objectives.dapt_objective import DaptObjective
 from lidarpose.train.objectives.objective import total
 from lidarpose.train.recipes import Finetune, Pretrain, recipe
@@ -156,6 +157,32 @@ def test_distances_are_divided_by_all_joints_where_that_is_asked_for():
     labels = np.isfinite(arrays["joints"]).all(-1)
     assert 0 < labels.mean() < 1
     torch.testing.assert_close(terms[True], terms[False] * labels.mean(), rtol=1e-5, atol=0, check_dtype=False)
+
+
+def test_parts_and_offsets_are_those_before_scaling_where_that_is_asked_for():
+    one = person(300)
+    visible = np.ones(26, np.float32)
+    sample = LabeledSample(
+        points=one.points.astype(np.float32),
+        part=np.full(300, -1, np.int16),
+        pose=Pose(joints=one.joints, visible=visible, skeleton=BODY26),
+        joint_labels=np.full(26, SEEN, np.uint8),
+        center=np.zeros(3),
+    )
+    shown = augmented(sample, AUGMENTATIONS["lidarhmr"], np.random.default_rng(2))
+    assert abs(shown.scale - 1) > 0.05
+    labels = {}
+    for before in (False, True):
+        objective = BaselineObjective(config=replace(PRN, labels_before_scaling=before))
+        arrays = {name: torch.as_tensor(array) for name, array in objective.collate([shown]).items()}
+        known = arrays["joints"].isfinite().all(-1)
+        labels[before] = point_labels(arrays["points"], arrays["valid"], arrays["joints"], known, arrays["scale"])
+    # in the frame before: the radius and the offsets are of another size, and the nearest joint is the same
+    torch.testing.assert_close(labels[True][1] * shown.scale, labels[False][1], rtol=1e-4, atol=1e-6)
+    distance = labels[True][1].norm(dim=-1)
+    is_body = labels[True][0] < len(PRN.joints)
+    assert (distance[is_body] < LABEL_RADIUS).all() and (distance[~is_body] >= LABEL_RADIUS).all()
+    assert is_body.any() and (labels[True][0] != labels[False][0]).any()
 
 
 # ---- fast paths

@@ -46,7 +46,8 @@ class Example:
     points (n, 3) float32 m; part (n,) int: 0 = background, 1 + j = the bone of SMPL-24's joint j, -1 = unknown; joints
     (26, 3) float32 m of body26, NaN where there is no label; visible (26,) float32: 1 seen, 0 not, NaN not known;
     view (5,): `voxelize.view_features`; seed: of what is drawn when the example is collated; person (2,) float32:
-    whether somebody is there, and a second one besides, 1, 0 or NaN as of joints.
+    whether somebody is there, and a second one besides, 1, 0 or NaN as of joints; scale: by which the augmentation
+    multiplied all lengths.
     """
 
     points: np.ndarray
@@ -56,6 +57,7 @@ class Example:
     view: np.ndarray
     seed: int
     person: np.ndarray = field(default_factory=lambda: np.full(2, np.nan, np.float32))
+    scale: float = 1.0
 
     @property
     def frames(self) -> tuple["Example", ...]:
@@ -189,7 +191,9 @@ def augmented(sample: LabeledSample, kind: Augmentation, rng: np.random.Generato
     part, visible = part_and_visible(sample)
     points, joints = sample.points - center, sample.joints - center
     yaw = rng.uniform(-kind.angle, kind.angle)
-    R = rotation_about("z", yaw if rng.random() < kind.turn else 0.0) * (1 + kind.scale * rng.uniform(-1, 1))
+    R = rotation_about("z", yaw if rng.random() < kind.turn else 0.0)
+    scale = 1 + kind.scale * rng.uniform(-1, 1)
+    R = R * scale
     is_mirrored = rng.random(2) < kind.flip
     R = np.diag([*np.where(is_mirrored, -1.0, 1.0), 1.0]) @ R
     if is_mirrored.sum() == 1:
@@ -204,7 +208,7 @@ def augmented(sample: LabeledSample, kind: Augmentation, rng: np.random.Generato
         points = jitter(points, sigma=kind.jitter, clip=4 * kind.jitter, rng=rng)
     if rng.random() < kind.strays:
         points, part = _with_clutter(points, part, np.zeros(3), _CLUTTER, rng)
-    return _example(rng, points, joints, part=part, visible=visible, view=view)
+    return replace(_example(rng, points, joints, part=part, visible=visible, view=view), scale=scale)
 
 
 def clip_example(

@@ -41,13 +41,16 @@ class BaselineObjective:
         return build(self.config)
 
     def collate(self, examples: list[Example]) -> dict[str, np.ndarray]:
-        """The arrays of `pad_clouds`; joints (B, J, 3) float32 m about the middle, NaN without a label; shift (B,)."""
+        """The arrays of `pad_clouds`; joints (B, J, 3) float32 m about the middle, NaN without a label; shift (B,);
+        scale (B,): 1, or with `labels_before_scaling` by what the person was scaled."""
         seeds = [example.seed for example in examples]
         view = np.stack([example.view for example in examples])
         arrays = pad_clouds([example.points for example in examples], view, self.config, seeds)
         joints = np.stack([example.joints for example in examples])[:, self.config.columns]
         shift = [np.random.default_rng([seed, 1]).uniform(-self.shift, self.shift) for seed in seeds]
-        return arrays | {"joints": joints - arrays["middle"][:, None], "shift": np.array(shift, np.float32)}
+        scale = [example.scale if self.config.labels_before_scaling else 1.0 for example in examples]
+        numbers = {"shift": np.array(shift, np.float32), "scale": np.array(scale, np.float32)}
+        return arrays | {"joints": joints - arrays["middle"][:, None]} | numbers
 
     def terms(
         self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
@@ -59,7 +62,8 @@ class BaselineObjective:
         is_labeled = tensors["joints"].isfinite().all(-1)
         joints = torch.where(is_labeled[..., None], tensors["joints"] + shift, 0)
         outputs = network(points, valid, tensors["center"])
-        terms = frame_losses(self.config, outputs, points, valid, joints, is_labeled, share)
+        labels = point_labels(points, valid, joints, is_labeled, tensors["scale"])
+        terms = frame_losses(self.config, outputs, valid, joints, is_labeled, labels, share)
         return terms | {"mpjpe": mean_distance(outputs.joints.detach(), joints, is_labeled, share)}
 
     @torch.no_grad()
@@ -116,12 +120,16 @@ class ClipObjective:
 # ---- losses
 
 
-def point_labels(points: Tensor, valid: Tensor, joints: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+def point_labels(
+    points: Tensor, valid: Tensor, joints: Tensor, known: Tensor, scale: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Labels (B, N): the number of the nearest joint with a label, J for background, -1 for padding; and the offsets
     (B, N, 3) m from the points to those joints.
 
-    joints (B, J, 3) m, known (B, J).
+    joints (B, J, 3) m, known (B, J); scale (B,): by which people were scaled, if they are labeled as they were before.
     """
+    if scale is not None:
+        points, joints = points / scale[:, None, None], joints / scale[:, None, None]
     distance = torch.cdist(points, joints).masked_fill(~known[:, None], torch.inf)
     nearest, joint = distance.min(-1)
     offsets = joints.gather(1, joint[..., None].expand(-1, -1, 3)) - points
@@ -132,14 +140,17 @@ def point_labels(points: Tensor, valid: Tensor, joints: Tensor, known: Tensor) -
 def frame_losses(
     config: PrnConfig | LpformerConfig,
     outputs: PrnOutputs | LpformerOutputs,
-    points: Tensor,
     valid: Tensor,
     joints: Tensor,
     known: Tensor,
+    labels: tuple[Tensor, Tensor],
     share: Share,
 ) -> dict[str, Tensor]:
-    """Distances of joints and cross entropy of parts; of PRN also distances of voted joints and of points' offsets."""
-    label, offset = point_labels(points, valid, joints, known)
+    """Distances of joints and cross entropy of parts; of PRN also distances of voted joints and of points' offsets.
+
+    labels: see `point_labels`.
+    """
+    label, offset = labels
     label, distance = label[valid], mean_distance(outputs.joints, joints, known, share)
     if isinstance(outputs, LpformerOutputs):
         assert isinstance(config, LpformerConfig)
