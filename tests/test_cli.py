@@ -23,7 +23,7 @@ from lidarpose import progress
 from lidarpose.cli import demo, main
 from lidarpose.errors import InputError
 from lidarpose.inference import predictor
-from lidarpose.models import BUNDLED, DEFAULT, bundled_path
+from lidarpose.models import BUNDLED, DEFAULT, bundled_path, weights_file
 from lidarpose.models.checkpoint import DIGEST, SafetensorsFile
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
@@ -421,6 +421,12 @@ BAD_COMMANDS = {
     "import as": ("import DAPT DIR/x.safetensors --config kitti", "waymo"),
     "import into another kind": ("import DAPT DIR/x.onnx", "give a name that ends in .safetensors"),
     "import without an out": ("import DAPT", "OUT"),
+    "a calibration of no boxes": ("predict CROP --calib DIR/c.txt", "calib is for boxes"),
+    "weights that pose nobody": (f"predict CROP --weights {weights_file('verifier.onnx')}", "poses nobody"),
+    "a checkpoint for a detector": (
+        f"evaluate detector heldout --detector {weights_file('detector.safetensors')} --out DIR/x",
+        "expected an ONNX file, got a checkpoint",
+    ),
     "unknown option": ("predict CROP --picure", "--picure"),
     "demo seed": ("demo --seed -1 --out DIR/d", "seed"),
     "demo weights": ("demo --weights tyni --out DIR/d", "did you mean tiny"),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lidarpose.models.detector.detector import Detector
+from lidarpose.models.detector.detector import SAME, Detector
 from lidarpose.synth.street import street
 from tests.test_proposals import column, nearest, plane
 
@@ -61,7 +61,7 @@ def test_two_who_touch_are_two_and_nobody_is_two(points):
         for cloud in (pair, points):
             places = Detector(scorer).detect(cloud, ORIGIN).centers[:, :2]
             gaps = np.linalg.norm(places[:, None] - places, axis=-1)
-            assert (gaps[~np.eye(len(gaps), dtype=bool)] >= 0.25).all()
+            assert (gaps[~np.eye(len(gaps), dtype=bool)] >= SAME).all()
 
 
 def test_a_scan_that_is_turned_or_unlocated_holds_the_same_people(points):

@@ -424,7 +424,7 @@ def test_a_damaged_shard_is_skipped_counted_and_named(copy):
     result = evaluated(copy.parent, "humanm3").result
     assert result.counts["people"] == 8
     assert result.skipped["damaged shards"]["count"] == 1 and first.name in result.skipped["damaged shards"]["first"]
-    for paths, words in (([second], "nobody in test or val"), (shards, "none of the 3 shards")):
+    for paths, words in (([second], "perhaps those of the split test"), (shards, "none of the 3 shards")):
         for path in paths:
             path.write_bytes(b"PAR1")
         with pytest.raises(InputError, match=words):

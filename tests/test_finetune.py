@@ -21,6 +21,7 @@ from lidarpose.data.shards import open_dataset, shard_path
 from lidarpose.errors import InputError
 from lidarpose.eval.dataset import open_eval_dataset
 from lidarpose.inference.predictor import load
+from lidarpose.models import weights_file
 from lidarpose.models.checkpoint import load_checkpoint, read_header
 from lidarpose.sample import SEEN, UNLABELED, Box, LabeledSample, Pose, center_of
 from lidarpose.skeleton import BODY26, HUMAN15, skeleton
@@ -38,6 +39,7 @@ from lidarpose.train.augment import (
     seen,
 )
 from lidarpose.train.data_loader import MixedSource, StoredSource, SyntheticSource
+from lidarpose.train.networks import PRETRAINED, expanded_network, initial_network
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.setup import make_setup
 from lidarpose.train.torch_dataset import InMemoryDataset
@@ -519,3 +521,11 @@ def test_points_are_jittered_lost_and_added():
     assert len(clutter.points) > 500 and len(clutter.points) == len(clutter.part) and not clutter.part[500:].any()
     # 400 of 500, drawn one by one
     assert len(lost.points) == len(lost.part) and 370 < len(lost.points) < 430
+
+
+def test_weights_that_pose_nobody_are_no_beginning():
+    for name in ("verifier", "detector"):
+        with pytest.raises(InputError, match=f"holds the network {name}, which poses nobody"):
+            initial_network(Finetune(data=("any",), init=str(weights_file(f"{name}.safetensors"))))
+        with pytest.raises(InputError, match=f"holds the network {name}: --init names one of the package's own"):
+            expanded_network(str(weights_file(f"{name}.safetensors")), PRETRAINED["tiny"][0])

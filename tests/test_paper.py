@@ -161,11 +161,16 @@ def test_rows_have_names_of_their_own_and_every_cell_a_command_or_a_reason(name)
 def data(tmp_path):
     """Real sets and a corpus by name, as far as options look at them."""
     folders = {name: tmp_path / name for name in (*REAL, "lipd", "freemotion", "noisemotion")}
-    for folder in folders.values():
+    for name, folder in folders.items():
         folder.mkdir()
-        (folder / "dataset.json").write_text("{}")
+        (folder / "dataset.json").write_text(json.dumps({"settings": {"dataset": name}}))
     poses = {name: "raw" for name in ("freemotion-poses", "lidarhuman26m-poses")}
     return {name: str(folder) for name, folder in folders.items()} | poses
+
+
+def test_a_set_of_another_name_is_not_taken_for_a_real_one(data):
+    with pytest.raises(InputError, match=r"--data waymo=.*: expected waymo as prepared, got humanm3"):
+        Options(data=data | {"waymo": data["humanm3"]})
 
 
 def test_the_published_figures_are_those_of_the_published_table(data):
@@ -234,7 +239,8 @@ def test_poses_of_lidarhuman26m_s_test_sequences_are_not_learned_from(tmp_path, 
     raw = tmp_path / "raw"
     write_lidarhuman26m(raw, smpl, sequences=("5", "7", "24", "8"))
     options = Options(data=data | {"lidarhuman26m-poses": str(raw)}, size="paper")
-    for table, row in (("table1", "dapt"), ("table1", "ours"), ("table2", "lidarh26m"), ("table4", "pre-training")):
+    rows = ("table1", "dapt"), ("table1", "ours"), ("table2", "lidarh26m-poses"), ("table4", "pre-training")
+    for table, row in rows:
         first = cells(TABLES[table], options, [row])[0].training[0]
         words = first.command(tmp_path)
         subjects = words[words.index("--subjects") + 1].split(",")
@@ -302,6 +308,7 @@ def test_a_plan_runs_nothing(tmp_path, monkeypatch, capsys):
         (["table1", "--data", "wymo=x"], "unknown dataset 'wymo'"),
         (["table1", "--data", "waymo=nowhere"], "is no prepared dataset"),
         (["table1", "--data", "freemotion-poses=x"], "needs a dataset to score on"),
+        (["fig6", "--rows", "dapt"], "fig6 has no rows"),
         (["table1", "--held-out", "2"], "--motion"),
         (["table1", "--out", "file"], "name another by --out"),
     ],

@@ -202,6 +202,15 @@ def test_most_of_a_wall_is_no_candidate_and_who_stands_before_it_is():
     assert nearest(centers, 5.5, 3) < 0.3
 
 
+@pytest.mark.parametrize("gap", [0.5, 0.55, 0.6, 0.65])
+def test_everybody_in_a_row_is_a_candidate(gap):
+    """People abreast look like a wall from afar."""
+    places = gap * np.arange(-2, 3)
+    points = np.concatenate([plane(), *[column(10, y, seed=k) for k, y in enumerate(places)]])
+    centers = propose(points, estimate_ground(points, ORIGIN))
+    assert max(nearest(centers, 10, y) for y in places) < 0.15
+
+
 def test_bare_ground_and_nothing_have_no_candidates():
     points = plane()
     ground = estimate_ground(points, ORIGIN)

@@ -1,9 +1,16 @@
 """The command line: `lidarpose COMMAND`, also `python -m lidarpose`."""
 
+import sys
+
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command. Returns 0, or 2 after one line on stderr where the input is at fault."""
-    # here, so that a module of one command is imported without those of all others
-    from lidarpose.cli.command_line import run
+    try:
+        # here, so that a module of one command is imported without those of all others
+        from lidarpose.cli.command_line import run
 
-    return run(arguments)
+        return run(arguments)
+    except KeyboardInterrupt:
+        # before the command runs, which says more
+        sys.stderr.write("lidarpose: stopped\n")
+        return 130

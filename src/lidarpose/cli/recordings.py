@@ -11,7 +11,7 @@ from typing import Any
 from lidarpose._version import __version__
 from lidarpose.cli.predicting import output_paths, prediction_options
 from lidarpose.cli.terminal import add_options, option_names, tell
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, counted
 
 _FRAMES = """
 [folders and recordings]
@@ -109,7 +109,7 @@ def _predict_recording(
         write_atomic(picture, tracks_picture.draw(source, steps.wanted, title=Path(source.name).name))
     if frames_page is not None and page is not None:
         write_atomic(page, frames_page.render(source, steps.wanted, title=Path(source.name).name))
-    _report(source, steps, summary, f" -> {' and '.join(str(path) for path in (result, picture, page) if path)}")
+    _report(options, source, summary, f" -> {' and '.join(str(path) for path in (result, picture, page) if path)}")
 
 
 def _print_lines(options: argparse.Namespace, source, steps) -> None:
@@ -119,20 +119,27 @@ def _print_lines(options: argparse.Namespace, source, steps) -> None:
 
     if steps.is_tracked and not steps.live:
         raise InputError("--out - prints frames as they come: say --live, which needs no later frames, or name a file")
+    if options.format not in (None, "jsonl"):
+        raise InputError(f"--out - prints lines of JSON, not {options.format}: name a file")
     summary = Summary()
     for frame in steps.predict_all(source.frames()):
         line = frame.to_dict()
         line = in_world(line, steps.up) if options.world else line
         summary.add(line)
         print(json.dumps(line), flush=True)
-    _report(source, steps, summary)
+    _report(options, source, summary)
 
 
-def _report(source, steps, summary, outputs: str = "") -> None:
+def _report(options: argparse.Namespace, source, summary, outputs: str = "") -> None:
     source_warnings = [f"{source.name}: {line}" for line in source.warnings]
+    if options.world and (num_others := summary.frames - summary.in_world):
+        source_warnings.append(
+            f"of {num_others:,} of {counted(summary.frames, 'frame')} the sensor's place in the world is not known: "
+            "joints are in the sensor's frame there"
+        )
     for line in [*source_warnings, *summary.warning_lines(_MOST_WARNINGS)]:
         tell(f"lidarpose: warning: {line}")
-    tell(summary.text(steps.is_tracked) + outputs)
+    tell(summary.text(options.track or options.live) + outputs)
 
 
 def _command(options: argparse.Namespace) -> dict[str, Any]:

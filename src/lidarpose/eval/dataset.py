@@ -169,6 +169,10 @@ def _open_folder(folder: Path, split: str | None, limit: int | None) -> EvalData
     splits = sorted(rows["split"].dropna().unique())
     if split is None:
         split = next((name for name in _DEFAULT_SPLITS if name in splits), EVERYBODY)
+        if splits and split != _DEFAULT_SPLITS[0] and damaged_shards:
+            (entry,) = damaged_shards.values()
+            problem = f"of its {card.shards} shards {entry['count']} cannot be read, perhaps those of the split test"
+            raise file_error(folder, f"{problem}; the first: {entry['first']}; or say split NAME")
         if split == EVERYBODY and splits:
             raise file_error(folder, f"has nobody in test or val, only in {', '.join(splits)}: say split NAME")
     people = rows if split == EVERYBODY else rows[rows["split"] == split]

@@ -114,7 +114,7 @@ def exported_beside(path: str | os.PathLike, *, threads: int | None = None) -> O
     path = Path(path)
     header = read_header(path)
     if header.network != "pose":
-        raise file_error(path, "a network of the paper does not run as ONNX: leave backend away, or say torch")
+        raise file_error(path, f"the network {header.network} does not run as ONNX: leave backend away, or say torch")
     onnx_path = path.with_suffix(".onnx")
     hint = f"make it with `lidarpose export {path} --out {onnx_path}`, or use backend torch"
     if not onnx_path.is_file():

@@ -67,7 +67,7 @@ def predict(
         InputError: one line that says what to do.
     """
     options = (min_score, max_range, max_people, background)
-    check_choice(boxes, crop, find or any(option is not None for option in options))
+    check_choice(boxes, crop, find or any(option is not None for option in options), calib)
     start = time.perf_counter()
     input_boxes = None if boxes is None else read_boxes(boxes, calib=calib)
     if up is None:
@@ -135,8 +135,10 @@ def is_wide(scan: Scan) -> bool:
     return bool(np.ptp(upright_points, axis=0).max() >= CROP_SIZE)
 
 
-def check_choice(boxes: object, crop: bool, searched: bool) -> None:
-    """Raises InputError where it is said in two ways who is in the file."""
+def check_choice(boxes: object, crop: bool, searched: bool, calib: object) -> None:
+    """Raises InputError where it is said in two ways who is in the file, and for a calibration of no boxes."""
+    if calib is not None and boxes is None:
+        raise InputError("calib is for boxes that are a KITTI label: expected boxes too, got none: name the label")
     if boxes is not None and crop:
         raise InputError("expected boxes or a crop, got both: a crop is one person already, so leave the boxes away")
     if searched and (boxes is not None or crop):

@@ -107,6 +107,8 @@ def load(
         network_backend = OnnxBackend(path if is_exported else path.with_suffix(".onnx"), threads=threads)
     else:
         network_backend = exported_beside(path, threads=threads)
+    if not network_backend.header.config.poses:
+        raise file_error(path, "holds a network that poses nobody: name weights of a pose network")
     return Predictor(network_backend, name=path.stem, decode=decode, tta=tta)
 
 

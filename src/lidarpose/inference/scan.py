@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidarpose.geometry import rotation_from_up, rotation_of_boxes, upright_axis
-from lidarpose.inference.checks import check_scan, origin_warning, rows_inside, unit_warning
+from lidarpose.inference.checks import check_scan, origin_warning, rounding_warning, rows_inside, unit_warning
 from lidarpose.inference.inputs import as_points, only_returns
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.io.files import file_error
@@ -99,13 +99,18 @@ def read_scan(scan: Scan, points: str | os.PathLike | ArrayLike, columns: int | 
     file without any."""
     if not isinstance(points, str | os.PathLike):
         returns, notes = only_returns(as_points(points))
-        return replace(scan, points=returns, warnings=tuple(notes))
+        return replace(scan, points=returns, warnings=(*notes, *_rounding(returns)))
     cloud = read_points(points, columns=columns)
     returns, notes = only_returns(cloud.points)
     if not len(returns):
         problem = f"none within {FARTHEST:g} m" if cloud.points.any() else "only 0,0,0, which are no returns"
         raise file_error(points, f"expected points in meters, got {problem}: export it again")
-    return replace(scan, points=returns, warnings=(*cloud.warnings, *notes), source=os.fsdecode(points))
+    warnings = (*cloud.warnings, *notes, *_rounding(returns))
+    return replace(scan, points=returns, warnings=warnings, source=os.fsdecode(points))
+
+
+def _rounding(points: np.ndarray) -> tuple[str, ...]:
+    return tuple(filter(None, [rounding_warning(points)]))
 
 
 def pose_scan(scan: Scan, predictor: Predictor, *, skeleton: str | None = None, progress: bool = False) -> Poses:

@@ -32,7 +32,7 @@ _SAME_PERSON = 0.3
 # places that are posed for each person that is asked for at most: some are the same person
 _PLACES = 2
 # so is who shares more than this with surer people, of the points in the box
-_SHARED = 0.75
+_SHARED = 0.9
 # what the final score is made of, by detection: the scorer's logit; the verifier's log odds of a person; log of 1 + the
 # points of the column
 FEATURES = ("logit", "verifier", "log_points")

@@ -6,6 +6,7 @@ from dataclasses import MISSING, Field, asdict, dataclass, field, fields
 from typing import Any, ClassVar, get_args
 
 from lidarpose.errors import InputError, check_int, check_name
+from lidarpose.models import VERIFIER
 from lidarpose.skeleton import BODY26, skeleton
 
 # heatmaps in a window about each joint's vote; over the whole person, as the paper's; or votes alone
@@ -45,6 +46,11 @@ class Config:
     numbers above 0 (see `probability`), true or false; lists become tuples. Raises InputError for anything else."""
 
     kind: ClassVar[str] = ""
+
+    @property
+    def poses(self) -> bool:
+        """Whether it predicts joints."""
+        return bool(getattr(self, "joints", ()))
 
     def __post_init__(self):
         for f in fields(self):
@@ -125,6 +131,11 @@ class NetworkConfig(Config):
     @property
     def name(self) -> str:
         return self.size
+
+    @property
+    def poses(self) -> bool:
+        """Whether it learned to predict joints."""
+        return self.size != VERIFIER
 
     @property
     def joints(self) -> tuple[str, ...]:

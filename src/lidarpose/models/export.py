@@ -60,7 +60,7 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
         return
     if not isinstance(network, PoseNet):
         raise InputError(
-            f"{os.fspath(weights)}: a network of the paper ({network.config.name}) is not offered as {format}: "
+            f"{os.fspath(weights)}: the network {network.config.name} is not offered as {format}: "
             "it runs with torch, and the package's own networks (tiny, small, base) are exported"
         )
     # tracing takes a minute

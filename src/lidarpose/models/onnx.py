@@ -103,6 +103,9 @@ def open_network(path: str | os.PathLike, *, threads: int | None = None) -> tupl
     if _EXTERNAL in content:
         # they would be looked up in the current folder, whatever lies there
         raise file_error(path, "keeps its weights in other files: make one file of it with `lidarpose export`")
+    # a checkpoint begins with the length of its header in JSON
+    if content[8:9] == b"{":
+        raise file_error(path, "expected an ONNX file, got a checkpoint: make one of it with `lidarpose export`")
     has_digest = check_digest(path, content)
     # what is wrong with it is not the file's fault
     _runtime()

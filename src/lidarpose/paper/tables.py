@@ -5,6 +5,7 @@ scene `paper` (one simulated LiDAR), a target of the scene `wild` of another see
 method learns the same people and is scored on the same others.
 """
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -70,8 +71,8 @@ class Options:
         check_name("size of the paper's network", self.size, MODELS["dapt"])
         for name, folder in self.data.items():
             check_name("dataset", name, (*REAL, *CORPORA, *POSES, SMPL))
-            if name not in (*POSES, SMPL) and not (Path(folder) / CARD).is_file():
-                raise InputError(f"{name}={folder} is no prepared dataset: run lidarpose prepare first")
+            if name not in (*POSES, SMPL):
+                _check_prepared(name, folder)
         if (self.subjects or self.held_out) and not self.motion:
             raise InputError("--subjects and --held-out are of captured motion: name its file by --motion")
         if self.data and not self.real:
@@ -155,9 +156,20 @@ class Row:
         return "--recipe" in self.finetune and not _NO_HEATMAPS & set(self.finetune)
 
 
+def _check_prepared(name: str, folder: str) -> None:
+    """Raises InputError unless a folder holds this dataset as prepared."""
+    try:
+        content = json.loads((Path(folder) / CARD).read_bytes())["settings"].get("dataset", "synthetic people")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        raise InputError(f"{name}={folder} is no prepared dataset: run lidarpose prepare first") from None
+    if content != name:
+        raise InputError(f"--data {name}={folder}: expected {name} as prepared, got {content}: name its own folder")
+
+
 def row_key(name: str) -> str:
-    """A row's name as --rows has it."""
-    return "-".join("".join(c if c.isalnum() or c == "." else " " for c in name.lower()).split())
+    """A row's name as --rows has it; of a corpus synthesized of poses alone (a dagger) it ends in -poses."""
+    name = name.lower().replace("†", " poses")
+    return "-".join("".join(c if c.isalnum() or c == "." else " " for c in name).split())
 
 
 def cells(table: Table, options: Options, chosen: Sequence[str] = ()) -> list[Cell]:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from lidarpose.errors import counted
 from lidarpose.io.files import check_writable, file_error
@@ -22,6 +22,12 @@ from lidarpose.recording.coordinates import in_world
 from lidarpose.recording.predict_recording import FramePoses, FramePredictor
 from lidarpose.recording.result_files import check_format, write_result
 from lidarpose.recording.steady_tracks import steadied
+
+try:
+    import fcntl
+except ImportError:
+    # Windows has none
+    fcntl = None  # type: ignore[assignment]
 
 
 class PartFile:
@@ -44,8 +50,12 @@ class PartFile:
         self.other: list[str] = []
         check_writable(self.path)
         self.path.parent.mkdir(parents=True, exist_ok=True)
+        # neither emptied nor read before it is this process's own
+        self._file = os.fdopen(os.open(self.path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)), "r+b")
+        if not _is_locked(self._file):
+            self._file.close()
+            raise file_error(self.path, "another lidarpose writes it: wait for its end, or choose another --out")
         size = self._read()
-        self._file = open(self.path, "r+b" if size else "wb")  # noqa: SIM115
         self._file.truncate(size)
         self._file.seek(size)
 
@@ -93,20 +103,41 @@ class PartFile:
             yield from map(json.loads, file)
 
     def remove(self) -> None:
-        self._file.close()
-        for path in (self.path, self.state_path):
+        # while it is locked: after it is closed, another process may have begun
+        for path in (self.state_path, self.path):
             with suppress(OSError):
                 path.unlink()
+        self._file.close()
+        if fcntl is None:
+            # Windows does not let go of a file that is open
+            with suppress(OSError):
+                self.path.unlink()
+
+
+def _is_locked(file: BinaryIO) -> bool:
+    """Whether the file is this process's until it is closed; True too where a system or a disk knows no locks."""
+    if fcntl is None:
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass
+    # whoever held it may have removed it in between
+    return os.fstat(file.fileno()).st_nlink > 0
 
 
 @dataclass
 class Summary:
-    """What a recording holds: counts, and of the warnings of frames and people an example and in how many frames; those
-    that differ in numbers alone are one."""
+    """What a recording holds: counts, of frames also how many are in the world's frame, and of the warnings of
+    frames and people an example and in how many frames; those that differ in numbers alone are one.
+    """
 
     frames: int = 0
     people: int = 0
     damaged: int = 0
+    in_world: int = 0
     tracks: set[int] = field(default_factory=set)
     first_error: str | None = None
     warnings: dict[str, str] = field(default_factory=dict)
@@ -115,10 +146,12 @@ class Summary:
     def add(self, line: dict[str, Any]) -> None:
         self.frames += 1
         self.people += len(line["people"])
+        self.in_world += line.get("coordinates") == "world"
         self.tracks.update(person["track"] for person in line["people"] if person["track"] is not None)
         if line["error"] is not None:
             self.damaged += 1
-            self.first_error = self.first_error or f"frame {line['frame']} ({line['id']}): {line['error']}"
+            name = f" ({line['id']})" if line["id"] else ""
+            self.first_error = self.first_error or f"frame {line['frame']}{name}: {line['error']}"
         kinds = {}
         for text in (text for person in (line, *line["people"]) for text in person["warnings"]):
             kinds[re.sub(r"(-?[\d.,]+)+", "0", text)] = text
@@ -174,6 +207,10 @@ def write_recording(
         if not part.frames:
             part.remove()
             raise file_error(source.name, "has no frames between start and end: choose others")
+        if not any(line["error"] is None for line in part.lines()):
+            error = next(part.lines())["error"]
+            part.remove()
+            raise file_error(source.name, f"of {counted(part.frames, 'frame')} none can be read, the first: {error}")
         is_smoothed = steps.is_tracked and not steps.live
         lines = steadied(part.lines, steps.up, steps.wanted) if is_smoothed else part.lines()
 

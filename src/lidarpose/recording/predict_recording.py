@@ -148,7 +148,7 @@ class FramePredictor:
     ):
         search_arguments = (min_score, max_range, max_people, background)
         is_searched = find or any(option is not None for option in search_arguments)
-        check_choice(boxes, crop, is_searched)
+        check_choice(boxes, crop, is_searched, calib)
         rotation_from_up(up)
         self.up, self.name, self.skeleton = up_text(up), name, skeleton
         self.boxes = None if boxes is None else FrameBoxes(boxes, calib=calib)

@@ -59,8 +59,16 @@ class Job:
         check_int(f"the number of {self.what}", self.count, least=1)
         check_int("--per-shard", self.shard_size, least=1)
         check_int("the seed", self.seed, least=0)
-        if self.what == "streets" and (self.scene != "wild" or self.hard != 1 or self.motion or self.body or self.set):
-            raise InputError("streets have scene, difficulty and walkers of their own: leave these options out")
+        if self.what == "streets":
+            not_theirs = {
+                "--scene": self.scene != "wild",
+                "--hard": self.hard != 1,
+                "--motion": self.motion,
+                "--body": self.body,
+                "--set or --keep": self.set,
+            }
+            if names := ", ".join(name for name, is_set in not_theirs.items() if is_set):
+                raise InputError(f"streets have scene, difficulty and walkers of their own: leave {names} out")
         if -(-self.count // self.shard_size) > _MOST_SHARDS:
             raise InputError(
                 f"{self.count:,} {self.what} would take more than {_MOST_SHARDS:,} shards: give a larger --per-shard"

@@ -88,11 +88,13 @@ def pretraining_network(recipe: Pretrain) -> tuple[Any, Skeleton]:
 def expanded_network(init: str, config: Config) -> tuple[Callable[[], nn.Module], dict]:
     """What makes a network of this configuration that begins as the weights named, and their card."""
     if not isinstance(config, NetworkConfig):
-        raise InputError("init is for the package's own networks: the paper's begin at random")
+        raise InputError(f"init is for the package's own networks: {config.name} begins at random")
     path = weights_path(init)
     small_network, header = load_checkpoint(path)
-    if not isinstance(small_network, PoseNet):
-        raise file_error(path, "holds a network of the paper: --init names one of the package's own")
+    if not isinstance(small_network, PoseNet) or not header.config.poses:
+        raise file_error(
+            path, f"holds the network {header.config.name}: --init names one of the package's own that poses"
+        )
     # tried at once, so that an error comes before a folder is made
     expand_weights(small_network, config)
     return partial(expand_weights, small_network, config), header.card
@@ -105,8 +107,8 @@ def initial_network(recipe: Finetune) -> tuple[Any, dict]:
         return None, {"init": RANDOM, "init_card": {}}
     path = weights_path(recipe.init)
     trained, header = load_checkpoint(path)
-    if not trained.config.joints:
-        raise file_error(path, f"holds the network {header.network}, which poses nobody: name a checkpoint of another")
+    if not header.config.poses:
+        raise file_error(path, f"holds the network {header.config.name}, which poses nobody: name another's checkpoint")
     if recipe.model and header.network != PRETRAINED[MODELS[recipe.model][0]][0].kind:
         raise file_error(path, f"holds the network {header.config.name}, not {recipe.model}: name a checkpoint of it")
     return trained, {"init": path.name, "init_card": header.card}

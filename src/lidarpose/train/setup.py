@@ -90,13 +90,10 @@ def objective_of(config: Config, recipe: PoseRecipe, layout: str = "ragged") -> 
     """What a network of a configuration minimizes: its entry in `models.NETWORKS`, by its settings of a recipe.
     layout: of the paper's tables."""
     bone_weights = {"bone": recipe.bone, "symmetry": recipe.symmetry}
-    # what a baseline is shown beside what happens to examples
-    shift = augmentation(recipe.augment).shift if isinstance(recipe, Finetune) else 0.0
     # heatmaps are learned the same way in both stages
     stage = "finetune" if isinstance(config, DaptConfig) and config.bins else recipe.kind
     settings_by_kind: dict[str, dict] = {"pose": bone_weights, "dapt": {"stage": stage, "layout": layout}}
-    settings_by_kind |= dict.fromkeys(("prn", "lpformer"), {"shift": shift}) | dict.fromkeys(("lidarcap", "ne"), {})
-    settings = settings_by_kind[config.kind]
+    settings = settings_by_kind.get(config.kind, {})
     if "prn" in (config.kind, getattr(config, "neck", "")) and recipe.batch < 2:
         raise InputError("batch must be at least 2 for prn, whose batch norms see a few points a person, got 1")
     if settings is not bone_weights and any(bone_weights.values()):

@@ -13,6 +13,8 @@ from lidarpose.io.sources.frame import IndexedRecording, ReadingOptions, Sweep
 
 # files of text may be notes, tables or labels: they are points where nothing else is
 _TEXT = (".csv", ".txt", ".xyz")
+# tables of joints, which `lidarpose predict` writes
+_POSES = ".poses.csv"
 # of files without a header the width of a row is taken from the first that can be read, among so many
 _MOST_TRIED = 10
 
@@ -40,13 +42,14 @@ def list_folder(folder: Path) -> list[Path]:
 def scan_files(folder: Path, other: Sequence[str] = ()) -> tuple[list[Path], list[str]]:
     """The point files of a folder in natural order, and warnings.
 
-    Files of suffixes in `other` count where there are no points but in text, text where nothing else is. Of text, and
-    of scans that are there in several formats, those of the commonest suffix are taken.
+    Poses that `lidarpose predict` wrote there are none. Files of suffixes in `other` count where there are no
+    points but in text, text where nothing else is. Of text, and of scans that are there in several formats, those
+    of the commonest suffix are taken.
 
     Raises InputError, which says what is there, where there is none.
     """
     entries = list_folder(folder)
-    suffixes = {path: path.suffix.lower() for path in entries if path.is_file()}
+    suffixes = {path: path.suffix.lower() for path in entries if path.is_file() and not path.name.endswith(_POSES)}
     kinds = ([s for s in SUFFIXES if s not in _TEXT], other, _TEXT)
     groups = [[path for path, suffix in suffixes.items() if suffix in kind] for kind in kinds]
     files = next(filter(None, groups), [])
@@ -78,6 +81,8 @@ def open_files(name: str, paths: Sequence[Path], how: ReadingOptions) -> Indexed
     paths, times = in_order(paths)
     suffixes = sorted({path.suffix.lower() for path in paths})
     warnings = [f"mixes {', '.join(suffixes)} files: one sensor is assumed"] if len(suffixes) > 1 else []
+    if how.topic is not None or how.meta is not None:
+        warnings.append("topic and meta are for recordings: they say nothing of point files")
     columns = how.columns
     if columns is None and ".bin" in suffixes:
         columns, notes = _columns_of([path for path in paths if path.suffix.lower() == ".bin"])

@@ -58,8 +58,8 @@ class PrnConfig(BaselineConfig):
     """PRN, the pose network of LiDAR-HMR. resample_with_replacement: `most_points` points are drawn, some of them
     several times, in evaluation too, as published; else each point is there once, and of more that many stay;
     missing_in_softmax: a neighbor that a small cloud does not have takes part in the attention's batch norms and
-    softmax, and its weight is set to 0 after it, as published; labels_before_scaling: points' parts and offsets in
-    training are those of the person before the augmentation scales them, as published; attention_dropout: share of the
+    softmax, and its weight is set to 0 after it, as published; labels_before_scaling: points' parts in training are
+    those of the person before the augmentation scales them, as published; attention_dropout: share of the
     attention's weights dropped."""
 
     kind: ClassVar[str] = "prn"
@@ -73,9 +73,9 @@ class PrnConfig(BaselineConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class LpformerConfig(BaselineConfig):
-    """LPFormer for crops. resample_with_replacement: as for `PrnConfig`; grid: cells a side of the occupancy
-    grid, 64 as published, or 32 or 16, each an eighth of the work of the one before, with weights of the same
-    shapes; labels_before_scaling: as for `PrnConfig`; second_softmax: the cross entropy of parts is computed of
+    """LPFormer for crops. resample_with_replacement: as for `PrnConfig`; grid: cells a side of the occupancy grid,
+    64 as published, or 32 or 16, each an eighth of the work of the one before, with weights of the same shapes;
+    labels_before_scaling: as for `PrnConfig`; second_softmax: the cross entropy of parts is computed of
     probabilities, as published; divide_by_all_joints: the distance of joints is divided by all, with a label or
     not, as published; sensor_position: a point's token has its place from the sensor beside the local one, as in
     LiDAR-HMR, else the local one twice, as in the DAPT repository; attention_dropout: share of the attention's

@@ -27,7 +27,7 @@ _STRAY, _NEARLY_ALL = 100.0, (0.1, 99.9)
 # a detection's own points lie within this of its axis, m
 _OWN_RADIUS = 0.35
 # detections nearer than this are one person, m: the network moves those of one to the same place
-SAME = 0.25
+SAME = 0.15
 # a box: side, side of somebody mounted, what is added to the height; and bounds of what the network says, m
 _SIDE, _MOUNTED_SIDE, _ROOM = 0.9, 1.1, 0.1
 _MOST_SHIFT, _MOST_FOOT, _HEIGHTS = 0.6, 1.0, (0.5, 2.3)

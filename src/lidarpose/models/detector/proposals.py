@@ -41,8 +41,9 @@ _EMPTY = np.float32(HIGH + 1)
 # a column is dropped this near to a head or to a stronger column, m
 _APART = 0.3
 
-# a column stays whose logit is above this: at 0, three in a thousand of those who have columns lose all of theirs
-_LEAST_LOGIT = 0.5
+# a column stays whose logit is above this: at 0, three in a thousand of those who have columns lose all of theirs, and
+# in a row of people, who are rare in training, those in the middle
+_LEAST_LOGIT = -0.75
 
 # points whose heights are looked up in one go
 _PIECE = 16_384

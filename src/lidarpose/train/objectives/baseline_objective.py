@@ -31,38 +31,34 @@ _COLUMNS = BODY26.map_to(SMPL24)
 
 @dataclass(frozen=True, kw_only=True)
 class BaselineObjective:
-    """The `Objective` of a `Prn` or `Lpformer` with this configuration. shift: largest step, m, by which a person is
-    moved along x, y and z alike, after the middle of their extent was subtracted; LiDAR-HMR's is 0.2."""
+    """The `Objective` of a `Prn` or `Lpformer` with this configuration."""
 
     config: PrnConfig | LpformerConfig
-    shift: float = 0.0
 
     def network(self) -> nn.Module:
         return build(self.config)
 
     def collate(self, examples: list[Example]) -> dict[str, np.ndarray]:
-        """The arrays of `pad_clouds`; joints (B, J, 3) float32 m about the middle, NaN without a label; shift (B,);
-        scale (B,): 1, or with `labels_before_scaling` by what the person was scaled."""
+        """The arrays of `pad_clouds`; joints (B, J, 3) float32 m about the middle, NaN without a label; radius (B,)
+        float32 m within which points belong to a joint."""
         seeds = [example.seed for example in examples]
         view = np.stack([example.view for example in examples])
         arrays = pad_clouds([example.points for example in examples], view, self.config, seeds)
         joints = np.stack([example.joints for example in examples])[:, self.config.columns]
-        shift = [np.random.default_rng([seed, 1]).uniform(-self.shift, self.shift) for seed in seeds]
         scale = [example.scale if self.config.labels_before_scaling else 1.0 for example in examples]
-        numbers = {"shift": np.array(shift, np.float32), "scale": np.array(scale, np.float32)}
-        return arrays | {"joints": joints - arrays["middle"][:, None]} | numbers
+        radius = LABEL_RADIUS * np.array(scale, np.float32)
+        return arrays | {"joints": joints - arrays["middle"][:, None], "radius": radius}
 
     def terms(
         self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
     ) -> dict[str, Tensor]:
-        """`frame_losses`, people moved by their shift; joints without a label teach nothing."""
+        """`frame_losses`; joints without a label teach nothing."""
         tensors = on_device(arrays, device)
-        shift, valid = tensors["shift"][:, None, None], tensors["valid"]
-        points = (tensors["points"] + shift).masked_fill(~valid[..., None], 0)
+        points, valid = tensors["points"], tensors["valid"]
         is_labeled = tensors["joints"].isfinite().all(-1)
-        joints = torch.where(is_labeled[..., None], tensors["joints"] + shift, 0)
+        joints = torch.where(is_labeled[..., None], tensors["joints"], 0)
         outputs = network(points, valid, tensors["center"])
-        labels = point_labels(points, valid, joints, is_labeled, tensors["scale"])
+        labels = point_labels(points, valid, joints, is_labeled, tensors["radius"])
         terms = frame_losses(self.config, outputs, valid, joints, is_labeled, labels, share)
         return terms | {"mpjpe": mean_distance(outputs.joints.detach(), joints, is_labeled, share)}
 
@@ -121,19 +117,18 @@ class ClipObjective:
 
 
 def point_labels(
-    points: Tensor, valid: Tensor, joints: Tensor, known: Tensor, scale: Tensor | None = None
+    points: Tensor, valid: Tensor, joints: Tensor, known: Tensor, radius: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Labels (B, N): the number of the nearest joint with a label, J for background, -1 for padding; and the offsets
     (B, N, 3) m from the points to those joints.
 
-    joints (B, J, 3) m, known (B, J); scale (B,): by which people were scaled, if they are labeled as they were before.
+    joints (B, J, 3) m, known (B, J); radius (B,) m, None for `LABEL_RADIUS`.
     """
-    if scale is not None:
-        points, joints = points / scale[:, None, None], joints / scale[:, None, None]
+    bound = LABEL_RADIUS if radius is None else radius[:, None]
     distance = torch.cdist(points, joints).masked_fill(~known[:, None], torch.inf)
     nearest, joint = distance.min(-1)
     offsets = joints.gather(1, joint[..., None].expand(-1, -1, 3)) - points
-    label = torch.where(nearest < LABEL_RADIUS, joint, joints.shape[1])
+    label = torch.where(nearest < bound, joint, joints.shape[1])
     return label.masked_fill(~valid, -1), offsets
 
 
