@@ -374,6 +374,7 @@ def test_json_that_is_nothing_but_brackets_is_one_line(tmp_path, capsys):
 # ---- what is wrong with a command or a file: (command, words of the error)
 
 BAD_FILES = {
+    "a.pcap": b"abcd",
     "a.obj": b"o x\nv 0 0 0\n",
     "cut.ply": _ply(np.zeros((99, 3)))[:-40],
     "nan.xyz": "nan nan nan\n" * 9,
@@ -385,6 +386,8 @@ BAD_FILES = {
 }
 
 BAD_COMMANDS = {
+    "a recording": ("detect DIR/a.pcap", "got a recording (.pcap): lidarpose predict reads it"),
+    "the standard input": ("predict -", "the standard input is not read"),
     "unknown suffix": ("predict DIR/a.obj --crop", ".pcd .ply"),
     "truncated": ("predict DIR/cut.ply --crop", "cut off"),
     "all NaN": ("predict DIR/nan.xyz --crop", "finite"),

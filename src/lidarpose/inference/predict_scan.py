@@ -76,7 +76,7 @@ def predict(
     scan = Scan(points=np.zeros((0, 3)), boxes=input_boxes, origin=as_origin(sensor_origin), up=up_text(up))
     scan = read_scan(scan, path, columns)
     if not len(scan.points):
-        raise InputError("expected points (n, 3) in meters, got none, or only 0,0,0, which are no returns")
+        raise InputError("expected points (n, 3) in meters, got none, or only 0,0,0 and NaN, which are no returns")
     find = find or boxes is None and not crop and is_wide(scan)
     if not find and any(option is not None for option in options):
         note = f"taken as one person, since under {CROP_SIZE:g} m across, and not searched: find looks for people"

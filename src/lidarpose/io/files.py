@@ -118,7 +118,8 @@ def read_bytes(path: str | os.PathLike, *, expected: str, most: int | None = Non
     except InputError:
         raise
     except FileNotFoundError:
-        raise file_error(path, f"no such file; expected {expected}{_nearest(path)}") from None
+        hint = "; the standard input is not read, save it as a file first" if path == "-" else _nearest(path)
+        raise file_error(path, f"no such file; expected {expected}{hint}") from None
     except OSError as error:
         raise unreadable(path, error) from None
     except MemoryError:

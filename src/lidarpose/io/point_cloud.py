@@ -38,6 +38,8 @@ _NARROWER = 0.4
 # no LiDAR sees farther, m; a column of constants is as wide as noise, m
 _FAR, _NARROWEST = 1e3, 1e-3
 
+# suffixes of files of many scans
+RECORDINGS = (".mcap", ".bag", ".db3", ".pcap", ".pcapng")
 # the first bytes of what users rename by mistake, with the remedy; long enough never to be float32 coordinates
 _FOREIGN = {
     rb"\x1f\x8b\x08[\x00-\x1f]": "is gzip-compressed: unpack it first (gunzip)",
@@ -149,6 +151,8 @@ def _refuse_foreign(data: bytes, suffix: str) -> None:
     for pattern, problem in _FOREIGN.items():
         if re.match(pattern, data):
             raise FormatError(problem)
+    if suffix in RECORDINGS:
+        raise FormatError("one scan", f"a recording ({suffix})", "lidarpose predict reads it, frame by frame")
     if suffix not in SUFFIXES:
         raise FormatError(f"one of {' '.join(SUFFIXES)}", f"the suffix {suffix!r}", "convert or rename the file")
 

@@ -5,7 +5,7 @@ All happens in the person's own frame but for the crop. Legend: n points.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -252,7 +252,7 @@ def clip_example(
     )
 
 
-def _example(rng: np.random.Generator, points: np.ndarray, joints: np.ndarray, **arrays: np.ndarray) -> Example:
+def _example(rng: np.random.Generator, points: np.ndarray, joints: np.ndarray, **arrays: Any) -> Example:
     seed = int(rng.integers(2**31))
     return Example(points=points.astype(np.float32), joints=joints.astype(np.float32), seed=seed, **arrays)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from lidarpose.errors import InputError, check_int
 from lidarpose.io.files import file_error, listed
+from lidarpose.io.point_cloud import RECORDINGS
 from lidarpose.io.sources.folders import natural_key, open_files, scan_files
 from lidarpose.io.sources.frame import (
     ChainedRecording,
@@ -27,9 +28,8 @@ from lidarpose.io.sources.nuscenes import open_nuscenes
 
 __all__ = ["RECORDINGS", "DamagedFrame", "Frame", "FrameSource", "Source", "is_single_scan", "open_source"]
 
-# suffix of a file that holds many frames -> the module whose `open_recording(path, how)` reads it
+# of `RECORDINGS`, the module whose `open_recording(path, how)` reads it
 _READERS = {".mcap": "rosbag", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "ouster", ".pcapng": "ouster"}
-RECORDINGS = tuple(_READERS)
 
 
 def open_source(
