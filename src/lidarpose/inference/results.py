@@ -11,7 +11,7 @@ import numpy as np
 from lidarpose.errors import counted
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
 from lidarpose.io.boxes import people_json
-from lidarpose.io.files import write_atomic
+from lidarpose.io.files import check_suffix, write_atomic
 from lidarpose.sample import JOINT_COLUMNS, PER_JOINT, Box, Pose, facing
 from lidarpose.skeleton import Skeleton
 
@@ -278,7 +278,8 @@ class Poses(Sequence[PersonPose]):
         return people_json(document | last_entries)
 
     def save(self, path: str | Path) -> None:
-        """Writes `to_json`, or `to_dataframe` to a .csv, whole or not at all."""
+        """Writes `to_json` to a .json, or `to_dataframe` to a .csv, whole or not at all."""
+        check_suffix(path, ".json", ".csv")
         is_csv = str(path).lower().endswith(".csv")
         write_atomic(path, self.to_dataframe().to_csv(index=False) if is_csv else self.to_json())
 
