@@ -193,7 +193,7 @@ def _changed(scene: SceneConfig, name: str, text: str) -> SceneConfig:
         for sensor_name in text.split(":"):
             sensor(sensor_name)
         return replace(scene, sensors=tuple(text.split(":")))
-    check_name("setting of the scene", name, targets)
+    check_name("setting of the scene", name, ("sensors", *targets))
     group, field_name = targets[name]
     old_value = getattr(groups[group], field_name)
     try:
