@@ -346,6 +346,14 @@ def test_a_full_memory_is_one_line(monkeypatch, capsys):
 
 
 @pytest.mark.filterwarnings("error")
+def test_map_coordinates_in_32_bits_are_named(crop, points, tmp_path, out, capsys):
+    far = points + [500_000.0, 4_676_500.0, 0.0]
+    for name, dtype, is_warned in (("narrow", np.float32, True), ("wide", np.float64, False)):
+        np.save(tmp_path / f"{name}.npy", far.astype(dtype))
+        assert run("predict", tmp_path / f"{name}.npy", "--crop", "--out", out) == 0
+        assert ("coordinates are rounded to 0.5 m" in capsys.readouterr().err) == is_warned
+
+
 @pytest.mark.parametrize("scale, words", [(1e30, ""), (1e30, "--crop"), (1.7e308, "--boxes"), (1.7e308, "")])
 def test_absurd_coordinates_are_one_line(crop, points, boxes, tmp_path, out, capsys, scale, words):
     flags = [words, boxes] if words == "--boxes" else words.split()

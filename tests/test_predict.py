@@ -736,6 +736,8 @@ def test_results_as_arrays_and_as_a_table(poses, tmp_path):
     assert list(table.person.unique()) == [0, 2] and len(table) == 48
     np.testing.assert_array_equal(table[["x", "y", "z"]].to_numpy()[24:], poses[2].joints)
     np.testing.assert_array_equal(table.confidence[:24], poses[0].confidence)
+    with pytest.raises(InputError, match="give a name that ends in .json"):
+        poses.save(tmp_path / "poses.xyz")
     poses.save(tmp_path / "poses.csv")
     read = pd.read_csv(tmp_path / "poses.csv")
     assert list(read) == list(table) and list(read.joint) == list(table.joint)

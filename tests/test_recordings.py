@@ -375,6 +375,8 @@ def test_a_folder_without_one_readable_scan_is_an_error(tmp_path, capsys):
         (tmp_path / f"{name}.pcd").write_bytes(b"garbage")
     assert main(["predict", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert "of 2 frames none can be read, the first: " in capsys.readouterr().err
+    assert main(["predict", str(tmp_path), "--out", "-"]) == 2
+    assert "of 2 frames none can be read" in capsys.readouterr().err
     assert not list((tmp_path / "out").iterdir())
 
 
@@ -470,6 +472,7 @@ def test_of_a_long_recording_the_page_shows_some_frames(drive, tmp_path, monkeyp
         (["DRIVE", "--crop", "--boxes", "b.json"], "got both"),
         (["DRIVE", "--every", "0"], "every must be"),
         (["DRIVE", "--start", "9"], "has no frames between start and end"),
+        (["DRIVE", "--start", "9", "--out", "-"], "has no frames between start and end"),
         (["no*.pcd"], "no file has such a name"),
         (["DRIVE", "--calib", "c.txt"], "calib is for boxes"),
         (["DRIVE", "--format", "csv", "--out", "-"], "--out - prints lines of JSON, not csv"),

@@ -127,7 +127,11 @@ def _print_lines(options: argparse.Namespace, source, steps) -> None:
         line = in_world(line, steps.up) if options.world else line
         summary.add(line)
         print(json.dumps(line), flush=True)
+    if not summary.frames:
+        raise InputError(f"{source.name}: has no frames between start and end: choose others")
     _report(options, source, summary)
+    if summary.damaged == summary.frames:
+        raise InputError(f"{source.name}: of {counted(summary.frames, 'frame')} none can be read")
 
 
 def _report(options: argparse.Namespace, source, summary, outputs: str = "") -> None:

@@ -67,7 +67,8 @@ _FAR_OUT, _FAR_AWAY, _BELOW_SENSOR, _LOWEST, _LEAST_HEIGHT = 25.0, 60.0, 15.0, 5
 
 def rounding_warning(points: np.ndarray) -> str | None:
     """Map coordinates (n, 3) m lost what makes a person where they were stored in 32 bits."""
-    step = float(np.spacing(np.float32(np.abs(points).max(initial=0))))
+    # without a copy of a large map
+    step = float(np.spacing(np.float32(max(points.max(initial=0), -points.min(initial=0)))))
     if step < _COARSE or not np.array_equal(points.astype(np.float32), points):
         return None
     return (
