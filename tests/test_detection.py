@@ -98,6 +98,19 @@ def test_a_file_alone_is_searched_and_boxes_do_the_same(model, scene, file):
     np.testing.assert_array_equal(in_memory.to_numpy(), poses.to_numpy())
 
 
+def test_second_returns_that_are_the_first_again_change_nothing(scene):
+    points, _ = scene
+    rng = np.random.default_rng(0)
+    copies = np.concatenate([points, points[rng.permutation(len(points))[: len(points) // 2]]])
+    boxes, again = lidarpose.detect(points), lidarpose.detect(copies)
+    for one, other in zip(boxes, again, strict=True):
+        np.testing.assert_array_equal(one.center, other.center)
+        assert one.score == other.score
+    # few copies are left alone, and none are no points
+    few = np.concatenate([points, points[:5]])
+    assert detection._distinct(few) is few and len(detection._distinct(np.zeros((0, 3)))) == 0
+
+
 def test_fewer_are_found_where_fewer_are_asked_for(scene):
     points, _ = scene
     boxes = lidarpose.detect(points)
