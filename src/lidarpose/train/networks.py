@@ -88,7 +88,7 @@ def pretraining_network(recipe: Pretrain) -> tuple[Any, Skeleton]:
 def expanded_network(init: str, config: Config) -> tuple[Callable[[], nn.Module], dict]:
     """What makes a network of this configuration that begins as the weights named, and their card."""
     if not isinstance(config, NetworkConfig):
-        raise InputError(f"init is for the package's own networks: {config.name} begins at random")
+        raise InputError(f"init is for the package's own networks: {config.kind} begins at random")
     path = weights_path(init)
     small_network, header = load_checkpoint(path)
     if not isinstance(small_network, PoseNet) or not header.config.poses:
