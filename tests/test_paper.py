@@ -15,6 +15,7 @@ from training_runs import Killed, few_to_validate_on  # noqa: F401
 
 from lidarpose.cli import main
 from lidarpose.cli.command_line import make_parser
+from lidarpose.data.dataset_card import DatasetCard, write_card
 from lidarpose.data.prepare import prepare
 from lidarpose.data.shards import open_dataset
 from lidarpose.errors import InputError
@@ -163,7 +164,8 @@ def data(tmp_path):
     folders = {name: tmp_path / name for name in (*REAL, "lipd", "freemotion", "noisemotion")}
     for name, folder in folders.items():
         folder.mkdir()
-        (folder / "dataset.json").write_text(json.dumps({"settings": {"dataset": name}}))
+        card = DatasetCard(settings={"dataset": name}, count=1, per_shard=1, tables=("labelled",))
+        write_card(folder, card)
     poses = {name: "raw" for name in ("freemotion-poses", "lidarhuman26m-poses")}
     return {name: str(folder) for name, folder in folders.items()} | poses
 

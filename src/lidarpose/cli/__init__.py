@@ -1,7 +1,5 @@
 """The command line: `lidarpose COMMAND`, also `python -m lidarpose`."""
 
-import sys
-
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command. Returns 0, or 2 after one line on stderr where the input is at fault."""
@@ -11,6 +9,8 @@ def main(arguments: list[str] | None = None) -> int:
 
         return run(arguments)
     except KeyboardInterrupt:
+        from lidarpose.cli.terminal import tell
+
         # before the command runs, which says more
-        sys.stderr.write("lidarpose: stopped\n")
+        tell("lidarpose: stopped", error=True)
         return 130

@@ -115,7 +115,7 @@ def _predict_recording(
 def _print_lines(options: argparse.Namespace, source, steps) -> None:
     """Frames as they come, on the standard output."""
     from lidarpose.recording.coordinates import in_world
-    from lidarpose.recording.output import Summary
+    from lidarpose.recording.output import Summary, nothing_read
 
     if steps.is_tracked and not steps.live:
         raise InputError("--out - prints frames as they come: say --live, which needs no later frames, or name a file")
@@ -127,11 +127,9 @@ def _print_lines(options: argparse.Namespace, source, steps) -> None:
         line = in_world(line, steps.up) if options.world else line
         summary.add(line)
         print(json.dumps(line), flush=True)
-    if not summary.frames:
-        raise InputError(f"{source.name}: has no frames between start and end: choose others")
-    _report(options, source, summary)
     if summary.damaged == summary.frames:
-        raise InputError(f"{source.name}: of {counted(summary.frames, 'frame')} none can be read")
+        raise nothing_read(source.name, summary.frames, summary.first_error)
+    _report(options, source, summary)
 
 
 def _report(options: argparse.Namespace, source, summary, outputs: str = "") -> None:

@@ -63,14 +63,16 @@ def check_settings(folder: str | Path, present: DatasetCard, wanted: DatasetCard
         name: (json.dumps(old_settings.get(name)), json.dumps(new_settings.get(name)))
         for name in sorted(old_settings | new_settings)
     }
-    differences = [
-        f"{name} {present_value} there, {wanted_value} asked for"
+    differences = {
+        name: f"{name} {present_value} there, {wanted_value} asked for"
         for name, (present_value, wanted_value) in pairs.items()
+        if present_value != wanted_value
+    }
+    if len(differences) > 1:
         # digests, which say nothing that the others do not
-        if present_value != wanted_value and (name != "parts" or sum(a != b for a, b in pairs.values()) == 1)
-    ]
+        differences.pop("parts", None)
     if differences:
-        problem = f"{folder} holds a dataset of other settings: {'; '.join(differences)}"
+        problem = f"{folder} holds a dataset of other settings: {'; '.join(differences.values())}"
         raise InputError(f"{problem}; give another folder or the same settings")
 
 

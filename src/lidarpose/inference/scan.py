@@ -17,7 +17,7 @@ from lidarpose.inference.checks import check_scan, origin_warning, rounding_warn
 from lidarpose.inference.inputs import as_points, only_returns
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.io.files import file_error
-from lidarpose.io.point_cloud import read_points
+from lidarpose.io.point_cloud import Cloud, read_points
 from lidarpose.sample import FARTHEST, Box
 
 if TYPE_CHECKING:
@@ -97,20 +97,16 @@ def _turned(points: np.ndarray, R: np.ndarray) -> np.ndarray:
 def read_scan(scan: Scan, points: str | os.PathLike | ArrayLike, columns: int | None) -> Scan:
     """The scan with the returns of a file, its name and notes, or those of an array (n, 3+) m. Raises InputError for a
     file without any."""
-    if not isinstance(points, str | os.PathLike):
-        returns, notes = only_returns(as_points(points))
-        return replace(scan, points=returns, warnings=(*notes, *_rounding(returns)))
-    cloud = read_points(points, columns=columns)
+    source = os.fsdecode(points) if isinstance(points, str | os.PathLike) else None
+    cloud = Cloud(points=as_points(points)) if source is None else read_points(source, columns=columns)
     returns, notes = only_returns(cloud.points)
-    if not len(returns):
+    if source is not None and not len(returns):
         problem = f"none within {FARTHEST:g} m" if cloud.points.any() else "only 0,0,0, which are no returns"
-        raise file_error(points, f"expected points in meters, got {problem}: export it again")
-    warnings = (*cloud.warnings, *notes, *_rounding(returns))
-    return replace(scan, points=returns, warnings=warnings, source=os.fsdecode(points))
-
-
-def _rounding(points: np.ndarray) -> tuple[str, ...]:
-    return tuple(filter(None, [rounding_warning(points)]))
+        raise file_error(source, f"expected points in meters, got {problem}: export it again")
+    warnings = [*cloud.warnings, *notes]
+    if warning := rounding_warning(returns):
+        warnings.append(warning)
+    return replace(scan, points=returns, warnings=tuple(warnings), source=source)
 
 
 def pose_scan(scan: Scan, predictor: Predictor, *, skeleton: str | None = None, progress: bool = False) -> Poses:

@@ -5,13 +5,12 @@ scene `paper` (one simulated LiDAR), a target of the scene `wild` of another see
 method learns the same people and is scored on the same others.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 
-from lidarpose.data.dataset_card import CARD
+from lidarpose.data.dataset_card import CARD, read_card
 from lidarpose.data.readers.lidarhuman26m import POSE_FOLDER
 from lidarpose.data.splits import split_rule
 from lidarpose.errors import InputError, check_name
@@ -158,10 +157,9 @@ class Row:
 
 def _check_prepared(name: str, folder: str) -> None:
     """Raises InputError unless a folder holds this dataset as prepared."""
-    try:
-        content = json.loads((Path(folder) / CARD).read_bytes())["settings"].get("dataset", "synthetic people")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        raise InputError(f"{name}={folder} is no prepared dataset: run lidarpose prepare first") from None
+    if not (Path(folder) / CARD).is_file():
+        raise InputError(f"{name}={folder} is no prepared dataset: run lidarpose prepare first")
+    content = read_card(folder).settings.get("dataset", "synthetic people")
     if content != name:
         raise InputError(f"--data {name}={folder}: expected {name} as prepared, got {content}: name its own folder")
 

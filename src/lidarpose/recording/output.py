@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from lidarpose.errors import counted
+from lidarpose.errors import InputError, counted
 from lidarpose.io.files import check_writable, file_error
 from lidarpose.io.sources import Source
 from lidarpose.progress import Progress
@@ -204,13 +204,10 @@ def write_recording(
         elif part.frames:
             tell(f"{part.frames:,} frames are in {part.path}: going on")
         _add_frames(source, steps, part)
-        if not part.frames:
-            part.remove()
-            raise file_error(source.name, "has no frames between start and end: choose others")
         if not any(line["error"] is None for line in part.lines()):
-            error = next(part.lines())["error"]
+            error = next((line["error"] for line in part.lines()), None)
             part.remove()
-            raise file_error(source.name, f"of {counted(part.frames, 'frame')} none can be read, the first: {error}")
+            raise nothing_read(source.name, part.frames, error)
         is_smoothed = steps.is_tracked and not steps.live
         lines = steadied(part.lines, steps.up, steps.wanted) if is_smoothed else part.lines()
 
@@ -225,6 +222,13 @@ def write_recording(
         write_result(result, final())
         part.remove()
     return summary
+
+
+def nothing_read(name: str, frames: int, first_error: str | None) -> InputError:
+    """The error of a recording of which no frame could be read, of so many."""
+    if not frames:
+        return file_error(name, "has no frames between start and end: choose others")
+    return file_error(name, f"of {counted(frames, 'frame')} none can be read, the first: {first_error}")
 
 
 def _add_frames(source: Source, steps: FramePredictor, part: PartFile) -> None:
