@@ -12,6 +12,7 @@ from fake_detector import FakeDetector
 import lidarpose
 from lidarpose.cli import main
 from lidarpose.errors import InputError
+from lidarpose.eval.detector.labeled_scans import heldout_scans
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
 from lidarpose.inference import detection, verification
 from lidarpose.lidar.raycast import scan
@@ -539,6 +540,54 @@ def test_who_cannot_reach_the_least_score_is_neither_verified_nor_posed(monkeypa
     for rows in people.rows:
         assert len(owned & set(rows.tolist())) <= 0.75 * len(rows)
         owned |= set(rows.tolist())
+
+
+@pytest.fixture(scope="module")
+def hidden():
+    """A scene whose person 2 is taken for one with the person beside, 0.6 m away."""
+    scene = heldout_scans().loaders[80]()
+    detector = Detector(threads=1)
+    return scene, detector, detector.detect(scene.points, scene.origin, limit=60)
+
+
+def test_who_is_beside_somebody_is_found_without_their_points(hidden):
+    scene, detector, detections = hidden
+    rows_asked = []
+
+    def detect_beside(rows, people):
+        rows_asked.append((rows, people))
+        return detector.detect_beside(scene.points[rows], scene.origin, people, detections.ground)
+
+    def found(people):
+        centers = np.array([box.center[:2] for box in people.boxes])
+        return np.linalg.norm(centers - scene.boxes[2].center[:2], axis=1).min() < 0.2
+
+    given = detections, scene.points.astype(float), scene.origin, detector.header, 0.8
+    alone = verification.verified(*given)
+    people = verification.verified(*given, detect_beside=detect_beside)
+    ((rows, places),) = rows_asked
+    assert found(people) and not found(alone)
+    # nobody else is lost, and the points on those who were found were not looked at again
+    assert {tuple(box.center) for box in alone.boxes} <= {tuple(box.center) for box in people.boxes}
+    assert scene.num_points[2] > 100 and len(places) >= len(alone.boxes)
+    left = np.isin(np.arange(len(scene.points)), rows)
+    assert left[scene.person == 2].mean() > 0.7 and left[scene.person < 0].mean() > 0.99
+    assert [box.id for box in people.boxes] == list(range(len(people.boxes)))
+    # scores are not those of who asks: a lower bound only adds people
+    more = verification.verified(*given[:-1], 0.3, detect_beside=detect_beside)
+    assert {tuple(box.center) for box in people.boxes} <= {tuple(box.center) for box in more.boxes}
+
+
+def test_people_beside_others_are_looked_for_near_them_alone(hidden):
+    scene, detector, detections = hidden
+    people = scene.joints[:3, 0, :2].astype(float)
+    beside = detector.detect_beside(scene.points, scene.origin, people, detections.ground)
+    distance = np.linalg.norm(beside.centers[:, None, :2] - people, axis=-1).min(1)
+    assert 0 < len(beside) < len(detections) and distance.max() < 0.85 + 0.6
+    # of nobody, and where nothing moves
+    none = np.zeros(len(scene.points), bool)
+    assert not len(detector.detect_beside(scene.points, scene.origin, people[:0], detections.ground))
+    assert not len(detector.detect_beside(scene.points, scene.origin, people, detections.ground, moving=none))
 
 
 def test_of_two_whose_pelvises_meet_the_surer_one_stays():

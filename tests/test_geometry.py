@@ -11,6 +11,7 @@ from lidarpose.geometry import (
     UP_AXES,
     Strips,
     axis_angle_to_matrix,
+    distance_to_segments,
     from_spherical,
     inverse_transform,
     quaternion_to_matrix,
@@ -18,6 +19,7 @@ from lidarpose.geometry import (
     rotation_about,
     rotation_between,
     rotation_from_up,
+    rows_near,
     similarity_align,
     to_spherical,
     transform_points,
@@ -204,6 +206,30 @@ def test_strips_hold_all_rows_between(x, low, size):
 def test_strips_leave_most_rows_out():
     x = 5e5 + np.random.default_rng(0).uniform(0, 1000, 10_000)
     assert len(Strips(x).rows(5e5 + 500, 5e5 + 501)) < 100
+
+
+@quick
+@given(
+    points=arrays(float, st.tuples(st.integers(0, 40), st.just(3)), elements=coordinate),
+    centers=arrays(float, st.tuples(st.integers(0, 4), st.just(2)), elements=coordinate),
+    reach=st.floats(0.1, 20),
+)
+def test_rows_near_are_those_of_a_square(points, centers, reach):
+    for center, rows in zip(centers, rows_near(centers, points, reach), strict=True):
+        assert rows.tolist() == np.flatnonzero((np.abs(points[:, :2] - center) < reach).all(1)).tolist()
+
+
+@quick
+@given(seed=st.integers(0, 2**32 - 1))
+def test_the_nearest_segment_is_as_near_as_its_nearest_point(seed):
+    rng = np.random.default_rng(seed)
+    points, starts, ends = rng.normal(size=(20, 3)), rng.normal(size=(5, 3)), rng.normal(size=(5, 3))
+    # one of no length
+    ends[0] = starts[0]
+    along = (starts + np.linspace(0, 1, 2001)[:, None, None] * (ends - starts)).reshape(-1, 3)
+    brute = np.linalg.norm(points[:, None] - along, axis=-1).min(1)
+    distance = distance_to_segments(points, starts, ends)
+    assert (distance <= brute + 1e-12).all() and (brute - distance < 2e-3).all()
 
 
 @pytest.mark.parametrize(("up", "axis"), [("-y", "-y"), ("0.3,0,0.9", "z"), ("0.3,-0.9,0.1", "-y"), ((-2, 1, 0), "-x")])

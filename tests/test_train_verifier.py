@@ -9,6 +9,7 @@ import torch
 from training_runs import refused, train_until_killed
 
 from lidarpose.cli import main
+from lidarpose.geometry import rows_near
 from lidarpose.inference import verification
 from lidarpose.models import bundled_path, weights_file
 from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
@@ -81,7 +82,7 @@ def test_the_crops_are_those_that_are_verified(monkeypatch):
             )
 
     monkeypatch.setattr(verification, "_bundled", lambda name: Backend())
-    rows = verification.rows_near(detections.centers, scene.points)
+    rows = rows_near(detections.centers, scene.points, verification.AROUND)
     clouds = {i: scene.points[near] for i, near in enumerate(rows)}
     verification.Crops(detections, clouds, origin).verdicts()
     assert 0 < crops.size <= len(shown)

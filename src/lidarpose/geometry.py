@@ -174,6 +174,19 @@ def vector_of(given: Any) -> np.ndarray | None:
 _LAST_STRIP = 65_535
 
 
+def distance_to_segments(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """points (n, 3), segments from starts (S, 3) to ends (S, 3), S >= 1 -> (n,): to the nearest segment."""
+    direction = ends - starts
+    square_length = np.maximum((direction**2).sum(1), 1e-12)
+    nearest = np.full(len(points), np.inf)
+    # one after the other: points may be many
+    for start, along, square in zip(starts, direction, square_length, strict=True):
+        offset = points - start
+        share = np.clip(offset @ along / square, 0, 1)
+        np.minimum(nearest, ((offset - share[:, None] * along) ** 2).sum(1), out=nearest)
+    return np.sqrt(nearest)
+
+
 class Strips:
     """Points by strips along one axis, so that nobody who asks for a place has to look at all of millions of them.
 
@@ -193,6 +206,16 @@ class Strips:
         ends = (np.array([low, high]) - self._start) / self._width
         first, last = np.clip(ends, 0, _LAST_STRIP).astype(int)
         return self._order[self._ends[first] : self._ends[last + 1]]
+
+
+def rows_near(centers: np.ndarray, points: np.ndarray, reach: float) -> list[np.ndarray]:
+    """Of each of centers (K, 2+) m the rows (k,) of points (n, 3) m within `reach` m of it in x and in y, ascending."""
+    strips, rows = Strips(points[:, 0]), []
+    for x, y in centers[:, :2]:
+        near_rows = strips.rows(x - reach, x + reach)
+        near_rows = near_rows[np.abs(points[near_rows, 1] - y) < reach]
+        rows.append(np.sort(near_rows[np.abs(points[near_rows, 0] - x) < reach]))
+    return rows
 
 
 def similarity_align(source: np.ndarray, target: np.ndarray) -> np.ndarray:

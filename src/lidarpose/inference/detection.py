@@ -157,12 +157,14 @@ def other_up_axis(places: "Places", search: Search) -> str | None:
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Places:
     """A scan in which people were detected, but not verified: as given, and as it is searched; its points in the level
-    frame (n, 3) m; the detections there, None of a scan without points."""
+    frame (n, 3) m; the detections there, None of a scan without points; moving (n,) bool, where a background is known.
+    """
 
     given: Scan
     scan: Scan
     level: np.ndarray
     detections: Detections | None
+    moving: np.ndarray | None = None
 
 
 def detect_places(scan: Scan, search: Search) -> Places:
@@ -214,21 +216,33 @@ def detect_places(scan: Scan, search: Search) -> Places:
     if not (detections.has_ground or frame_warning):
         warnings.append("no ground was found, and people are searched without it: is the up axis right?")
     scan = replace(scan, warnings=tuple(warnings))
-    return Places(given=input_scan, scan=scan, level=level, detections=detections)
+    return Places(given=input_scan, scan=scan, level=level, detections=detections, moving=is_moving)
 
 
 def verify_people(places: Places, search: Search, known: KnownPlaces | None = None) -> Scan:
     """The second half of `find_people`."""
-    scan, input_scan = places.scan, places.given
-    if places.detections is None:
+    scan, input_scan, detections = places.scan, places.given, places.detections
+    if detections is None:
         return replace(scan, boxes=[], detected_rows=[])
     # the boxes of a frame that leans are larger than their people: these are looked for anew
     is_tilted = not np.allclose(input_scan.R_boxes_input, scan.R_level_input)
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     known_level = None if known is None or is_tilted else known.level(scan.R_level_input)
-    header = (search.detector or _detector()).header
+    detector = search.detector or _detector()
+
+    def detect_beside(rows: np.ndarray, people: np.ndarray) -> Detections:
+        moving = None if places.moving is None else places.moving[rows]
+        return detector.detect_beside(places.level[rows], origin, people, detections.ground, moving=moving)
+
     people = verified(
-        places.detections, places.level, origin, header, least_score(search), search.max_people, known_level
+        detections,
+        places.level,
+        origin,
+        detector.header,
+        least_score(search),
+        search.max_people,
+        known_level,
+        detect_beside,
     )
     boxes = [_in_input(box, scan, input_scan) for box in people.boxes]
     result = replace(scan, boxes=boxes, detected_rows=people.rows)

@@ -4,13 +4,13 @@ boxes are drawn about their poses.
 Legend: D detections.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 
-from lidarpose.geometry import Strips, rotation_about
+from lidarpose.geometry import distance_to_segments, rotation_about, rows_near
 from lidarpose.inference.backend import Backend, OnnxBackend, Raw, estimates
 from lidarpose.inference.tta import TTATransform, apply
 from lidarpose.models import DEFAULT, VERIFIER, weights_file
@@ -18,12 +18,15 @@ from lidarpose.models.decode import decoder, sigmoid
 from lidarpose.models.detector.detector import Detections
 from lidarpose.sample import MIN_POINTS, Box, Pose, facing
 
+# rows (m,) of a scan's points that are on nobody, and where people are (K, 2) m -> who else is beside them
+DetectBeside = Callable[[np.ndarray, np.ndarray], Detections]
+
 # detections that are verified or posed at once, of like size: a batch costs as much as if all were its largest
 _BATCH = 16
 # what is posed: a column so wide, and so far below and above the detection's box, m
 _COLUMN, _BELOW, _ABOVE = 0.6, 0.15, 0.25
 # points around a detection that its final box may hold, m to each side
-_AROUND = 2.5
+AROUND = 2.5
 # a box is so much larger than the joints on each side, m, beside another person no more than this; it ends half way to
 # the next person, less half a body
 _ROOM, _LEAST_ROOM, _HALF_BODY = 0.15, 0.1, 0.25
@@ -42,6 +45,9 @@ _FALLBACK_WEIGHTS = {"logit": 0.5, "verifier": 0.5}
 _MOST_ODDS, _BEYOND_MOST = 6.0, 0.01
 # the fewest and most points, between which a score is bounded before anybody is verified
 _LOG_POINTS = (np.log1p(MIN_POINTS), np.log1p(1e5))
+# whose points are left out where others are looked for beside them: people of at least this score, points so near to
+# their bones, m
+_SURE_SCORE, _BODY = 0.5, 0.18
 # a detection so near to where somebody is expected is that person, m, if no other is expected within the second
 # distance
 _EXPECTED, _ALONE = 0.5, 1.0
@@ -87,7 +93,7 @@ def _bundled(name: str) -> Backend:
 def verification_features(detections: Detections, points: np.ndarray, origin: np.ndarray | None) -> np.ndarray:
     """What the final score of detections in points (n, 3) m, level, from a sensor at origin (3,) or None is made of:
     (D, 3) in the order of `FEATURES`, NaN of fewer than 5 points."""
-    near_rows = rows_near(detections.centers, points)
+    near_rows = rows_near(detections.centers, points, AROUND)
     return Crops(detections, dict(enumerate(points[rows] for rows in near_rows)), origin).verdicts()[0]
 
 
@@ -202,6 +208,7 @@ def verified(
     least_score: float,
     max_people: int | None = None,
     known: KnownPlaces | None = None,
+    detect_beside: DetectBeside | None = None,
 ) -> People:
     """The people among the detections, surest first, in boxes about their poses; of known people about where they are
     expected.
@@ -210,6 +217,7 @@ def verified(
         points: (n, 3) m, level, from a sensor at origin (3,) or None.
         header: the detector's.
         least_score: people of a lower score are left out; near where tracks are expected, `WEAK_SCORE` is enough.
+        detect_beside: also looks for people beside others, whom it had taken for one with them.
     """
     highest_scores = _highest_score(detections, header)
     known_index, thresholds = np.full(len(detections), -1), np.full(len(detections), least_score)
@@ -217,54 +225,140 @@ def verified(
         known_index = _expected(detections, highest_scores >= least_score, known)
         thresholds = _least_scores(detections, known_index, least_score, known)
     possible_rows = np.flatnonzero(highest_scores >= thresholds)
-    near_rows = dict(zip(possible_rows.tolist(), rows_near(detections.centers[possible_rows], points), strict=True))
-    new_rows = possible_rows[known_index[possible_rows] < 0]
+    # who is expected needs neither verdict nor pose
+    posed_from = np.where(known_index < 0, thresholds, np.inf)
+    if detect_beside is not None:
+        posed_from = np.where(known_index < 0, np.minimum(thresholds, _SURE_SCORE), np.inf)
+    places = _assessed(detections, points, origin, header, posed_from, max_people, possible_rows)
+    is_nobody = places.scores[possible_rows] < _NOBODY * least_score
+    rejected = detections.centers[possible_rows[is_nobody & (known_index[possible_rows] < 0)]]
+    known_boxes: dict[int, Box] = {}
+    if known is not None:
+        known_rows = np.flatnonzero(known_index >= 0)
+        known_boxes = {row: known.boxes[known_index[row]] for row in known_rows.tolist()}
+        places.scores[known_rows] = [box.score for box in known_boxes.values()]
+        places.pelvises[known_rows] = known.pelvises[known_index[known_rows]]
+    if detect_beside is not None:
+        sure_pelvises = np.where(places.scores[:, None] >= _SURE_SCORE, places.pelvises, np.nan)
+        sure_people = _boxed(replace(places, pelvises=sure_pelvises), points, _SURE_SCORE, None, known_boxes)
+        posed_rows = [row for row, _, _ in sure_people if row not in known_boxes]
+        if posed_rows:
+            other_rows = np.flatnonzero(~_on_people(places, sure_people, points, known_boxes))
+            hidden = detect_beside(other_rows, places.pelvises[posed_rows, :2])
+            posed_from = np.full(len(hidden), least_score)
+            rows = np.flatnonzero(_highest_score(hidden, header) >= posed_from)
+            hidden_places = _assessed(hidden, points[other_rows], origin, header, posed_from, max_people, rows)
+            places = places.joined(hidden_places, other_rows)
+            thresholds = np.append(thresholds, posed_from)
+    places.pelvises[places.scores < thresholds] = np.nan
+    people = _boxed(places, points, least_score, max_people, known_boxes)
+    kept_rows = [row for row, _, _ in people]
+    return People(
+        boxes=[replace(box, id=number) for number, (_, box, _) in enumerate(people)],
+        rows=[own_rows for _, _, own_rows in people],
+        pelvises=places.pelvises[kept_rows],
+        logits=places.logits[kept_rows],
+        verified=np.array([row not in known_boxes for row in kept_rows], bool),
+        rejected=rejected,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Places:
+    """What is known of D detections: scores and logits (D,), see `final_score`, NaN where they were not looked at;
+    mounted (D,), the probability; joints (D, J, 3) and pelvises (D, 3) m, NaN of who is not posed; near_rows: of each
+    the rows of the points about it."""
+
+    scores: np.ndarray
+    logits: np.ndarray
+    mounted: np.ndarray
+    joints: np.ndarray
+    pelvises: np.ndarray
+    near_rows: list[np.ndarray]
+
+    def joined(self, other: "_Places", other_rows: np.ndarray) -> "_Places":
+        """These, then the others, which know the points of some rows alone."""
+        near_rows = self.near_rows + [other_rows[rows] for rows in other.near_rows]
+        arrays = {
+            name: np.concatenate([values, getattr(other, name)])
+            for name, values in vars(self).items()
+            if name != "near_rows"
+        }
+        return _Places(**arrays, near_rows=near_rows)
+
+
+def _assessed(
+    detections: Detections,
+    points: np.ndarray,
+    origin: np.ndarray | None,
+    header: dict,
+    posed_from: np.ndarray,
+    max_people: int | None,
+    rows: np.ndarray,
+) -> _Places:
+    """Verifies the detections of some rows, and poses those whose scores are at least `posed_from` (D,); where that is
+    infinite nobody is verified."""
+    near_rows = [np.zeros(0, int)] * len(detections)
+    for row, own_rows in zip(rows.tolist(), rows_near(detections.centers[rows], points, AROUND), strict=True):
+        near_rows[row] = own_rows
+    new_rows = rows[np.isfinite(posed_from[rows])]
     crops = Crops(detections, {i: points[near_rows[i]] for i in new_rows.tolist()}, origin)
     features, mounted = crops.verdicts()
-    scores = final_score(features, header)
-    logits = final_logit(features, header)
-    posed_rows = new_rows[scores[new_rows] >= thresholds[new_rows]]
+    scores, logits = final_score(features, header), final_logit(features, header)
+    posed_rows = new_rows[scores[new_rows] >= posed_from[new_rows]]
     if max_people is not None:
         posed_rows = posed_rows[_surest_first(scores[posed_rows], logits[posed_rows])][: _PLACES * max_people]
     poses = crops.poses(posed_rows)
     pelvises = poses.joints[:, poses.skeleton.index("pelvis")].copy()
-    rejected = detections.centers[new_rows][scores[new_rows] < _NOBODY * least_score]
-    if known is not None:
-        known_rows = np.flatnonzero(known_index >= 0)
-        scores[known_rows] = [known.boxes[k].score for k in known_index[known_rows].tolist()]
-        pelvises[known_rows] = known.pelvises[known_index[known_rows]]
-    pelvises[scores < thresholds] = np.nan
-    person_rows = surest_rows(scores, pelvises, logits)
+    return _Places(
+        scores=scores, logits=logits, mounted=mounted, joints=poses.joints, pelvises=pelvises, near_rows=near_rows
+    )
+
+
+def _on_people(
+    places: _Places, people: list[tuple[int, Box, np.ndarray]], points: np.ndarray, known_boxes: dict[int, Box]
+) -> np.ndarray:
+    """(n,) bool: which points are on the bodies of people, as of `_boxed`, or in the boxes of known ones."""
+    is_body = np.zeros(len(points), bool)
+    skeleton = _bundled(DEFAULT).header.skeleton
+    ends = [j for j, parent in enumerate(skeleton.parents) if parent >= 0]
+    starts = [skeleton.parents[j] for j in ends]
+    for row, _, own_rows in people:
+        if row not in known_boxes:
+            own_rows, joints = places.near_rows[row], places.joints[row]
+            distance = distance_to_segments(points[own_rows], joints[starts], joints[ends])
+            own_rows = own_rows[distance < _BODY]
+        is_body[own_rows] = True
+    return is_body
+
+
+def _boxed(
+    places: _Places, points: np.ndarray, least_score: float, max_people: int | None, known_boxes: dict[int, Box]
+) -> list[tuple[int, Box, np.ndarray]]:
+    """The different people of places that have a pelvis, the surest first: rows, boxes, and rows of their points; of
+    known people, by row, the boxes where they are expected."""
+    scores, pelvises = places.scores, places.pelvises
+    skeleton = _bundled(DEFAULT).header.skeleton
+    person_rows = surest_rows(scores, pelvises, places.logits)
     is_owned = np.zeros(len(points), bool)
-    boxes: list[Box] = []
-    rows: list[np.ndarray] = []
-    kept_rows: list[int] = []
+    people: list[tuple[int, Box, np.ndarray]] = []
     for i in person_rows:
-        if known is not None and known_index[i] >= 0:
-            box = known.boxes[known_index[i]]
+        if i in known_boxes:
+            box = known_boxes[i]
             crop_box, is_mounted = replace(box, size=box.size + 2 * _MOVED), box.mounted
         else:
             distances = [
                 np.hypot(*(pelvises[k] - pelvises[i])[:2]) for k in person_rows if k != i and scores[k] >= least_score
             ]
-            nearest_distance = min(distances, default=np.inf)
-            box = crop_box = _box_about(Pose(joints=poses.joints[i], skeleton=poses.skeleton), nearest_distance)
-            is_mounted = bool(mounted[i] > 0.5)
-        own_rows = near_rows[i][crop_box.contains(points[near_rows[i]])]
-        if len(own_rows) < MIN_POINTS or is_owned[own_rows].mean() > _SHARED or len(boxes) == max_people:
+            pose = Pose(joints=places.joints[i], skeleton=skeleton)
+            box = crop_box = box_about(pose, min(distances, default=np.inf))
+            is_mounted = bool(places.mounted[i] > 0.5)
+        own_rows = places.near_rows[i][crop_box.contains(points[places.near_rows[i]])]
+        if len(own_rows) < MIN_POINTS or is_owned[own_rows].mean() > _SHARED or len(people) == max_people:
             continue
         is_owned[own_rows] = True
-        boxes.append(replace(box, id=len(boxes), score=float(scores[i]), mounted=is_mounted))
-        rows.append(own_rows)
-        kept_rows.append(i)
-    return People(
-        boxes=boxes,
-        rows=rows,
-        pelvises=pelvises[kept_rows],
-        logits=logits[kept_rows],
-        verified=known_index[kept_rows] < 0,
-        rejected=rejected,
-    )
+        people.append((i, replace(box, score=float(scores[i]), mounted=is_mounted), own_rows))
+    return people
 
 
 def _least_scores(
@@ -299,7 +393,7 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.linalg.norm(a[:, None, :2] - b[None, :, :2], axis=-1)
 
 
-def _box_about(pose: Pose, nearest_distance: float) -> Box:
+def box_about(pose: Pose, nearest_distance: float) -> Box:
     """The box of a person by the pose, joints (J, 3) m; nearest_distance: to the next person, m, who is to be kept
     out."""
     forward = facing(pose)
@@ -316,13 +410,3 @@ def rounded(box: Box) -> Box:
     """As it is written: a file of boxes crops the same points."""
     center, size = box.center.round(_DECIMALS), box.size.round(_DECIMALS)
     return replace(box, center=center, size=size, yaw=round(box.yaw, _DECIMALS))
-
-
-def rows_near(centers: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
-    """Of each center the rows (k,) of the points (n, 3) m about it, ascending."""
-    strips, rows = Strips(points[:, 0]), []
-    for x, y in centers[:, :2]:
-        near_rows = strips.rows(x - _AROUND, x + _AROUND)
-        near_rows = near_rows[np.abs(points[near_rows, 1] - y) < _AROUND]
-        rows.append(np.sort(near_rows[np.abs(points[near_rows, 0] - x) < _AROUND]))
-    return rows

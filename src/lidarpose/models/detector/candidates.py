@@ -81,7 +81,7 @@ class SceneIndex:
         points = np.asarray(points)
         if heights is None:
             heights = heights_above(points, ground)
-        self.origin = None if origin is None else np.asarray(origin, float)
+        self.ground, self.origin = ground, None if origin is None else np.asarray(origin, float)
         columns = points.T
         self._corner = np.floor([values.min() if len(points) else 0.0 for values in columns[:2]])
         extent = np.floor([values.max(initial=0) for values in columns[:2]]) - self._corner + 1

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from lidarpose.geometry import rows_near
 from lidarpose.io.files import file_error
 from lidarpose.models import weights_file
 from lidarpose.models.decode import sigmoid
 from lidarpose.models.detector.candidates import CHUNK, SceneIndex, suppress_near
 from lidarpose.models.detector.detector_config import INPUTS, OUTPUT, DetectorConfig
-from lidarpose.models.detector.ground import estimate_ground, without_ground
+from lidarpose.models.detector.ground import Ground, estimate_ground, without_ground
 from lidarpose.models.detector.proposals import heights_above, propose
 from lidarpose.models.detector.range_image import SIDE, SLICES
 from lidarpose.models.detector.render import render
@@ -28,6 +29,8 @@ _STRAY, _NEARLY_ALL = 100.0, (0.1, 99.9)
 _OWN_RADIUS = 0.35
 # detections nearer than this are one person, m: the network moves those of one to the same place
 SAME = 0.15
+# beside people somebody is looked for so far away; a proposal is told by what is so far about it, m
+_BESIDE, _COLUMN = (0.3, 0.85), 1.0
 # a box: side, side of somebody mounted, what is added to the height; and bounds of what the network says, m
 _SIDE, _MOUNTED_SIDE, _ROOM = 0.9, 1.1, 0.1
 _MOST_SHIFT, _MOST_FOOT, _HEIGHTS = 0.6, 1.0, (0.5, 2.3)
@@ -43,7 +46,8 @@ class Detections:
 
     centers (D, 3): of their boxes; sizes (D, 3); yaws (D,) rad: 0, the boxes are square; logit (D,); score (D,): the
     probability that it is a person; mounted (D,): the probability that somebody rides or sits in a wheelchair; rows:
-    of each the rows of the scan's points within 0.35 m of its axis; has_ground: whether a ground was found.
+    of each the rows of the scan's points within 0.35 m of its axis; ground: under them; has_ground: whether it was
+    found.
     """
 
     centers: np.ndarray
@@ -53,6 +57,7 @@ class Detections:
     score: np.ndarray
     mounted: np.ndarray
     rows: list[np.ndarray]
+    ground: Ground
     has_ground: bool
 
     def __len__(self) -> int:
@@ -121,6 +126,33 @@ class Detector:
         scene = SceneIndex(points, ground, origin, heights=heights)
         return self._detections(scene, centers, rows, has_ground, limit)
 
+    def detect_beside(
+        self,
+        points: np.ndarray,
+        origin: np.ndarray | None,
+        people: np.ndarray,
+        ground: Ground,
+        *,
+        moving: np.ndarray | None = None,
+    ) -> Detections:
+        """Who stands beside people whom `detect` found, and was taken for one with them.
+
+        Args:
+            points: (n, 3) m, those of the people left out.
+            origin, moving: as of `detect`.
+            people: (K, 2) m, where they are.
+            ground: as `detect` found it.
+        """
+        selected_rows = np.arange(len(points)) if moving is None else np.flatnonzero(moving)
+        near_rows = rows_near(people, points[selected_rows], _BESIDE[1] + _COLUMN)
+        near_points = points[selected_rows[np.unique(np.concatenate([np.zeros(0, int), *near_rows]))]]
+        places = propose(near_points, ground)
+        distance = np.linalg.norm(places[:, None, :2] - people[None], axis=-1).min(1, initial=np.inf)
+        places = places[(distance > _BESIDE[0]) & (distance < _BESIDE[1])]
+        # x after x in memory, as above; mostly there is nobody
+        points = np.ascontiguousarray((points if len(places) else near_points).T).T
+        return self._detections(SceneIndex(points, ground, origin), places, np.arange(len(points)), True, None)
+
     def _detections(
         self, scene: SceneIndex, places: np.ndarray, scan_rows: np.ndarray, has_ground: bool, limit: int | None
     ) -> Detections:
@@ -142,6 +174,7 @@ class Detector:
             score=self.probability(logit[indices]),
             mounted=mounted,
             rows=[scan_rows[rows] for rows in scene.rows(centers[indices], _OWN_RADIUS)],
+            ground=scene.ground,
             has_ground=has_ground,
         )
 

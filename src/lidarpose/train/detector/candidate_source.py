@@ -41,6 +41,7 @@ NOBODY, UNCLEAR = -1, -2
 _MARGIN = 0.05
 
 Scan = TypeVar("Scan")
+Shown = TypeVar("Shown")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +110,7 @@ def moved(labels: Labels, augmentation: Augmentation) -> Labels:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneSource(ABC, Generic[Scan]):
+class SceneSource(ABC, Generic[Scan, Shown]):
     """Each scene of `detection_scene` of a seed `uses` times, `lag` scenes between two times.
 
     Scene j is example uses * j the first time. Where no scene is old enough yet, a younger one stands in.
@@ -124,7 +125,7 @@ class SceneSource(ABC, Generic[Scan]):
         """What is learned from in a scene."""
 
     @abstractmethod
-    def shown(self, scan: Scan, rng: np.random.Generator) -> Scan:
+    def shown(self, scan: Scan, rng: np.random.Generator) -> Shown:
         """An example of it, drawn anew."""
 
     def __getstate__(self) -> dict:
@@ -135,7 +136,7 @@ class SceneSource(ABC, Generic[Scan]):
         """The scans of this process by their numbers."""
         return {}
 
-    def example(self, index: int) -> Scan:
+    def example(self, index: int) -> Shown:
         newest_scene, use = divmod(index, self.uses)
         number = newest_scene - use * self.lag
         scan = self._scan(newest_scene // (use + 1) if number < 0 else number, newest_scene)
@@ -150,7 +151,7 @@ class SceneSource(ABC, Generic[Scan]):
         return scans[number]
 
 
-class CandidateSource(SceneSource[DetectorExample]):
+class CandidateSource(SceneSource[DetectorExample, DetectorExample]):
     """Candidates of scenes: all of people, and some of nobody."""
 
     def made(self, number: int) -> DetectorExample:

@@ -8,9 +8,10 @@ from functools import cache, partial
 
 import numpy as np
 
+from lidarpose.geometry import rows_near
 from lidarpose.inference.detection import MAX_RANGE, MOST_POSED
 from lidarpose.inference.tta import IDENTITY, apply
-from lidarpose.inference.verification import inside_column, rows_near
+from lidarpose.inference.verification import AROUND, inside_column
 from lidarpose.models.detector.detector import Detector
 from lidarpose.sample import MIN_POINTS
 from lidarpose.train.detector.candidate_source import NOBODY, UNCLEAR, SceneSource, scene_to_search
@@ -47,7 +48,7 @@ class CropExample:
         return len(self.clouds)
 
 
-class CropSource(SceneSource[CropExample]):
+class CropSource(SceneSource[CropExample, CropExample]):
     """Crops of scenes, changed a little each time."""
 
     def made(self, number: int) -> CropExample:
@@ -81,7 +82,7 @@ def scan_crops(seed: int, number: int, *, family: str = "train") -> CropExample:
     centers = np.array([scene.boxes[row].center[:2] for row in visible_people]).reshape(-1, 2)
     rng = np.random.default_rng([seed, number])
     clouds, kept_centers, person, num_others = [], [], [], []
-    near_rows = rows_near(detections.centers, scene.points)
+    near_rows = rows_near(detections.centers, scene.points, AROUND)
     for center, size, near in zip(detections.centers, detections.sizes, near_rows, strict=True):
         rows = near[inside_column(scene.points[near], center, size)]
         if len(rows) < MIN_POINTS:
