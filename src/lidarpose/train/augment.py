@@ -150,7 +150,7 @@ def example(sample: Sample, rng: np.random.Generator, *, refined: float = REFINE
     origin = None if rng.random() < BLIND else np.zeros(3)
     points, joints = sample.points - center, sample.pose.joints - center
     visible = seen(joints, points[sample.part > 0]).astype(np.float32)
-    return _example(rng, points, joints, part=sample.part, visible=visible, view=view_features(center, origin))
+    return make_example(rng, points, joints, part=sample.part, visible=visible, view=view_features(center, origin))
 
 
 def people_in(sample: Sample) -> np.ndarray:
@@ -171,7 +171,7 @@ def object_example(sample: Sample, rng: np.random.Generator, *, refined: float =
     if rng.random() < refined:
         center = center + rng.normal(0, _OBJECT_ERROR, 3)
     origin = None if rng.random() < BLIND else np.zeros(3)
-    return _example(
+    return make_example(
         rng,
         sample.points - center,
         np.full((len(BODY26), 3), np.nan),
@@ -207,7 +207,7 @@ def augmented(sample: LabeledSample, kind: Augmentation, rng: np.random.Generato
         points = jitter(points, sigma=kind.jitter, clip=4 * kind.jitter, rng=rng)
     if rng.random() < kind.strays:
         points, part = _with_clutter(points, part, np.zeros(3), _CLUTTER, rng)
-    return replace(_example(rng, points, joints, part=part, visible=visible, view=view), scale=scale)
+    return replace(make_example(rng, points, joints, part=part, visible=visible, view=view), scale=scale)
 
 
 def clip_example(
@@ -236,7 +236,7 @@ def clip_example(
         points = (sample.points - center) @ R.T
         part, visible = np.full(len(points), UNKNOWN_PART), np.full(len(joints), np.nan, np.float32)
         view = view_features(center, None)
-        frames.append(_example(rng, points, (joints - center) @ R.T, part=part, visible=visible, view=view))
+        frames.append(make_example(rng, points, (joints - center) @ R.T, part=part, visible=visible, view=view))
         other_clouds = (
             np.zeros((0, 3)) if cloud is None else (cloud - center) @ R.T
             for cloud in (sample.background, sample.neighbors)
@@ -252,7 +252,7 @@ def clip_example(
     )
 
 
-def _example(rng: np.random.Generator, points: np.ndarray, joints: np.ndarray, **arrays: Any) -> Example:
+def make_example(rng: np.random.Generator, points: np.ndarray, joints: np.ndarray, **arrays: Any) -> Example:
     seed = int(rng.integers(2**31))
     return Example(points=points.astype(np.float32), joints=joints.astype(np.float32), seed=seed, **arrays)
 

@@ -80,6 +80,11 @@ def pretraining_network(recipe: Pretrain) -> tuple[Any, Skeleton]:
         config = replace(config, person=True)
         if recipe.shards:
             raise InputError("objects are made during training, shards have none: leave either away")
+    if recipe.whole_scans and (recipe.shards or not isinstance(config, NetworkConfig)):
+        reason = "are made during training" if recipe.shards else "are for the package's own networks"
+        raise InputError(
+            f"whole_scans {reason}: leave whole_scans or {'shards' if recipe.shards else recipe.size} away"
+        )
     if (recipe.neck, recipe.head, recipe.drop_path) != ("mde", "coordinates", None):
         config = _with_neck_and_head(recipe, config)
     return config, joints

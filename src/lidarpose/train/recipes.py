@@ -32,7 +32,7 @@ HEADS = ("coordinates", "heatmaps")
 # what changes no sample: a resumed run may have others
 FREE = ("workers", "validate", "pictures", "precision")
 # shares of a whole that cannot be all of it
-_BELOW_ONE = ("ema", "mix", "hold_out", "objects")
+_BELOW_ONE = ("ema", "mix", "hold_out", "objects", "whole_scans")
 _MODEL = "ours, dapt, prn, lpformer, lidarcap or ne"
 _OPTIONS = "options of a baseline's network: resample_with_replacement=true, grid=32, ... (docs/train.md)"
 _LEAST = {"batch": 1, "people": 1, "scenes": 1, "uses": 1}
@@ -175,6 +175,9 @@ class Pretrain(PoseRecipe):
     noise: float = _setting(0.15, "how often all points are blurred, by 0.5 to 8 cm", "SHARE")
     objects: float = _setting(
         0.0, "share of crops in which nobody is; the network then says whether somebody is there", "SHARE"
+    )
+    whole_scans: float = _setting(
+        0.0, "share of people cut out of whole synthesized scans, as those whom a search found are", "SHARE"
     )
     shards: tuple[str, ...] = _setting(
         (),

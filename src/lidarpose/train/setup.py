@@ -37,6 +37,7 @@ from lidarpose.train.objectives.objective import Objective
 from lidarpose.train.objectives.verifier_objective import VerifierObjective, missed_by_verifier
 from lidarpose.train.recipes import Finetune, PoseRecipe, Pretrain, Recipe, TrainDetector, TrainVerifier
 from lidarpose.train.run_dir import folder_names
+from lidarpose.train.scan_people import ScanPeopleSource
 from lidarpose.train.torch_dataset import InMemoryDataset
 from lidarpose.train.validation import validate
 
@@ -50,6 +51,8 @@ _NO_VALIDATION = (
 _LEAST_SEQUENCES = 3
 # chunks of a run between two times that a scan is shown: divides by the usual numbers of workers
 _LAG = 12
+# how often a whole scan is shown in pre-training, each time one of its people
+_SCAN_USES = 12
 # share of objects among the synthesized people of fine-tuning, for a network that says whether somebody is there
 _OBJECTS = 0.2
 
@@ -128,7 +131,7 @@ def _detection(recipe: TrainDetector) -> TrainSetup:
         card["init_card"] = header.card
     return TrainSetup(
         objective=objective,
-        source=CandidateSource(seed=recipe.seed, uses=recipe.uses, lag=_lag(recipe)),
+        source=CandidateSource(seed=recipe.seed, uses=recipe.uses, lag=_lag(recipe.batch, recipe.uses)),
         people=recipe.scenes * recipe.uses,
         network=network,
         validation=partial(validation_scans, _VALIDATION_SEED),
@@ -156,7 +159,7 @@ def _verification(recipe: TrainVerifier) -> TrainSetup:
 
     return TrainSetup(
         objective=VerifierObjective(config=config),
-        source=CropSource(seed=recipe.seed, uses=recipe.uses, lag=_lag(recipe)),
+        source=CropSource(seed=recipe.seed, uses=recipe.uses, lag=_lag(recipe.batch, recipe.uses)),
         people=recipe.scenes * recipe.uses,
         network=network,
         validation=partial(validation_crops, _VALIDATION_SEED),
@@ -168,10 +171,10 @@ def _verification(recipe: TrainVerifier) -> TrainSetup:
     )
 
 
-def _lag(recipe: TrainDetector | TrainVerifier) -> int:
-    """Scenes between two times that one is shown: a worker shows each scan again that it has made, for all usual
-    numbers of workers."""
-    return _LAG * BATCHES * recipe.batch // recipe.uses
+def _lag(batch: float, uses: int) -> int:
+    """Scans between two times that one is shown, of so many examples a step: a worker shows each scan again that it has
+    made, for all usual numbers of workers."""
+    return max(int(_LAG * BATCHES * batch) // uses, 1)
 
 
 def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
@@ -192,9 +195,14 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
             return [held_out_source.clip(index, trans_center=config.trans_center) for index in clips]
         return [held_out_source.example(index) for index in range(VALIDATION)]
 
+    source: Source = SyntheticSource(seed=recipe.seed, easy=recipe.easy * recipe.people, **synthetic_settings)
+    if recipe.whole_scans:
+        batch = recipe.batch * recipe.whole_scans
+        other_source = ScanPeopleSource(seed=recipe.seed, uses=_SCAN_USES, lag=_lag(batch, _SCAN_USES))
+        source = MixedSource(main=source, other=other_source, share=recipe.whole_scans)
     setup = TrainSetup(
         objective=objective,
-        source=SyntheticSource(seed=recipe.seed, easy=recipe.easy * recipe.people, **synthetic_settings),
+        source=source,
         people=recipe.people,
         network=network,
         validation=validation,

@@ -1,0 +1,158 @@
+"""People of whole synthesized scans, cut out as those whom a search found are: with whoever and whatever is near.
+
+People of `synth.generator` stand alone or beside one other; these stand in crowds, at walls, in rooms, among things.
+
+Legend: P people of a scan, n points.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidarpose.eval.protocols import jittered
+from lidarpose.geometry import rows_near
+from lidarpose.inference.verification import AROUND, box_about, inside_column
+from lidarpose.models.voxelize import view_features
+from lidarpose.sample import Box, Pose, center_of
+from lidarpose.skeleton import BODY26
+from lidarpose.train.augment import (
+    BLIND,
+    FLIP_PART,
+    PELVIS_ERROR,
+    REFINED,
+    UNKNOWN_PART,
+    Example,
+    make_example,
+    second_person_label,
+    seen,
+)
+from lidarpose.train.detector.candidate_source import SceneSource, scene_to_search
+
+# how a person is cut out: by a box about a pose, by the column about a detection, or by a labeled box
+_CUTS, _CHANCES = ("found", "column", "labeled"), (0.6, 0.15, 0.25)
+# of boxes about poses, standard deviations: of the center along x, y and z, m, and how often it is off by three times
+# that; of the logarithm of edges, whose mean is below zero since poses that are not certain are narrow
+_CENTER, _FAR, _EDGE, _MEAN_EDGE = np.array([0.06, 0.06, 0.03]), 0.15, 0.15, np.array([-0.12, -0.1, -0.03])
+# of a detection's center in x and y, m
+_DETECTION = 0.12
+# each time a person is shown: how often points are lost, and the least share that stays; the largest change of size;
+# the standard deviation of each point, m
+_LOSS, _LEAST_KEPT, _SCALE, _NOISE = 0.5, 0.3, 0.08, 0.004
+# who has fewer points in a scan, or in what a crop leaves, is not shown; points about a person that are kept
+LEAST_POINTS, _MOST_POINTS = 10, 6000
+# scans tried for one with somebody in it, and what lies between their numbers
+_TRIES, _STRIDE = 16, 2**24
+_PELVIS = BODY26.index("pelvis")
+_FLIP = list(BODY26.flip)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ScanPeople:
+    """Who has at least `LEAST_POINTS` points in a scan, z up.
+
+    clouds: P arrays (n, 3) float32 m, the points about each person; owners: of each cloud's points, (n,) int8: 1 the
+    person's, 0 of a thing, -1 another person's; boxes: labeled ones; joints (P, 26, 3) m; neighbors (P,) m: how far
+    the next person's pelvis is; origin (3,) m or None.
+    """
+
+    clouds: list[np.ndarray]
+    owners: list[np.ndarray]
+    boxes: list[Box]
+    joints: np.ndarray
+    neighbors: np.ndarray
+    origin: np.ndarray | None
+
+
+class ScanPeopleSource(SceneSource[ScanPeople, Example]):
+    """One person of a scan at a time, changed a little."""
+
+    def made(self, number: int) -> ScanPeople:
+        for attempt in range(_TRIES):
+            people = scan_people(self.seed, number + attempt * _STRIDE)
+            if people.boxes:
+                break
+        return people
+
+    def shown(self, scan: ScanPeople, rng: np.random.Generator) -> Example:
+        return person_example(scan, int(rng.integers(len(scan.boxes))), rng)
+
+
+def scan_people(seed: int, number: int, *, family: str = "train") -> ScanPeople:
+    """The people of scene `number` of `synth.detection_scene`, leveled as it is when people are searched for."""
+    scene, origin = scene_to_search(seed, number, family)
+    pelvises = scene.joints[:, _PELVIS, :2].astype(float)
+    rng = np.random.default_rng([seed, number])
+    rows, clouds, owners = [], [], []
+    centers = np.array([box.center for box in scene.boxes]).reshape(-1, 3)
+    all_near_rows = rows_near(centers, scene.points, AROUND)
+    for row, near_rows in enumerate(all_near_rows):
+        if len(near_rows) > _MOST_POINTS:
+            near_rows = np.sort(rng.permutation(near_rows)[:_MOST_POINTS])
+        person = scene.person[near_rows]
+        if (person == row).sum() >= LEAST_POINTS:
+            rows.append(row)
+            clouds.append(scene.points[near_rows])
+            owners.append(np.where(person == row, 1, np.where(person >= 0, -1, 0)).astype(np.int8))
+    distances = np.linalg.norm(pelvises[rows, None] - pelvises, axis=-1)
+    distances[np.arange(len(rows)), rows] = np.inf
+    return ScanPeople(
+        clouds=clouds,
+        owners=owners,
+        boxes=[scene.boxes[row] for row in rows],
+        joints=scene.joints[rows],
+        neighbors=distances.min(1, initial=np.inf),
+        origin=origin,
+    )
+
+
+def person_example(scan: ScanPeople, person: int, rng: np.random.Generator) -> Example:
+    """A person of a scan as a training step shows them. The center is that of the crop's points, or, where others are
+    in the crop, of the box; or a guess of the pelvis."""
+    joints = scan.joints[person].astype(float)
+    is_inside, box_center = _cut(scan, person, rng)
+    points, owner = scan.clouds[person][is_inside].astype(float), scan.owners[person][is_inside]
+    if rng.random() < _LOSS:
+        is_kept = rng.random(len(points)) < rng.uniform(_LEAST_KEPT, 1)
+        if (owner[is_kept] == 1).sum() >= LEAST_POINTS:
+            points, owner = points[is_kept], owner[is_kept]
+    center = box_center if (owner < 0).any() else center_of(points)
+    if rng.random() < REFINED:
+        center = joints[_PELVIS] + rng.normal(0, PELVIS_ERROR, 3)
+    view = view_features(center, None if rng.random() < BLIND else scan.origin)
+    points, joints = points - center, joints - center
+    visible = seen(joints, points[owner == 1]).astype(np.float32)
+    part = np.where(owner == 1, UNKNOWN_PART, 0)
+    if rng.random() < 0.5:
+        mirror = np.array([1, -1, 1])
+        points, joints, part = points * mirror, (joints * mirror)[_FLIP], FLIP_PART[part + 1]
+        view[1], visible = -view[1], visible[_FLIP]
+    scale = rng.uniform(1 - _SCALE, 1 + _SCALE)
+    points = scale * points + rng.normal(0, _NOISE, points.shape)
+    example = make_example(rng, points, scale * joints, part=part, visible=visible, view=view, scale=scale)
+    others = second_person_label(int((owner < 0).sum()), len(owner))
+    return replace(example, person=np.array([1, others], np.float32))
+
+
+def _cut(scan: ScanPeople, person: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Which points about a person are in the crop, (n,) bool, and the center (3,) m that says who is meant."""
+    cloud, owner, box = scan.clouds[person], scan.owners[person], scan.boxes[person]
+    cut = rng.choice(_CUTS, p=_CHANCES)
+    if cut == "found":
+        pose_box = box_about(Pose(joints=scan.joints[person].astype(float), skeleton=BODY26), scan.neighbors[person])
+        factor = 3.0 if rng.random() < _FAR else 1.0
+        cut_box = replace(
+            pose_box,
+            center=pose_box.center + factor * rng.normal(0, _CENTER),
+            size=pose_box.size * np.exp(rng.normal(_MEAN_EDGE, _EDGE)),
+        )
+        is_inside, center = cut_box.contains(cloud), cut_box.center
+    elif cut == "column":
+        center = box.center + np.append(rng.normal(0, _DETECTION, 2), 0)
+        is_inside = inside_column(cloud, center, box.size)
+    else:
+        cut_box = jittered(box, rng)
+        is_inside, center = cut_box.contains(cloud), cut_box.center
+    if (owner[is_inside] == 1).sum() < LEAST_POINTS:
+        # next to nothing of the person is in it
+        is_inside, center = (owner == 1) | box.contains(cloud), box.center
+    return is_inside, center

@@ -1,0 +1,103 @@
+"""People of whole scans as training shows them: who is in a crop, what is labeled, and how they join a run."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from lidarpose.errors import InputError
+from lidarpose.inference.verification import AROUND
+from lidarpose.skeleton import BODY26
+from lidarpose.synth.detection_scene import detection_scene
+from lidarpose.train import scan_people
+from lidarpose.train.augment import UNKNOWN_PART
+from lidarpose.train.data_loader import MixedSource
+from lidarpose.train.detector.candidate_source import scene_to_search
+from lidarpose.train.recipes import Pretrain
+from lidarpose.train.scan_people import LEAST_POINTS, ScanPeopleSource, person_example
+from lidarpose.train.setup import make_setup
+
+SEED = 4
+LEFT, RIGHT = (BODY26.index(f"{side}_shoulder") for side in ("left", "right"))
+PELVIS = BODY26.index("pelvis")
+
+
+@pytest.fixture(scope="module")
+def scan():
+    """One with people close together."""
+    scans = [scan_people.scan_people(SEED, number) for number in range(12)]
+    return min((scan for scan in scans if len(scan.boxes) > 3), key=lambda scan: np.sort(scan.neighbors)[2])
+
+
+def examples(scan, count):
+    people = np.arange(count) % len(scan.boxes)
+    return [(k, person_example(scan, k, np.random.default_rng([9, i]))) for i, k in enumerate(people.tolist())]
+
+
+def test_the_people_of_a_scan_are_those_with_points_and_their_surroundings():
+    number = next(n for n in range(9) if len(detection_scene(SEED, n).boxes) > 4)
+    scene, scan = scene_to_search(SEED, number, "train")[0], scan_people.scan_people(SEED, number)
+    counts = np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes))
+    assert {box.id for box in scan.boxes} <= set(np.flatnonzero(counts >= LEAST_POINTS).tolist())
+    for box, cloud, owner, joints in zip(scan.boxes, scan.clouds, scan.owners, scan.joints, strict=True):
+        assert (np.abs(cloud[:, :2] - box.center[:2]) < AROUND).all() and len(cloud) <= 6000
+        assert LEAST_POINTS <= (owner == 1).sum() <= counts[box.id]
+        assert box.contains(joints[None, PELVIS])[0] and box.contains(cloud[owner == 1]).mean() > 0.95
+    again = scan_people.scan_people(SEED, number)
+    assert all(np.array_equal(a, b) for a, b in zip(scan.clouds, again.clouds, strict=True))
+
+
+def test_a_crop_shows_its_person_and_says_what_is_not_theirs(scan):
+    second, mirrored = [], []
+    for person, example in examples(scan, 120):
+        assert (example.part == UNKNOWN_PART).sum() >= min(LEAST_POINTS, (scan.owners[person] == 1).sum()) > 0
+        assert set(np.unique(example.part)) <= {UNKNOWN_PART, 0} and len(example.part) == len(example.points)
+        # a scale and nothing else changes the body
+        true = scan.joints[person].astype(float)
+        lengths = [np.linalg.norm(joints[LEFT] - joints[RIGHT]) for joints in (true, example.joints)]
+        assert lengths[1] == pytest.approx(lengths[0] * example.scale, rel=1e-5)
+        assert 0.9 < example.scale < 1.1 and np.linalg.norm(example.joints[PELVIS]) < 1.5
+        side = np.cross(true[LEFT] - true[RIGHT], true[PELVIS + 1] - true[PELVIS])
+        after = example.joints.astype(float)
+        turned = np.cross(after[LEFT] - after[RIGHT], after[PELVIS + 1] - after[PELVIS])
+        mirrored.append(np.sign(side[1]) != np.sign(turned[1]))
+        assert example.person[0] == 1
+        second.append(example.person[1])
+        # where the sensor is known it is known for what is shown
+        assert example.view[4] == 0 or np.linalg.norm(example.view[:3]) == pytest.approx(1)
+    assert 0.3 < np.mean(mirrored) < 0.7 and np.nanmax(second) == 1
+
+
+def test_an_example_depends_on_its_number_alone():
+    source = ScanPeopleSource(seed=SEED, uses=3, lag=2)
+    first = [source.example(index) for index in range(8)]
+    alone = pickle.loads(pickle.dumps(source)).example(7)
+    assert np.array_equal(first[7].points, alone.points) and first[7].seed == alone.seed
+    assert len({example.seed for example in first}) == 8
+
+
+def test_a_scan_without_anybody_is_skipped(monkeypatch, scan):
+    empty = scan_people.ScanPeople(
+        clouds=[], owners=[], boxes=[], joints=np.zeros((0, 26, 3)), neighbors=np.zeros(0), origin=None
+    )
+    asked = []
+
+    def people(seed, number):
+        asked.append(number)
+        return scan if len(asked) > 2 else empty
+
+    monkeypatch.setattr(scan_people, "scan_people", people)
+    assert ScanPeopleSource(seed=SEED, uses=1, lag=1).made(5) is scan
+    assert len(set(asked)) == 3 and asked[0] == 5
+
+
+def test_they_join_pretraining_as_a_share(monkeypatch):
+    setup = make_setup(Pretrain(whole_scans=0.25, people=64))
+    assert isinstance(setup.source, MixedSource) and setup.source.share == 0.25
+    assert isinstance(setup.source.other, ScanPeopleSource)
+    with pytest.raises(InputError, match="whole_scans are for the package's own networks: leave whole_scans or prn"):
+        make_setup(Pretrain(whole_scans=0.1, size="prn"))
+    with pytest.raises(InputError, match="whole_scans are made during training: leave whole_scans or shards away"):
+        make_setup(Pretrain(whole_scans=0.1, shards=("somewhere",)))
+    with pytest.raises(InputError, match="whole_scans must be a share, below 1, got 1"):
+        Pretrain(whole_scans=1)
