@@ -18,8 +18,9 @@ from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
 from lidarpose.inference.background import is_static, read_background
 from lidarpose.inference.checks import flat_along_another_axis, flat_axis, scan_unit_warning, unlikely_origin
 from lidarpose.inference.inputs import as_origin
+from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.scan import Scan, read_scan, up_text
-from lidarpose.inference.verification import KnownPlaces, rounded, verified
+from lidarpose.inference.verification import rounded, verified
 from lidarpose.io.boxes import Boxes
 from lidarpose.models.detector.detector import Detections, Detector
 from lidarpose.models.detector.ground import estimate_up

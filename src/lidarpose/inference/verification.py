@@ -4,7 +4,7 @@ boxes are drawn about their poses.
 Legend: D detections.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from lidarpose.geometry import distance_to_segments, rotation_about, rows_near
 from lidarpose.inference.backend import Backend, OnnxBackend, Raw, estimates
+from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.tta import TTATransform, apply
 from lidarpose.models import DEFAULT, VERIFIER, weights_file
 from lidarpose.models.decode import decoder, sigmoid
@@ -48,41 +49,12 @@ _LOG_POINTS = (np.log1p(MIN_POINTS), np.log1p(1e5))
 # whose points are left out where others are looked for beside them: people of at least this score, points so near to
 # their bones, m
 _SURE_SCORE, _BODY = 0.5, 0.18
-# a detection so near to where somebody is expected is that person, m, if no other is expected within the second
-# distance
-_EXPECTED, _ALONE = 0.5, 1.0
 # who is expected may have moved by so much out of the box, m
 _MOVED = 0.15
-# a place that held nobody is not looked at again for a while: a score below this share of the least, and a distance, m
-_NOBODY, _SAME_PLACE = 1 / 3, 0.3
-# the least score where a track is expected
-WEAK_SCORE = 0.1
+# a place is known to hold nobody below this share of the least score
+_NOBODY = 1 / 3
 # decimals of meters in boxes, as they are written
 _DECIMALS = 4
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class KnownPlaces:
-    """What the frames before say of a scan, in its frame.
-
-    boxes: of the K people who need no verification, where they are expected, with the scores they had when they were
-    verified; pelvises (K, 3) m; tracks (M, 3) m: where anybody is expected, the K first, within reach (M,) m: who is
-    not found there is searched for among detections of `WEAK_SCORE` or more; rejected (R, 3) m: places of detections
-    that were nobody.
-    """
-
-    boxes: Sequence[Box]
-    pelvises: np.ndarray
-    tracks: np.ndarray
-    reach: np.ndarray
-    rejected: np.ndarray
-
-    def level(self, R_level_input: np.ndarray) -> "KnownPlaces":
-        """In the scan's level frame."""
-        level_points = {name: getattr(self, name) @ R_level_input.T for name in ("pelvises", "tracks", "rejected")}
-        return replace(
-            self, boxes=[replace(box, center=R_level_input @ box.center) for box in self.boxes], **level_points
-        )
 
 
 @cache
@@ -222,8 +194,8 @@ def verified(
     highest_scores = _highest_score(detections, header)
     known_index, thresholds = np.full(len(detections), -1), np.full(len(detections), least_score)
     if known is not None:
-        known_index = _expected(detections, highest_scores >= least_score, known)
-        thresholds = _least_scores(detections, known_index, least_score, known)
+        known_index = known.index_of(detections.centers, highest_scores >= least_score)
+        thresholds = known.least_scores(detections.centers, known_index, least_score)
     possible_rows = np.flatnonzero(highest_scores >= thresholds)
     # who is expected needs neither verdict nor pose
     posed_from = np.where(known_index < 0, thresholds, np.inf)
@@ -359,38 +331,6 @@ def _boxed(
         is_owned[own_rows] = True
         people.append((i, replace(box, score=float(scores[i]), mounted=is_mounted), own_rows))
     return people
-
-
-def _least_scores(
-    detections: Detections, known_index: np.ndarray, least_score: float, known_places: KnownPlaces
-) -> np.ndarray:
-    """(D,): what a detection's score must be: less where a known person is missed, infinite where it turned out to be
-    nobody."""
-    thresholds = np.full(len(detections), least_score)
-    is_missed = ~np.isin(np.arange(len(known_places.tracks)), known_index)
-    is_near = (_apart(detections.centers, known_places.tracks[is_missed]) < known_places.reach[is_missed]).any(1)
-    thresholds[is_near] = min(least_score, WEAK_SCORE)
-    is_nobody = (_apart(detections.centers, known_places.rejected) < _SAME_PLACE).any(1)
-    thresholds[is_nobody & ~is_near & (known_index < 0)] = np.inf
-    return thresholds
-
-
-def _expected(detections: Detections, is_sure: np.ndarray, known_places: KnownPlaces) -> np.ndarray:
-    """Of each detection, those that are sure enough, which known person it is: (D,) int, -1: none."""
-    known_index = np.full(len(detections), -1)
-    sure_rows = np.flatnonzero(is_sure)
-    if len(sure_rows) and known_places.boxes:
-        distances = _apart(detections.centers[sure_rows], known_places.tracks[: len(known_places.boxes)])
-        is_alone = (_apart(known_places.tracks, known_places.tracks) < _ALONE).sum(0)[: len(known_places.boxes)] == 1
-        nearest_rows = distances.argmin(0)
-        for k in np.flatnonzero(is_alone & (distances.min(0) < _EXPECTED)):
-            known_index[sure_rows[nearest_rows[k]]] = k
-    return known_index
-
-
-def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Level distances of a (A, 2+) from b (B, 2+): (A, B) m."""
-    return np.linalg.norm(a[:, None, :2] - b[None, :, :2], axis=-1)
 
 
 def box_about(pose: Pose, nearest_distance: float) -> Box:

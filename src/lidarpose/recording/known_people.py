@@ -6,9 +6,9 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from lidarpose.geometry import transform_points
+from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.inference.scan import Scan
-from lidarpose.inference.verification import KnownPlaces
 from lidarpose.recording.coordinates import FixedFrame, moved_yaw
 from lidarpose.sample import Box, Pose
 from lidarpose.tracking.live import LiveFilter
