@@ -16,7 +16,8 @@ from lidarpose.eval.detector.labeled_scans import heldout_scans
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
 from lidarpose.inference import detection, verification
 from lidarpose.lidar.raycast import scan
-from lidarpose.models.detector.detector import Detector
+from lidarpose.models.detector.candidates import SceneIndex
+from lidarpose.models.detector.detector import Detector, rows_that_matter
 from lidarpose.synth.bodies import draw_bodies
 from lidarpose.synth.detection_scene import detection_scene
 from lidarpose.synth.environment.mesh import Mesh, box, quad, union
@@ -592,6 +593,24 @@ def test_people_beside_others_are_looked_for_near_them_alone(hidden):
     none = np.zeros(len(scene.points), bool)
     assert not len(detector.detect_beside(scene.points, scene.origin, people[:0], detections.ground))
     assert not len(detector.detect_beside(scene.points, scene.origin, people, detections.ground, moving=none))
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_a_few_places_look_the_same_without_the_points_that_do_not_matter(hidden, is_known):
+    scene, _, detections = hidden
+    origin = scene.origin if is_known else None
+    # one nearer to the sensor than a view is wide
+    places = np.concatenate([scene.joints[:4, 0].astype(float), scene.origin[None] + [0.9, 0.4, -1.0]])
+    places[:, 2] = detections.ground.at(places[:, :2])
+    for part in (places, places[:1], places[:0]):
+        rows = rows_that_matter(scene.points, origin, part)
+        all_of_it, some = (
+            SceneIndex(points, detections.ground, origin).candidates(part)
+            for points in (scene.points, scene.points[rows])
+        )
+        for name in ("count", "range_views", "contexts", "sizes"):
+            np.testing.assert_array_equal(getattr(all_of_it, name), getattr(some, name), err_msg=name)
+        assert len(rows) < len(scene.points) or len(part) > 1
 
 
 def test_of_two_whose_pelvises_meet_the_surer_one_stays():

@@ -298,6 +298,9 @@ def _on_people(
     for row, _, own_rows in people:
         if row not in known_boxes:
             own_rows, joints = places.near_rows[row], places.joints[row]
+            near_points, low, high = points[own_rows], joints.min(0) - _BODY, joints.max(0) + _BODY
+            # far fewer than those about a person
+            own_rows = own_rows[((near_points > low) & (near_points < high)).all(1)]
             distance = distance_to_segments(points[own_rows], joints[starts], joints[ends])
             own_rows = own_rows[distance < _BODY]
         is_body[own_rows] = True

@@ -31,6 +31,9 @@ _OWN_RADIUS = 0.35
 SAME = 0.15
 # beside people somebody is looked for so far away; a proposal is told by what is so far about it, m
 _BESIDE, _COLUMN = (0.3, 0.85), 1.0
+# what is looked at for a place: so far around it, m, and in its direction so far to both sides, m, and a bit more, rad,
+# by so many bins of directions
+_CONTEXT, _VIEW, _VIEW_MARGIN, _BINS = 8.0, 2.0, 0.1, 512
 # a box: side, side of somebody mounted, what is added to the height; and bounds of what the network says, m
 _SIDE, _MOUNTED_SIDE, _ROOM = 0.9, 1.1, 0.1
 _MOST_SHIFT, _MOST_FOOT, _HEIGHTS = 0.6, 1.0, (0.5, 2.3)
@@ -149,9 +152,10 @@ class Detector:
         places = propose(near_points, ground)
         distance = np.linalg.norm(places[:, None, :2] - people[None], axis=-1).min(1, initial=np.inf)
         places = places[(distance > _BESIDE[0]) & (distance < _BESIDE[1])]
-        # x after x in memory, as above; mostly there is nobody
-        points = np.ascontiguousarray((points if len(places) else near_points).T).T
-        return self._detections(SceneIndex(points, ground, origin), places, np.arange(len(points)), True, None)
+        scan_rows = rows_that_matter(points, origin, places)
+        # x after x in memory, as above
+        points = np.ascontiguousarray(points[scan_rows].T).T
+        return self._detections(SceneIndex(points, ground, origin), places, scan_rows, True, None)
 
     def _detections(
         self, scene: SceneIndex, places: np.ndarray, scan_rows: np.ndarray, has_ground: bool, limit: int | None
@@ -184,6 +188,26 @@ class Detector:
             return sigmoid(logit)
         logits, probabilities = self.header["calibration"]
         return np.interp(logit, logits, probabilities)
+
+
+def rows_that_matter(points: np.ndarray, origin: np.ndarray | None, places: np.ndarray) -> np.ndarray:
+    """The rows (k,) of points (n, 3) m that `SceneIndex` looks at for few places (K, 3) m: those around each, and all
+    that a sensor at origin (3,) m sees in its direction."""
+    is_used = np.zeros(len(points), bool)
+    for rows in rows_near(places, points, _CONTEXT):
+        is_used[rows] = True
+    if origin is not None and len(places):
+        x, y = (places[:, i] - origin[i] for i in (0, 1))
+        half_widths = np.arcsin(np.minimum(_VIEW / np.hypot(x, y).clip(1e-6), 1)) + _VIEW_MARGIN
+        # by whole bins; who is nearer than a view is wide may be seen anywhere
+        half_widths[np.hypot(x, y) < _VIEW] = np.pi
+        middles = (np.arange(_BINS) + 0.5) * (2 * np.pi / _BINS) - np.pi
+        turns = np.abs((middles[:, None] - np.arctan2(y, x) + np.pi) % (2 * np.pi) - np.pi)
+        is_seen = (turns < half_widths + np.pi / _BINS).any(1)
+        x, y = ((points[:, i] - origin[i]).astype(np.float32) for i in (0, 1))
+        bins = ((np.arctan2(y, x) + np.float32(np.pi)) * np.float32(_BINS / (2 * np.pi))).astype(np.int32)
+        is_used |= is_seen[np.minimum(bins, _BINS - 1)]
+    return np.flatnonzero(is_used)
 
 
 def predicted_boxes(places: np.ndarray, yaw: np.ndarray, outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
