@@ -211,17 +211,8 @@ def verified(
         places.scores[known_rows] = [box.score for box in known_boxes.values()]
         places.pelvises[known_rows] = known.pelvises[known_index[known_rows]]
     if detect_beside is not None:
-        sure_pelvises = np.where(places.scores[:, None] >= _SURE_SCORE, places.pelvises, np.nan)
-        sure_people = _boxed(replace(places, pelvises=sure_pelvises), points, _SURE_SCORE, None, known_boxes)
-        posed_rows = [row for row, _, _ in sure_people if row not in known_boxes]
-        if posed_rows:
-            other_rows = np.flatnonzero(~_on_people(places, sure_people, points, known_boxes))
-            hidden = detect_beside(other_rows, places.pelvises[posed_rows, :2])
-            posed_from = np.full(len(hidden), least_score)
-            rows = np.flatnonzero(_highest_score(hidden, header) >= posed_from)
-            hidden_places = _assessed(hidden, points[other_rows], origin, header, posed_from, max_people, rows)
-            places = places.joined(hidden_places, other_rows)
-            thresholds = np.append(thresholds, posed_from)
+        places = _with_hidden(places, known_boxes, points, origin, header, least_score, max_people, detect_beside)
+        thresholds = np.append(thresholds, np.full(len(places.scores) - len(thresholds), least_score))
     places.pelvises[places.scores < thresholds] = np.nan
     people = _boxed(places, points, least_score, max_people, known_boxes)
     kept_rows = [row for row, _, _ in people]
@@ -285,6 +276,30 @@ def _assessed(
     return _Places(
         scores=scores, logits=logits, mounted=mounted, joints=poses.joints, pelvises=pelvises, near_rows=near_rows
     )
+
+
+def _with_hidden(
+    places: _Places,
+    known_boxes: dict[int, Box],
+    points: np.ndarray,
+    origin: np.ndarray | None,
+    header: dict,
+    least_score: float,
+    max_people: int | None,
+    detect_beside: DetectBeside,
+) -> _Places:
+    """The places, and then those beside sure people, of what is left without these people's points."""
+    sure_pelvises = np.where(places.scores[:, None] >= _SURE_SCORE, places.pelvises, np.nan)
+    people = _boxed(replace(places, pelvises=sure_pelvises), points, _SURE_SCORE, None, known_boxes)
+    posed_rows = [row for row, _, _ in people if row not in known_boxes]
+    if not posed_rows:
+        return places
+    other_rows = np.flatnonzero(~_on_people(places, people, points, known_boxes))
+    hidden = detect_beside(other_rows, places.pelvises[posed_rows, :2])
+    posed_from = np.full(len(hidden), least_score)
+    rows = np.flatnonzero(_highest_score(hidden, header) >= posed_from)
+    hidden_places = _assessed(hidden, points[other_rows], origin, header, posed_from, max_people, rows)
+    return places.joined(hidden_places, other_rows)
 
 
 def _on_people(
