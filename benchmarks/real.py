@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import lidarpose
+from lidarpose.geometry import distance_to_segments
 from lidarpose.inference.predictor import TTA, Predictor
 from lidarpose.inference.results import PersonPose
 from lidarpose.io.files import write_atomic
@@ -30,11 +31,8 @@ NEAR = 0.15
 
 def distance_to_bones(points: np.ndarray, joints: np.ndarray) -> np.ndarray:
     """points (n, 3), joints (24, 3) m -> (n,) m to the nearest bone."""
-    start, end = joints[[a for a, _ in SMPL24.bones]], joints[[b for _, b in SMPL24.bones]]
-    bone = end - start
-    share = ((points[:, None] - start) * bone).sum(-1) / np.maximum((bone**2).sum(-1), 1e-9)
-    nearest = start + np.clip(share, 0, 1)[..., None] * bone
-    return np.linalg.norm(points[:, None] - nearest, axis=-1).min(1)
+    start, end = np.array(SMPL24.bones).T
+    return distance_to_segments(points, joints[start], joints[end])
 
 
 def rows_of(model: Predictor, four: Predictor, folder: Path, least: int) -> Iterator[tuple[dict, PersonPose]]:

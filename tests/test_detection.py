@@ -561,9 +561,9 @@ def test_who_is_beside_somebody_is_found_without_their_points(hidden):
 
     def detect_beside(rows, people):
         rows_asked.append((rows, people))
-        return detector.detect_beside(scene.points[rows], scene.origin, people, detections.ground)
+        return detector.detect_beside(scene.points, scene.origin, detections.ground, rows, people)
 
-    def found(people):
+    def is_detected(people):
         centers = np.array([box.center[:2] for box in people.boxes])
         return np.linalg.norm(centers - scene.boxes[6].center[:2], axis=1).min() < 0.3
 
@@ -571,8 +571,8 @@ def test_who_is_beside_somebody_is_found_without_their_points(hidden):
     alone = verification.verified(*given)
     people = verification.verified(*given, detect_beside=detect_beside)
     ((rows, places),) = rows_asked
-    assert found(people) and not found(alone)
-    # nobody else is lost, and the points on those who were found were not looked at again
+    assert is_detected(people) and not is_detected(alone)
+    # nobody else is lost, and the points on those who were detected were not looked at again
     assert {tuple(box.center) for box in alone.boxes} <= {tuple(box.center) for box in people.boxes}
     assert scene.num_points[6] > 100 and len(places) >= len(alone.boxes)
     left = np.isin(np.arange(len(scene.points)), rows)
@@ -586,13 +586,14 @@ def test_who_is_beside_somebody_is_found_without_their_points(hidden):
 def test_people_beside_others_are_looked_for_near_them_alone(hidden):
     scene, detector, detections = hidden
     people = scene.joints[:3, 0, :2].astype(float)
-    beside = detector.detect_beside(scene.points, scene.origin, people, detections.ground)
+    rows = np.arange(len(scene.points))
+    given = scene.points, scene.origin, detections.ground, rows
+    beside = detector.detect_beside(*given, people)
     distance = np.linalg.norm(beside.centers[:, None, :2] - people, axis=-1).min(1)
     assert 0 < len(beside) < len(detections) and distance.max() < 0.85 + 0.6
     # of nobody, and where nothing moves
-    none = np.zeros(len(scene.points), bool)
-    assert not len(detector.detect_beside(scene.points, scene.origin, people[:0], detections.ground))
-    assert not len(detector.detect_beside(scene.points, scene.origin, people, detections.ground, moving=none))
+    assert not len(detector.detect_beside(*given, people[:0]))
+    assert not len(detector.detect_beside(*given, people, moving=np.zeros(len(rows), bool)))
 
 
 @pytest.mark.parametrize("is_known", [True, False])

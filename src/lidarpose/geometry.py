@@ -170,10 +170,6 @@ def vector_of(given: Any) -> np.ndarray | None:
     return vector if vector.shape == (3,) and np.isfinite(vector).all() else None
 
 
-# strips are numbered by 16 bits, which sort in linear time
-_LAST_STRIP = 65_535
-
-
 def distance_to_segments(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
     """points (n, 3), segments from starts (S, 3) to ends (S, 3), S >= 1 -> (n,): to the nearest segment."""
     direction = ends - starts
@@ -185,6 +181,10 @@ def distance_to_segments(points: np.ndarray, starts: np.ndarray, ends: np.ndarra
         share = np.clip(offset @ along / square, 0, 1)
         np.minimum(nearest, ((offset - share[:, None] * along) ** 2).sum(1), out=nearest)
     return np.sqrt(nearest)
+
+
+# strips are numbered by 16 bits, which sort in linear time
+_LAST_STRIP = 65_535
 
 
 class Strips:

@@ -7,7 +7,7 @@ Legend: D detections.
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
@@ -230,11 +230,7 @@ def verify_people(places: Places, search: Search, known: KnownPlaces | None = No
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     known_level = None if known is None or is_tilted else known.level(scan.R_level_input)
     detector = search.detector or _detector()
-
-    def detect_beside(rows: np.ndarray, people: np.ndarray) -> Detections:
-        moving = None if places.moving is None else places.moving[rows]
-        return detector.detect_beside(places.level[rows], origin, people, detections.ground, moving=moving)
-
+    detect_beside = partial(detector.detect_beside, places.level, origin, detections.ground, moving=places.moving)
     people = verified(
         detections,
         places.level,

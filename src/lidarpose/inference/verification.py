@@ -198,9 +198,8 @@ def verified(
         thresholds = known.least_scores(detections.centers, known_index, least_score)
     possible_rows = np.flatnonzero(highest_scores >= thresholds)
     # who is expected needs neither verdict nor pose
-    posed_from = np.where(known_index < 0, thresholds, np.inf)
-    if detect_beside is not None:
-        posed_from = np.where(known_index < 0, np.minimum(thresholds, _SURE_SCORE), np.inf)
+    posed_from = thresholds if detect_beside is None else np.minimum(thresholds, _SURE_SCORE)
+    posed_from = np.where(known_index < 0, posed_from, np.inf)
     places = _assessed(detections, points, origin, header, posed_from, max_people, possible_rows)
     is_nobody = places.scores[possible_rows] < _NOBODY * least_score
     rejected = detections.centers[possible_rows[is_nobody & (known_index[possible_rows] < 0)]]
@@ -307,9 +306,7 @@ def _on_people(
 ) -> np.ndarray:
     """(n,) bool: which points are on the bodies of people, as of `_boxed`, or in the boxes of known ones."""
     is_body = np.zeros(len(points), bool)
-    skeleton = _bundled(DEFAULT).header.skeleton
-    ends = [j for j, parent in enumerate(skeleton.parents) if parent >= 0]
-    starts = [skeleton.parents[j] for j in ends]
+    starts, ends = np.array(_bundled(DEFAULT).header.skeleton.bones).T
     for row, _, own_rows in people:
         if row not in known_boxes:
             own_rows, joints = places.near_rows[row], places.joints[row]

@@ -253,6 +253,7 @@ def clip_example(
 
 
 def make_example(rng: np.random.Generator, points: np.ndarray, joints: np.ndarray, **arrays: Any) -> Example:
+    """An `Example` of points (n, 3) and joints (26, 3) m in the person's frame; arrays: its other fields."""
     seed = int(rng.integers(2**31))
     return Example(points=points.astype(np.float32), joints=joints.astype(np.float32), seed=seed, **arrays)
 

@@ -177,7 +177,7 @@ class Pretrain(PoseRecipe):
         0.0, "share of crops in which nobody is; the network then says whether somebody is there", "SHARE"
     )
     whole_scans: float = _setting(
-        0.0, "share of people cut out of whole synthesized scans, as those whom a search found are", "SHARE"
+        0.0, "share of people cut out of whole synthesized scans, as people are who were detected", "SHARE"
     )
     shards: tuple[str, ...] = _setting(
         (),

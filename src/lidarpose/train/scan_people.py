@@ -1,4 +1,4 @@
-"""People of whole synthesized scans, cut out as those whom a search found are: with whoever and whatever is near.
+"""People of whole synthesized scans, cut out as people are who were detected: with whoever and whatever is near.
 
 People of `synth.generator` stand alone or beside one other; these stand in crowds, at walls, in rooms, among things.
 
@@ -17,7 +17,6 @@ from lidarpose.sample import Box, Pose, center_of
 from lidarpose.skeleton import BODY26
 from lidarpose.train.augment import (
     BLIND,
-    FLIP_PART,
     PELVIS_ERROR,
     REFINED,
     UNKNOWN_PART,
@@ -29,7 +28,7 @@ from lidarpose.train.augment import (
 from lidarpose.train.detector.candidate_source import SceneSource, scene_to_search
 
 # how a person is cut out: by a box about a pose, by the column about a detection, or by a labeled box
-_CUTS, _CHANCES = ("found", "column", "labeled"), (0.6, 0.15, 0.25)
+_CUTS, _CHANCES = ("pose box", "column", "labeled box"), (0.6, 0.15, 0.25)
 # of boxes about poses, standard deviations: of the center along x, y and z, m, and how often it is off by three times
 # that; of the logarithm of edges, whose mean is below zero since poses that are not certain are narrow
 _CENTER, _FAR, _EDGE, _MEAN_EDGE = np.array([0.06, 0.06, 0.03]), 0.15, 0.15, np.array([-0.12, -0.1, -0.03])
@@ -124,7 +123,7 @@ def person_example(scan: ScanPeople, person: int, rng: np.random.Generator) -> E
     part = np.where(owner == 1, UNKNOWN_PART, 0)
     if rng.random() < 0.5:
         mirror = np.array([1, -1, 1])
-        points, joints, part = points * mirror, (joints * mirror)[_FLIP], FLIP_PART[part + 1]
+        points, joints = points * mirror, (joints * mirror)[_FLIP]
         view[1], visible = -view[1], visible[_FLIP]
     scale = rng.uniform(1 - _SCALE, 1 + _SCALE)
     points = scale * points + rng.normal(0, _NOISE, points.shape)
@@ -137,7 +136,7 @@ def _cut(scan: ScanPeople, person: int, rng: np.random.Generator) -> tuple[np.nd
     """Which points about a person are in the crop, (n,) bool, and the center (3,) m that says who is meant."""
     cloud, owner, box = scan.clouds[person], scan.owners[person], scan.boxes[person]
     cut = rng.choice(_CUTS, p=_CHANCES)
-    if cut == "found":
+    if cut == "pose box":
         pose_box = box_about(Pose(joints=scan.joints[person].astype(float), skeleton=BODY26), scan.neighbors[person])
         factor = 3.0 if rng.random() < _FAR else 1.0
         cut_box = replace(

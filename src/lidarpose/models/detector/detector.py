@@ -29,7 +29,7 @@ _STRAY, _NEARLY_ALL = 100.0, (0.1, 99.9)
 _OWN_RADIUS = 0.35
 # detections nearer than this are one person, m: the network moves those of one to the same place
 SAME = 0.15
-# beside people somebody is looked for so far away; a proposal is told by what is so far about it, m
+# beside people somebody is looked for so far away; a proposal is judged by what is so far about it, m
 _BESIDE, _COLUMN = (0.3, 0.85), 1.0
 # what is looked at for a place: so far around it, m, and in its direction so far to both sides, m, and a bit more, rad,
 # by so many bins of directions
@@ -133,26 +133,27 @@ class Detector:
         self,
         points: np.ndarray,
         origin: np.ndarray | None,
-        people: np.ndarray,
         ground: Ground,
+        rows: np.ndarray,
+        people: np.ndarray,
         *,
         moving: np.ndarray | None = None,
     ) -> Detections:
-        """Who stands beside people whom `detect` found, and was taken for one with them.
+        """Who stands beside people whom `detect` returned, and was taken for one with them.
 
         Args:
-            points: (n, 3) m, those of the people left out.
-            origin, moving: as of `detect`.
+            points, origin, moving: as of `detect`.
+            ground: as `detect` returned it.
+            rows: (m,) of the points that are not on these people.
             people: (K, 2) m, where they are.
-            ground: as `detect` found it.
         """
-        selected_rows = np.arange(len(points)) if moving is None else np.flatnonzero(moving)
+        selected_rows = rows if moving is None else rows[moving[rows]]
         near_rows = rows_near(people, points[selected_rows], _BESIDE[1] + _COLUMN)
         near_points = points[selected_rows[np.unique(np.concatenate([np.zeros(0, int), *near_rows]))]]
         places = propose(near_points, ground)
         distance = np.linalg.norm(places[:, None, :2] - people[None], axis=-1).min(1, initial=np.inf)
         places = places[(distance > _BESIDE[0]) & (distance < _BESIDE[1])]
-        scan_rows = rows_that_matter(points, origin, places)
+        scan_rows = rows[rows_that_matter(points[rows], origin, places)]
         # x after x in memory, as above
         points = np.ascontiguousarray(points[scan_rows].T).T
         return self._detections(SceneIndex(points, ground, origin), places, scan_rows, True, None)

@@ -62,7 +62,7 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
             people = np.array([scene.boxes[row].center[:2] for row in box_rows]).reshape(-1, 2)
             detections = detector.detect(scene.points, scene.origin, max_range=MAX_RANGE, limit=MOST_POSED)
             features = verification_features(detections, scene.points, scene.origin)
-            beside = partial(_beside, detector, scene.points, scene.origin, detections)
+            beside = partial(detector.detect_beside, scene.points, scene.origin, detections.ground)
             verify = partial(verified, detections, scene.points, scene.origin, detect_beside=beside)
             tables.append(ScanTable(detections=detections, features=features, people=people, verify=verify))
             bar.update(number + 1)
@@ -73,18 +73,6 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
         card |= {"default_score": max(card["default_score"], result.thresholds[f"{FALSE:g}"])}
         export_detector(network, out, card=card | {"labeled_scans": result.scans})
     return out
-
-
-def _beside(
-    detector: Detector,
-    points: np.ndarray,
-    origin: np.ndarray,
-    detections: Detections,
-    rows: np.ndarray,
-    people: np.ndarray,
-) -> Detections:
-    """`verification.DetectBeside` of a scan."""
-    return detector.detect_beside(points[rows], origin, people, detections.ground)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
