@@ -7,7 +7,6 @@ makes it in another process, then a training step on it.
 """
 
 import argparse
-import inspect
 import math
 import sys
 import time
@@ -364,16 +363,13 @@ def _from_files(ours: Ours, folder: Path, threads: int, left_out: list[str]) -> 
         left_out.append(f"{ours.name} ONNX: {reason(error)}")
     if ours.name != "tiny":
         return
-    for backend in ("torch", "onnx"):
+    of_backend: dict[str, dict] = {"torch": {}, "onnx": {"threads": threads}}
+    for backend, options in of_backend.items():
         try:
             from lidarpose.inference.predictor import load
 
-            if backend == "onnx" and "backend" not in inspect.signature(load).parameters:
-                raise ImportError("this version's predictor has no ONNX backend")
-            load_options = {"backend": backend, "threads": threads}
-            load_parameters = inspect.signature(load).parameters
-            supported_options = {name: value for name, value in load_options.items() if name in load_parameters}
-            yield Predict(f"tiny predict(), {backend}", load(weights, tta=1, **supported_options), ours.parameters)
+            predictor = load(weights, tta=1, backend=backend, **options)
+            yield Predict(f"tiny predict(), {backend}", predictor, ours.parameters)
         except Exception as error:
             left_out.append(f"tiny predict(), {backend}: {reason(error)}")
 

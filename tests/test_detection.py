@@ -136,8 +136,8 @@ def test_one_person_is_found_once(scene, fake, monkeypatch):
         every = {
             name: np.concatenate([value, value]) for name, value in vars(once).items() if isinstance(value, np.ndarray)
         }
-        every["centers"][len(once.rows) :] += [0.05, -0.05, 0.02]
-        return replace(once, **every, rows=[*once.rows, *once.rows])
+        every["centers"][len(once) :] += [0.05, -0.05, 0.02]
+        return replace(once, **every)
 
     monkeypatch.setattr(FakeDetector, "detect", twice)
     assert len(lidarpose.detect(scene[0])) == len(boxes) == len(PLACES)
@@ -552,7 +552,7 @@ def hidden():
     distance = np.linalg.norm(detections.centers[:, :2] - scene.boxes[6].center[:2], axis=1)
     rows = np.flatnonzero(distance > 0.45)
     arrays = {name: values[rows] for name, values in vars(detections).items() if isinstance(values, np.ndarray)}
-    return scene, detector, replace(detections, rows=[detections.rows[k] for k in rows], **arrays)
+    return scene, detector, replace(detections, **arrays)
 
 
 def test_who_is_beside_somebody_is_found_without_their_points(hidden):

@@ -432,7 +432,7 @@ def test_no_points_and_no_candidates_are_legal():
     ground = estimate_ground(plane(), ORIGIN)
     empty = SceneIndex(np.zeros((0, 3)), ground, ORIGIN)
     nobody = empty.candidates(np.zeros((0, 3)))
-    assert len(nobody) == 0 and empty.rows(np.zeros((0, 2))) == []
+    assert len(nobody) == 0
     for augmentation in (None, Augmentation(), draw_augmentation(np.random.default_rng(0), 0)):
         assert render(nobody, augmentation)["fine"].shape == (0, 28, 24, 24)
     alone = empty.candidates(np.array([[4.0, 1, -1.8]]))
@@ -452,14 +452,15 @@ def test_dense_places_cost_no_more_than_thinned_ones():
     assert height.max() > 1.7 and np.diff(np.sort(height)).max() < 0.1
 
 
-def test_rows_are_those_of_the_column(scene):
+def test_a_candidates_points_are_those_around_it(scene):
     _, points, ground = scene
     places, _ = columns(points, heights_above(points, ground))
     centers = np.concatenate([places, ground.at(places)[:, None]], 1)
-    rows = SceneIndex(points, ground, ORIGIN).rows(centers)
-    for center, own in zip(centers[::10], rows[::10], strict=True):
-        near = (np.hypot(*(points[:, :2] - center[:2]).T) < 0.35) & (heights_above(points, ground) < 3.2)
-        assert len(np.setxor1d(own, np.flatnonzero(near))) <= 1
+    candidates = SceneIndex(points, ground, ORIGIN).candidates(centers)
+    for center, count in zip(candidates.centers[::10], candidates.count[::10], strict=True):
+        offset = points - center
+        is_near = (np.hypot(offset[:, 0], offset[:, 1]) < 1.75) & (offset[:, 2] > -0.7) & (offset[:, 2] < 2.5)
+        assert abs(count - is_near.sum()) <= 1
 
 
 def test_of_places_too_near_to_each_other_the_weaker_goes():
@@ -472,3 +473,27 @@ def test_of_places_too_near_to_each_other_the_weaker_goes():
     row = np.array([[0.0, 0], [0.2, 0], [0.4, 0]])
     assert suppress_near(row, np.array([3.0, 2, 1]), 0.25).tolist() == [0, 2]
     assert len(suppress_near(np.zeros((0, 3)), np.zeros(0), 0.25)) == 0
+
+
+@pytest.mark.parametrize("shift", [(-3000.0, -3000.0), (3000.0, 0.0), (-20_000.0, 5000.0)])
+def test_what_is_looked_at_does_not_depend_on_where_zero_is(scene, shift):
+    """A scan in a map's coordinates, far from zero, is cut as one about the sensor."""
+    _, points, ground = scene
+    offset = np.array([*shift, 0.0])
+    centers = propose(points, ground)[:20]
+    here = SceneIndex(points, ground, ORIGIN).candidates(centers)
+    moved_points = points + offset
+    moved_ground = replace(ground, corner=ground.corner + offset[:2])
+    there = SceneIndex(moved_points, moved_ground, ORIGIN + offset).candidates(centers + offset)
+    np.testing.assert_allclose(there.count, here.count, atol=1)
+    assert (there.contexts != here.contexts).mean() < 0.01
+
+
+def test_ground_on_a_slope_is_found_wherever_zero_is():
+    slope = plane()
+    slope[:, 2] += 0.2 * slope[:, 0]
+    for x in (-300.0, 0.0, 300.0):
+        offset = np.array([x, 0.0, 0.0])
+        ground = estimate_ground(slope + offset, ORIGIN + offset)
+        assert ground is not None
+        np.testing.assert_allclose(ground.at(np.array([[x + 5.0, 0.0]])), -1.8 + 1.0, atol=0.1)

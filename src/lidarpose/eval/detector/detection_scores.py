@@ -109,8 +109,8 @@ def score_scan(
 def _conditions(scan: LabeledScan, positions: np.ndarray) -> dict[str, np.ndarray]:
     """What may make people hard to find, each (P,) bool."""
     distance = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
-    # each is near itself
-    has_company = (distance < _COMPANY).sum(1) > 1
+    # each person is near themselves
+    has_company = (distance[:, scan.is_person] < _COMPANY).sum(1) > 1
     # without the ground and the ceiling
     margin = [2 * _TOUCHING, 2 * _TOUCHING, -2 * _TOUCHING]
     grown_boxes = [replace(box, size=np.maximum(box.size + margin, 0.1)) for box in scan.boxes]

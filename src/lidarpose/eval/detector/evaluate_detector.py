@@ -52,8 +52,8 @@ def _detect(search: Search, points: np.ndarray, origin: np.ndarray | None) -> tu
 
 def _scorer(detector: Detector, points: np.ndarray, origin: np.ndarray | None, *, max_range: float):
     detections = detector.detect(points, origin, max_range=max_range, limit=None)
-    boxes = zip(detections.centers, detections.sizes, detections.yaws, strict=True)
-    return [Box(center=center, size=size, yaw=float(yaw)) for center, size, yaw in boxes], detections.score
+    boxes = zip(detections.centers, detections.sizes, strict=True)
+    return [Box(center=center, size=size) for center, size in boxes], detections.score
 
 
 def _baseline(predictor: Predictor | None, points: np.ndarray, origin: np.ndarray | None):

@@ -83,8 +83,9 @@ class SceneIndex:
             heights = heights_above(points, ground)
         self.ground, self.origin = ground, None if origin is None else np.asarray(origin, float)
         columns = points.T
-        self._corner = np.floor([values.min() if len(points) else 0.0 for values in columns[:2]])
-        extent = np.floor([values.max(initial=0) for values in columns[:2]]) - self._corner + 1
+        bounds = np.floor([[values.min(), values.max()] for values in columns[:2]]) if len(points) else np.zeros((2, 2))
+        self._corner = bounds[:, 0]
+        extent = bounds[:, 1] - bounds[:, 0] + 1
         # a wide map has larger cells instead of a larger table
         self._cell = max(_INDEX_CELL, float(np.sqrt(extent.prod() / _MOST_INDEX_CELLS)))
         self._shape = tuple(int(n) for n in extent // self._cell + 2)
@@ -101,17 +102,10 @@ class SceneIndex:
         cells = all_cells[used_rows]
         # very dense cells are thinned, so that no candidate costs more than so much
         selection, count = _thinned(np.bincount(cells, minlength=self._shape[0] * self._shape[1]), _MOST_IN_CELL)
-        self._order = used_rows[_order(cells)][selection]
-        self._x, self._y, self._z = x[self._order], y[self._order], z[self._order]
+        sorted_rows = used_rows[_order(cells)][selection]
+        self._x, self._y, self._z = x[sorted_rows], y[sorted_rows], z[sorted_rows]
         self._start = np.concatenate([[0], np.cumsum(count)])
         self._image = None if self.origin is None else RangeImage(points, self.origin)
-
-    def rows(self, centers: np.ndarray, radius: float = 0.35) -> list[np.ndarray]:
-        """Of each of centers (K, 2 or 3) m the rows of the scan's points at a person's heights within `radius` m."""
-        if not len(centers):
-            return []
-        sorted_rows, _, count = self._near(np.asarray(centers, float), radius)
-        return np.split(self._order[sorted_rows], np.cumsum(count)[:-1])
 
     def candidates(self, centers: np.ndarray) -> Candidates:
         """Those at centers (K, 3) m: x, y, and z of the ground there."""
@@ -125,7 +119,7 @@ class SceneIndex:
         centers = np.asarray(centers, float)
         for start in range(0, len(centers), CHUNK):
             piece = centers[start : start + CHUNK]
-            point_count = self._runs(piece[:, :2] - self._corner, RADIUS)[2].sum()
+            point_count = self._runs(piece[:, :2] - self._corner)[2].sum()
             for part in np.array_split(piece, min(len(piece), 1 + 2 * point_count // _MOST_AT_ONCE)):
                 yield self._cut(part, margin)
 
@@ -142,7 +136,7 @@ class SceneIndex:
             offset = centers - self.origin
             distance, sensor_height = np.maximum(np.hypot(offset[:, 0], offset[:, 1]), _LEAST_DISTANCE), -offset[:, 2]
             range_views = self._image.views(offset, yaw, distance, margin)
-        _, (x, y, z), count = self._near(centers, RADIUS, (BOTTOM - _ROOM, BOTTOM + SLICES * CELL + _ROOM))
+        x, y, z, count = self._near(centers)
         selection, sizes = _thinned(count, _MOST_POINTS)
         x, y, z = x[selection], y[selection], z[selection]
         c, s = (np.repeat(values.astype(np.float32), sizes) for values in (np.cos(yaw), np.sin(yaw)))
@@ -160,35 +154,25 @@ class SceneIndex:
             contexts=self._context(centers, yaw),
         )
 
-    def _near(
-        self, centers: np.ndarray, radius: float, heights: tuple[float, float] | None = None
-    ) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
-        """Points within `radius` and between heights of centers (K, 2 or 3) m, one center's after the other's.
-
-        Returns their sorted rows (m,), where they lie from their center, x, y and with heights z (m,) float32 m, and
-        how many each has (K,).
-        """
-        owner, start, size = self._runs(centers[:, :2] - self._corner, radius)
+    def _near(self, centers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Points within `RADIUS` and at the heights looked at of centers (K, 3) m, one center's after the other's: where
+        they lie from their center, x, y, z (m,) float32 m, and how many each has (K,)."""
+        owner, start, size = self._runs(centers[:, :2] - self._corner)
         row = np.arange(size.sum()) + np.repeat(start - (np.cumsum(size) - size), size)
         sizes = np.bincount(owner, size, minlength=len(centers)).astype(np.int64)
-        center_axes = (centers - [*self._corner, 0.0][: centers.shape[1]]).astype(np.float32).T
-        x, y = (
-            values[row] - np.repeat(center, sizes)
-            for values, center in zip((self._x, self._y), center_axes, strict=False)
-        )
-        inside_index = np.flatnonzero(x * x + y * y < np.float32(radius**2))
-        offsets = [x, y]
-        if heights is not None:
-            z = self._z[row[inside_index]] - np.repeat(center_axes[2], sizes)[inside_index]
-            is_between = (z > heights[0]) & (z < heights[1])
-            inside_index, offsets = inside_index[is_between], [x, y, z[is_between]]
-        offsets[:2] = x[inside_index], y[inside_index]
-        return row[inside_index], offsets, np.diff(np.searchsorted(inside_index, np.cumsum(sizes)), prepend=0)
+        center_x, center_y, center_z = (centers - [*self._corner, 0.0]).astype(np.float32).T
+        x, y = self._x[row] - np.repeat(center_x, sizes), self._y[row] - np.repeat(center_y, sizes)
+        inside_index = np.flatnonzero(x * x + y * y < np.float32(RADIUS**2))
+        z = self._z[row[inside_index]] - np.repeat(center_z, sizes)[inside_index]
+        is_between = (z > BOTTOM - _ROOM) & (z < BOTTOM + SLICES * CELL + _ROOM)
+        inside_index, z = inside_index[is_between], z[is_between]
+        count = np.diff(np.searchsorted(inside_index, np.cumsum(sizes)), prepend=0)
+        return x[inside_index], y[inside_index], z, count
 
-    def _runs(self, place: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Runs of sorted rows in the cells around places (K, 2) m from the corner: (owner, first row, length)."""
-        low = np.floor((place - radius) / self._cell).astype(np.int64)
-        high = np.floor((place + radius) / self._cell).astype(np.int64)
+    def _runs(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Runs of sorted rows in the cells within `RADIUS` of places (K, 2) m from the corner: owner, first row, length."""
+        low = np.floor((place - RADIUS) / self._cell).astype(np.int64)
+        high = np.floor((place + RADIUS) / self._cell).astype(np.int64)
         low, high = np.maximum(low, 0), np.minimum(high, np.array(self._shape) - 1)
         # one for each row of the square of cells: its points lie one after the other
         row_counts = np.maximum(high[:, 0] - low[:, 0] + 1, 0)

@@ -25,8 +25,6 @@ _BEYOND = 6.0
 # of an unknown sensor there is no range: points so far, m, from nearly all others, percents, are stray ones, which
 # would make the cells of all that is looked at larger
 _STRAY, _NEARLY_ALL = 100.0, (0.1, 99.9)
-# a detection's own points lie within this of its axis, m
-_OWN_RADIUS = 0.35
 # detections nearer than this are one person, m: the network moves those of one to the same place
 SAME = 0.15
 # beside people somebody is looked for so far away; a proposal is judged by what is so far about it, m
@@ -47,19 +45,16 @@ Scorer = Callable[[dict[str, np.ndarray]], np.ndarray]
 class Detections:
     """D people, the surest first, in the level frame, meters.
 
-    centers (D, 3): of their boxes; sizes (D, 3); yaws (D,) rad: 0, the boxes are square; logit (D,); score (D,): the
-    probability that it is a person; mounted (D,): the probability that somebody rides or sits in a wheelchair; rows:
-    of each the rows of the scan's points within 0.35 m of its axis; ground: under them; has_ground: whether it was
-    found.
+    centers (D, 3): of their boxes, which are square, at yaw 0; sizes (D, 3); logit (D,); score (D,): the probability
+    that it is a person; mounted (D,): the probability that somebody rides or sits in a wheelchair; ground: under them;
+    has_ground: whether it was found.
     """
 
     centers: np.ndarray
     sizes: np.ndarray
-    yaws: np.ndarray
     logit: np.ndarray
     score: np.ndarray
     mounted: np.ndarray
-    rows: list[np.ndarray]
     ground: Ground
     has_ground: bool
 
@@ -127,7 +122,7 @@ class Detector:
         if origin is not None and max_range is not None:
             centers = centers[np.hypot(centers[:, 0] - origin[0], centers[:, 1] - origin[1]) < max_range]
         scene = SceneIndex(points, ground, origin, heights=heights)
-        return self._detections(scene, centers, rows, has_ground, limit)
+        return self._detections(scene, centers, has_ground, limit)
 
     def detect_beside(
         self,
@@ -153,13 +148,12 @@ class Detector:
         places = propose(near_points, ground)
         distance = np.linalg.norm(places[:, None, :2] - people[None], axis=-1).min(1, initial=np.inf)
         places = places[(distance > _BESIDE[0]) & (distance < _BESIDE[1])]
-        scan_rows = rows[rows_that_matter(points[rows], origin, places)]
         # x after x in memory, as above
-        points = np.ascontiguousarray(points[scan_rows].T).T
-        return self._detections(SceneIndex(points, ground, origin), places, scan_rows, True, None)
+        points = np.ascontiguousarray(points[rows[rows_that_matter(points[rows], origin, places)]].T).T
+        return self._detections(SceneIndex(points, ground, origin), places, True, None)
 
     def _detections(
-        self, scene: SceneIndex, places: np.ndarray, scan_rows: np.ndarray, has_ground: bool, limit: int | None
+        self, scene: SceneIndex, places: np.ndarray, has_ground: bool, limit: int | None
     ) -> Detections:
         # memory that each piece uses again: to get as much anew takes longer than all else
         fine = np.empty((min(len(places), CHUNK), SLICES, SIDE, SIDE), np.float32)
@@ -174,11 +168,9 @@ class Detector:
         return Detections(
             centers=centers[indices],
             sizes=np.stack([side, side, heights[indices] + _ROOM], 1),
-            yaws=np.zeros(len(indices)),
             logit=logit[indices],
             score=self.probability(logit[indices]),
             mounted=mounted,
-            rows=[scan_rows[rows] for rows in scene.rows(centers[indices], _OWN_RADIUS)],
             ground=scene.ground,
             has_ground=has_ground,
         )
