@@ -1,6 +1,7 @@
 """Folders and recordings: people of every frame, their tracks, and files that grow and go on after a kill."""
 
 import json
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -177,6 +178,97 @@ def test_finished_lines_of_other_frames_are_an_error(drive, folder, monkeypatch,
     recording = IndexedRecording(name="made", ids=["here"], times=None, read=lambda i: Sweep(points=np.ones((9, 3))))
     with pytest.raises(InputError, match=r"a.jsonl.part: was made of other frames, the last one gone: remove it"):
         output.write_recording(FrameSource(recording), steps, tmp_path / "a.jsonl", command={})
+
+
+@pytest.fixture
+def stopped(drive, folder, monkeypatch):
+    """A command on the folder that is stopped after its first frame: words -> words."""
+    predict = FramePredictor._predicted
+
+    def stop_at_second(self, *of):
+        if of[0].index:
+            raise KeyboardInterrupt
+        return predict(self, *of)
+
+    def stop(*words):
+        with monkeypatch.context() as patch:
+            patch.setattr(FramePredictor, "_predicted", stop_at_second)
+            run(drive, *words, status=130)
+        return words
+
+    return stop
+
+
+def test_a_page_asked_for_later_keeps_finished_frames(stopped, drive, tmp_path, capsys):
+    words = stopped("--end", 0.2, "--out", tmp_path / "a.jsonl")
+    assert main(["predict", str(drive), *map(str, words), "--html"]) == 0
+    assert "1 frames are in" in capsys.readouterr().err
+    assert (tmp_path / "a.html").is_file() and len((tmp_path / "a.jsonl").read_bytes().splitlines()) == 3
+
+
+@pytest.mark.parametrize("form", ["file", "folder"])
+def test_boxes_that_are_corrected_begin_anew(form, stopped, drive, tmp_path, capsys):
+    """Poses of boxes that were wrong are not kept."""
+    path = boxes = tmp_path / "boxes.json"
+    if form == "folder":
+        boxes = tmp_path / "boxes"
+        boxes.mkdir()
+        path = boxes / "0.json"
+    entry = {"people": [{"center": [4.1, 1.5, 0], "size": [1, 1, 2]}]}
+    content = entry if form == "folder" else [{"frame": 0} | entry]
+    path.write_text(json.dumps(content))
+    words = stopped("--end", 0.2, "--boxes", boxes, "--out", tmp_path / "a.jsonl")
+    stat = path.stat()
+    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns + 10**9))
+    assert main(["predict", str(drive), *map(str, words)]) == 0
+    assert "of another command (files changed): beginning anew" in capsys.readouterr().err
+
+
+def test_printed_lines_have_the_boxes_of_their_frames_too(drive, tmp_path, capsys):
+    (tmp_path / "b.json").write_text('[{"frame": "elsewhere", "people": []}]')
+    assert main(["predict", str(drive), "--end", "0.1", "--boxes", str(tmp_path / "b.json"), "--out", "-"]) == 2
+    assert "has boxes of frames elsewhere, none of which is here" in capsys.readouterr().err
+
+
+def test_boxes_with_another_axis_up_are_not_taken_for_these_frames(drive, tmp_path, capsys):
+    people = [{"center": [4.1, 0, 1.5], "size": [1, 1, 2]}]
+    entry = {"schema": "lidarpose.boxes/1", "people": people, "up": "y"}
+    (tmp_path / "b.json").write_text(json.dumps([{"frame": k} | entry for k in range(2)]))
+    words = ["predict", str(drive), "--end", "0.1", "--boxes", str(tmp_path / "b.json"), "--out"]
+    assert main([*words, str(tmp_path / "o.jsonl")]) == 2
+    assert "the boxes say that up is y, not z: give up y" in capsys.readouterr().err
+    assert main([*words, str(tmp_path / "o.jsonl"), "--up", "y"]) == 0
+
+
+def test_a_frame_without_points_costs_itself_alone(clouds, model, tmp_path, capsys):
+    feet = PLACES[0]
+    crop = clouds[0][(np.abs(clouds[0][:, :2] - feet) < 0.7).all(1)]
+    np.save(tmp_path / "0.npy", crop)
+    np.save(tmp_path / "1.npy", np.zeros((9, 3)))
+    boxes = {k: [Box(center=np.array([*feet, 0.0]), size=np.array([1.0, 1, 2]))] for k in range(2)}
+    for options in ({"crop": True}, {"boxes": boxes}, {}):
+        frames = list(lidarpose.predict_recording(tmp_path, model=model, **options))
+        assert [frame.error for frame in frames] == [None, None]
+        assert [person.has_pose for person in frames[1].poses] in ([], [False])
+    assert not model.predict(np.zeros((0, 3)), boxes=boxes[0])[0].has_pose
+
+
+def test_names_that_are_no_text_are_escaped_in_tables(clouds, tmp_path):
+    name = os.fsdecode(b"\xff0.npy")
+    np.save(tmp_path / name, clouds[0])
+    for suffix in ("csv", "parquet"):
+        assert main(["predict", str(tmp_path), "--out", str(tmp_path / f"out.{suffix}"), "--quiet"]) == 0
+    table = pandas.read_csv(tmp_path / "out.csv")
+    assert set(table["frame_id"]) == {"\\udcff0"} == set(pandas.read_parquet(tmp_path / "out.parquet")["frame_id"])
+
+
+def test_a_file_of_the_folder_is_not_overwritten(clouds, tmp_path, capsys):
+    np.savetxt(tmp_path / "0.csv", clouds[0], fmt="%.3f", delimiter=",")
+    before = (tmp_path / "0.csv").read_bytes()
+    for source in (tmp_path, tmp_path / "*.csv"):
+        assert main(["predict", str(source), "--format", "csv", "--out", str(tmp_path / "0.csv")]) == 2
+        assert "0.csv" in capsys.readouterr().err
+    assert (tmp_path / "0.csv").read_bytes() == before
 
 
 def test_csv_and_parquet_have_a_row_a_person_and_joint(tracked, tmp_path):

@@ -1,6 +1,7 @@
 """Point clouds of ROS recordings, written by rosbags' own writers: every layout, container and kind of damage."""
 
 import struct
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -362,3 +363,45 @@ def test_what_is_no_recording_is_one_line(tmp_path):
     (tmp_path / "folder" / "metadata.yaml").write_text("")
     with pytest.raises(InputError, match="expected a recording's .mcap"):
         open_source(tmp_path / "folder")
+
+
+def test_an_mcap_with_an_odd_statistics_record_is_read_without_it(tmp_path):
+    path = write(tmp_path / "drive.mcap", clouds(".mcap"))
+    data = bytearray(path.read_bytes())
+    # opcode and length of the statistics, whose last field is a map of 10 bytes an entry
+    at = data.rindex(b"\x0b" + struct.pack("<Q", 56))
+    assert struct.unpack_from("<I", data, at + 9 + 42)[0] == 10
+    struct.pack_into("<I", data, at + 9 + 42, 9)
+    path.write_bytes(data)
+    try:
+        frames = list(open_source(path))
+    except InputError as error:
+        assert "\n" not in str(error)
+    else:
+        assert all(np.array_equal(frame.points, points_of(k)) for k, frame in enumerate(frames[:5]))
+
+
+def test_a_bag_whose_record_has_an_empty_operation_is_damaged_there(tmp_path):
+    path = write(tmp_path / "drive.bag", clouds(".bag"))
+    data = path.read_bytes()
+    name = b"\x04\x00\x00\x00op=\x05"
+    assert data.count(name) == 1
+    # the header's length stays: the field is op= without a value, and one byte of another field
+    path.write_bytes(data.replace(name, b"\x03\x00\x00\x00op=\x05"))
+    try:
+        frames = list(open_source(path))
+    except InputError as error:
+        assert "\n" not in str(error)
+    else:
+        assert len(frames) <= 7
+
+
+def test_a_stopped_recording_of_sqlite_goes_on_in_another_thread(tmp_path):
+    source = open_source(write(tmp_path / "drive.db3", clouds(".db3")))
+    frames = source.frames(2)
+    first = next(frames)
+    with ThreadPoolExecutor(1) as pool:
+        others = pool.submit(list, frames).result()
+    for k, frame in enumerate([first, *others]):
+        assert np.array_equal(frame.points, points_of(k + 2))
+    assert len(others) == 3

@@ -300,6 +300,17 @@ def test_recordings_that_are_damaged_cost_no_other(tmp_path):
     assert [frame.index for frame in chain.frames(3)] == [3, 4]
 
 
+def test_a_part_without_a_single_frame_takes_nobodys_times():
+    def refused(first=0):
+        raise InputError("a.bag: is damaged")
+
+    times = np.array([100.0, 100.5])
+    made = [IndexedRecording(name=name, ids=["0", "1"], times=times, read=repr) for name in "ab"]
+    object.__setattr__(made[0], "lazy_frames", refused)
+    frames = list(ChainedRecording(os.curdir, made).lazy_frames())
+    assert [frame.time for frame in frames] == [None, 100.0, 100.5]
+
+
 def test_background_is_learned_of_any_source(tmp_path):
     rng = np.random.default_rng(0)
     wall = rng.uniform((5, -3, 0), (5.01, 3, 3), (4000, 3))

@@ -87,6 +87,12 @@ def inverse_transform(T: np.ndarray) -> np.ndarray:
     return rigid_transform(T[:3, :3].T, -T[:3, :3].T @ T[:3, 3])
 
 
+def is_rotation(R: np.ndarray) -> bool:
+    """Whether finite numbers R (3, 3) are a rotation to 1 %, as calibrations and poses of others are."""
+    # entries first: products of far larger ones overflow
+    return bool(np.abs(R).max() < 1.01 and np.abs(R @ R.T - np.eye(3)).max() < 0.01 and np.linalg.det(R) > 0)
+
+
 def quaternion_to_matrix(quaternion: np.ndarray) -> np.ndarray:
     """(3, 3) of a quaternion (4,) w, x, y, z of any length > 0."""
     w, x, y, z = quaternion / np.linalg.norm(quaternion)

@@ -1,6 +1,8 @@
 """`lidarpose predict` of one scan, and `lidarpose detect`; folders and recordings are `cli.recordings`."""
 
 import argparse
+import glob
+import os
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -118,14 +120,18 @@ def output_paths(
     """Where `predict` writes its result, in one of the formats, a picture and a page, None for what it does not write.
     Raises InputError where one cannot be written, or is a file that is read."""
     from lidarpose.io.files import check_apart, check_writable
+    from lidarpose.io.sources.folders import is_result
 
     result = _result_path(options.out, name, "poses", *(f".{suffix}" for suffix in formats))
     base_path = result or Path(f"{name}.poses.json")
     picture = base_path.with_suffix(".png") if options.picture else None
     page = base_path.with_suffix(".html") if options.html else None
+    sources = [path for source in options.source for path in (glob.glob(source) or [source])]
+    folders = [Path(path) for path in sources if os.path.isdir(path)]
+    files = [file for folder in folders for file in folder.iterdir() if not is_result(file)]
+    inputs = (options.boxes, options.calib, options.weights, *(options.background or ()))
     for path in filter(None, (result, picture, page)):
-        inputs = (options.boxes, options.calib, options.weights, *(options.background or ()))
-        check_apart(path, *options.source, *inputs)
+        check_apart(path, *sources, *files, *inputs)
         # before the work
         check_writable(path)
     return result, picture, page

@@ -121,12 +121,14 @@ def _print_lines(options: argparse.Namespace, source, steps) -> None:
         raise InputError("--out - prints frames as they come: say --live, which needs no later frames, or name a file")
     if options.format not in (None, "jsonl"):
         raise InputError(f"--out - prints lines of JSON, not {options.format}: name a file")
-    summary = Summary()
+    summary, last = Summary(), None
     for frame in steps.predict_all(source.frames()):
         line = frame.to_dict()
         line = in_world(line, steps.up) if options.world else line
         summary.add(line)
         print(json.dumps(line), flush=True)
+        last = frame.index, frame.id
+    steps.check_boxes(last)
     if summary.damaged == summary.frames:
         raise nothing_read(source.name, summary.frames, summary.first_error)
     _report(options, source, summary)
@@ -146,8 +148,14 @@ def _report(options: argparse.Namespace, source, summary, outputs: str = "") -> 
 
 def _command(options: argparse.Namespace) -> dict[str, Any]:
     """All that the poses of frames depend on."""
-    ignored_names = ("run", "command", "quiet", "out", "format", "picture", "world", "source")
+    ignored_names = ("run", "command", "quiet", "out", "format", "picture", "html", "world", "source")
     command = {name: value for name, value in vars(options).items() if name not in ignored_names}
-    weights = os.stat(options.weights).st_mtime_ns if os.path.isfile(options.weights) else None
+    files = [options.weights, options.boxes, options.calib, options.meta, *(options.background or ())]
+    changed = {path: _changed(Path(path)) for path in files if path and os.path.exists(path)}
     sources = [os.path.abspath(path) for path in options.source]
-    return command | {"source": sources, "weights changed": weights, "version": __version__}
+    return command | {"source": sources, "files changed": changed, "version": __version__}
+
+
+def _changed(path: Path) -> int:
+    """When a file, or one in a folder, was changed last, ns."""
+    return max(file.stat().st_mtime_ns for file in (path, *(path.iterdir() if path.is_dir() else ())))

@@ -15,7 +15,7 @@ import numpy as np
 from lidarpose.data.dataset_card import DatasetCard, read_card
 from lidarpose.data.rows import TABLES, Column, check_lengths, sample_of
 from lidarpose.errors import InputError, MissingExtra
-from lidarpose.io.files import atomic_path, file_error
+from lidarpose.io.files import atomic_path, encodable, file_error
 from lidarpose.sample import LabeledSample
 
 # rows that are compressed together: what a writer and a reader must hold. A turn of 128 rings has up to 260,000 points
@@ -44,8 +44,7 @@ def to_arrow(pa, table: str, rows: list[dict[str, Any]]):
     for name, column in TABLES[table].items():
         values = [row[name] for row in rows]
         if column.type == "string":
-            # names from a disk or from JSON may hold what is no character
-            values = [v if v is None else v.encode("utf-8", "backslashreplace").decode() for v in values]
+            values = [v if v is None else encodable(v) for v in values]
         elif column.shape is not None:
             values = [v if v is None else np.asarray(v, column.type).ravel() for v in values]
         arrays.append(pa.array(values, schema.field(name).type))

@@ -214,6 +214,8 @@ SCAN_CHECKS: tuple[Callable[[Scan, Poses], str | None], ...] = (box_units, empty
 
 def check_scan(scan: Scan, people: Poses) -> list[str]:
     """The warnings of all checks. people: in the level frame, in the order of the scan's clouds."""
+    if not len(scan.points):
+        return []
     # boxes that were found are nobody's fault, and the axes were looked at before
     is_given = scan.detected_rows is None
     warnings = {check: check(scan, people) for check in SCAN_CHECKS if scan.boxes and is_given}

@@ -121,13 +121,10 @@ def search_options(
     return search if background is None else replace(search, background=read_background(background, columns=columns))
 
 
-def find_people(scan: Scan, search: Search, known: KnownPlaces | None = None) -> Scan:
+def find_people(scan: Scan, search: Search) -> Scan:
     """The scan with the boxes of the people in it, surest first, `detected_rows`, and what looks wrong among its
-    warnings; without the place of a sensor that cannot have been there, and with the direction that is up after all.
-
-    known: of a recording's frames before; with it the scan has `pelvises`, `verified` and `rejected`, too.
-    """
-    return verify_people(detect_places(scan, search), search, known)
+    warnings; without the place of a sensor that cannot have been there, and with the direction that is up after all."""
+    return verify_people(detect_places(scan, search), search)
 
 
 def search_alone(scan: Scan, search: Search) -> Scan:
@@ -221,7 +218,8 @@ def detect_places(scan: Scan, search: Search) -> Places:
 
 
 def verify_people(places: Places, search: Search, known: KnownPlaces | None = None) -> Scan:
-    """The second half of `find_people`."""
+    """The second half of `find_people`. known: of a recording's frames before; with it the scan has `pelvises`,
+    `verified` and `rejected`, too."""
     scan, input_scan, detections = places.scan, places.given, places.detections
     if detections is None:
         return replace(scan, boxes=[], detected_rows=[])

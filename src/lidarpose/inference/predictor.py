@@ -221,9 +221,9 @@ class Predictor(PoseEstimator):
             up = "z" if input_boxes is None else input_boxes.up
             scan = Scan(points=cloud, boxes=input_boxes, origin=origin, up=up, warnings=tuple(notes))
             if find:
-                from lidarpose.inference.detection import Search, find_people
+                from lidarpose.inference.detection import Search, search_alone
 
-                scan = find_people(scan, Search())
+                scan = search_alone(scan, Search())
             return pose_scan(scan, self, skeleton=skeleton, progress=progress)
         origin = as_origin(sensor_origin)
         if not _is_many(points):

@@ -11,7 +11,7 @@ import numpy as np
 from lidarpose.errors import counted
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
 from lidarpose.io.boxes import people_json
-from lidarpose.io.files import check_suffix, write_atomic
+from lidarpose.io.files import check_suffix, encodable, write_atomic
 from lidarpose.sample import JOINT_COLUMNS, PER_JOINT, Box, Pose, facing
 from lidarpose.skeleton import Skeleton
 
@@ -247,9 +247,11 @@ class Poses(Sequence[PersonPose]):
             mounted = None if person.box is None else person.box.mounted
             known_values = (person.person, person.second_person, person.score, mounted)
             person_values = [np.nan if value is None else value for value in known_values]
+            # as tables are written
+            id = encodable(person.id) if isinstance(person.id, str) else person.id
             for j, joint in enumerate(self.skeleton.joints):
                 joint_values = [np.nan if value is None else value[j] for value in values]
-                rows.append((number, person.id, joint, *person.pose.joints[j], *joint_values, *person_values))
+                rows.append((number, id, joint, *person.pose.joints[j], *joint_values, *person_values))
         return pandas.DataFrame(rows, columns=["person", "id", *JOINT_COLUMNS])
 
     def to_dict(self) -> dict:

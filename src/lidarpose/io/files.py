@@ -60,7 +60,11 @@ def shorten(text: str, limit: int = 80) -> str:
 
 def one_line(text: str) -> str:
     """The text as one line that any terminal can print: what would break the line or steer the terminal is escaped."""
-    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.splitlines()))
+    return encodable("".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.splitlines())))
+
+
+def encodable(text: str) -> str:
+    """The text with what is no character, as names from a disk or from JSON may hold, escaped."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 

@@ -108,7 +108,7 @@ def load_array(data: bytes) -> np.ndarray:
     shape, dtype, order = array_header(file)
     if dtype.hasobject:
         raise FormatError("plain arrays of numbers", "dtype object", "save a float array with numpy.save")
-    if any(n < 0 for n in shape):
+    if any(n < 0 for n in shape) or not dtype.itemsize:
         raise FormatError("an array (n, 3+)", f"the shape {shape}", "save it again")
     check_bytes(data, file.tell(), math.prod(shape) * dtype.itemsize, shape[0] if shape else 1)
     return np.ndarray(shape, dtype, data, file.tell(), order=order)

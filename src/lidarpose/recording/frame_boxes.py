@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from lidarpose.errors import InputError
-from lidarpose.io.boxes import read_boxes
+from lidarpose.io.boxes import Boxes, read_boxes
 from lidarpose.io.files import file_error, read_bytes, shorten
 from lidarpose.io.sources import DamagedFrame, Frame
-from lidarpose.sample import Box
 
 _FORM = '{"frame": 0, "people": [{"center": [x, y, z], "size": [l, w, h]}]}'
 _SUFFIXES = (".json", ".npy", ".txt")
@@ -50,7 +49,7 @@ class FrameBoxes:
         if not self._by_frame:
             raise file_error(self._name, f"expected boxes a frame, files named as the frames are or {_FORM}, got none")
 
-    def of(self, frame: Frame | DamagedFrame) -> list[Box] | None:
+    def of(self, frame: Frame | DamagedFrame) -> Boxes | None:
         """The boxes of a frame; None where none are given. Raises InputError for those that cannot be read."""
         key = frame.id if frame.id in self._by_frame else str(frame.index)
         if key not in self._by_frame:

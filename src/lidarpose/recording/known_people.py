@@ -5,7 +5,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from lidarpose.geometry import transform_points
+from lidarpose.geometry import inverse_transform, transform_points
 from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.inference.scan import Scan
@@ -56,7 +56,7 @@ class KnownPeople:
 
     def expected(self, time: float, T_fixed_sensor: np.ndarray) -> KnownPlaces:
         """Where people are expected in the next frame, those first who need no verification, in the sensor's frame."""
-        T_sensor_fixed = np.linalg.inv(T_fixed_sensor)
+        T_sensor_fixed = inverse_transform(T_fixed_sensor)
         states = sorted(self._tracker.predicted(time), key=lambda state: not self._is_trusted(state, time))
         boxes, pelvises = [], []
         for state in states:
@@ -135,7 +135,7 @@ class KnownPeople:
 
     def _steadied(self, time: float, people: tuple[PersonPose, ...], T_fixed_sensor: np.ndarray) -> tuple:
         """Poses by the past of their tracks."""
-        T_sensor_fixed = np.linalg.inv(T_fixed_sensor)
+        T_sensor_fixed = inverse_transform(T_fixed_sensor)
         gap = self._tracker.max_gap
         self._filters = {id: entry for id, entry in self._filters.items() if 0 <= time - entry[0] <= gap}
         steady_people = []

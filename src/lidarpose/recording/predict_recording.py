@@ -246,7 +246,10 @@ class FramePredictor:
         scan = Scan(points=points, up=self.up)
         if self.boxes is not None:
             boxes = self.boxes.of(frame)
-            notes += ["no boxes are given for this frame"] if boxes is None else []
+            if boxes is None:
+                notes += ["no boxes are given for this frame"]
+            elif boxes.up not in ("z", self.up):
+                raise InputError(f"the boxes say that up is {boxes.up}, not {self.up}: give up {boxes.up}")
             scan = replace(scan, boxes=boxes or [])
         elif self._is_crop is None and len(points):
             self._is_crop = not is_wide(scan)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarpose.errors import missing_extra
-from lidarpose.io.files import atomic_path, file_error
+from lidarpose.io.files import atomic_path, encodable
 from lidarpose.sample import JOINT_COLUMNS
 
 FORMATS = ("jsonl", "csv", "parquet")
@@ -17,7 +17,7 @@ _COLUMNS = ("frame", "frame_id", "time", "person", "id", "track", "filled", *JOI
 
 
 def write_result(path: Path, lines: Iterable[dict[str, Any]]) -> None:
-    """Writes lines as the format that the file's name says, whole or not at all.
+    """Writes lines as the one of `FORMATS` that the file's name says, whole or not at all.
 
     Raises InputError where it cannot be written, MissingExtra for Parquet without pyarrow.
     """
@@ -29,10 +29,8 @@ def write_result(path: Path, lines: Iterable[dict[str, Any]]) -> None:
         elif suffix == ".csv":
             for number, table in enumerate(_tables(lines)):
                 table.to_csv(temporary, index=False, mode="a" if number else "w", header=not number)
-        elif suffix == ".parquet":
-            _write_parquet(temporary, lines)
         else:
-            raise file_error(path, f"expected a name that ends in .{' .'.join(FORMATS)}, got {suffix or 'none'}")
+            _write_parquet(temporary, lines)
 
 
 def check_format(path: Path) -> None:
@@ -48,13 +46,11 @@ def _write_parquet(path: Path, lines: Iterable[dict[str, Any]]) -> None:
     import pyarrow
     import pyarrow.parquet
 
-    writer = None
-    for table in _tables(lines):
-        rows = pyarrow.Table.from_pandas(table, preserve_index=False)
-        writer = writer or pyarrow.parquet.ParquetWriter(path, rows.schema)
-        writer.write_table(rows)
-    if writer is not None:
-        writer.close()
+    tables = (pyarrow.Table.from_pandas(table, preserve_index=False) for table in _tables(lines))
+    first_table = next(tables)
+    with pyarrow.parquet.ParquetWriter(path, first_table.schema) as writer:
+        for table in chain([first_table], tables):
+            writer.write_table(table)
 
 
 def _tables(lines: Iterable[dict[str, Any]]) -> Iterator[Any]:
@@ -62,31 +58,30 @@ def _tables(lines: Iterable[dict[str, Any]]) -> Iterator[Any]:
     import pandas
 
     remaining = iter(lines)
-    for first_line in chain(islice(remaining, 1), [None]):
-        # the first table, or an empty one
-        chunk = [] if first_line is None else [first_line, *islice(remaining, _ROWS_OF - 1)]
-        while chunk or first_line is None:
-            table = pandas.DataFrame([row for line in chunk for row in _rows(line)], columns=list(_COLUMNS))
-            table["id"] = table["id"].map(lambda id: None if id is None else str(id)).astype("string")
-            for name in ("frame_id", "joint"):
-                table[name] = table[name].astype("string")
-            types = {"frame": "int64", "person": "int64", "track": "Int64", "filled": "bool"}
-            types |= {"in_range": "boolean", "mounted": "boolean"}
-            float_columns = set(_COLUMNS) - set(types) - {"id", "frame_id", "joint"}
-            yield table.astype(types | dict.fromkeys(float_columns, "float64"))
-            chunk = list(islice(remaining, _ROWS_OF))
-            if not chunk:
-                return
+    chunk, is_first = list(islice(remaining, _ROWS_OF)), True
+    while chunk or is_first:
+        table = pandas.DataFrame([row for line in chunk for row in _rows(line)], columns=list(_COLUMNS))
+        for name in ("id", "frame_id", "joint"):
+            table[name] = table[name].astype("string")
+        types = {"frame": "int64", "person": "int64", "track": "Int64", "filled": "bool"}
+        types |= {"in_range": "boolean", "mounted": "boolean"}
+        float_columns = set(_COLUMNS) - set(types) - {"id", "frame_id", "joint"}
+        yield table.astype(types | dict.fromkeys(float_columns, "float64"))
+        chunk, is_first = list(islice(remaining, _ROWS_OF)), False
 
 
 def _rows(line: dict[str, Any]) -> Iterator[tuple]:
-    joints = line["skeleton"]["joints"]
+    joints, frame_id = line["skeleton"]["joints"], encodable(line["id"])
     for number, person in enumerate(line["people"]):
         if person["joints"] is None:
             continue
-        person_cells = (number, person["id"], person["track"], person["filled"])
+        id = None if person["id"] is None else encodable(str(person["id"]))
+        person_cells = (number, id, person["track"], person["filled"])
         joint_values = [person[name] or [None] * len(joints) for name in ("confidence", "spread", "visible")]
+        # a network that says nothing of its joints does not say this either
+        is_known = any(person[name] for name in ("confidence", "spread", "visible"))
         person_values = (person["person"], person["second_person"], person["score"], person["mounted"])
         for j, name in enumerate(joints):
-            values = (*(value[j] for value in joint_values), name not in person["out_of_range"], *person_values)
-            yield line["frame"], line["id"], line["time"], *person_cells, name, *person["joints"][j], *values
+            in_range = name not in person["out_of_range"] if is_known else None
+            values = (*(value[j] for value in joint_values), in_range, *person_values)
+            yield line["frame"], frame_id, line["time"], *person_cells, name, *person["joints"][j], *values

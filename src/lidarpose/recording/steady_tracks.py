@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.geometry import transform_points
+from lidarpose.geometry import inverse_transform, transform_points
 from lidarpose.recording.coordinates import FixedFrame, moved_points
 from lidarpose.sample import Pose
 from lidarpose.skeleton import Skeleton
@@ -48,7 +48,7 @@ def steadied(lines: Callable[[], Iterator[dict[str, Any]]], up: str, skeleton: S
             if not is_damaged[row]:
                 steady_poses[row][id] = pose, is_filled
     for line, people, T_fixed_sensor in zip(lines(), steady_poses, to_fixed, strict=True):
-        T_sensor_fixed = np.linalg.inv(T_fixed_sensor)
+        T_sensor_fixed = inverse_transform(T_fixed_sensor)
         entries = {id: _entry(pose, T_sensor_fixed) | {"filled": is_filled} for id, (pose, is_filled) in people.items()}
         people.clear()
         yield line | {"people": list(_with_steady(line["people"], entries))}

@@ -14,7 +14,7 @@ import numpy as np
 
 from lidarpose.data.readers.base import Skipped, labeled_sample
 from lidarpose.errors import InputError
-from lidarpose.geometry import from_spherical, transform_points
+from lidarpose.geometry import from_spherical, is_rotation, transform_points
 from lidarpose.sample import HIDDEN, SEEN, UNLABELED, Box, LabeledSample, within_reach
 from lidarpose.skeleton import WAYMO14
 
@@ -53,10 +53,7 @@ def transform(values: Iterable[float] | None, what: str) -> np.ndarray:
     if matrix.shape != (16,) or not np.isfinite(matrix).all():
         raise InputError(f"{what} must be 16 numbers, a 4 x 4 transform, got {np.isfinite(matrix).sum()}")
     matrix = matrix.reshape(4, 4)
-    R = matrix[:3, :3]
-    # entries first: products of far larger ones overflow
-    is_rotation = np.abs(R).max() < 1.01 and np.abs(R @ R.T - np.eye(3)).max() < 0.01 and np.linalg.det(R) > 0
-    if not is_rotation or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+    if not is_rotation(matrix[:3, :3]) or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise InputError(f"{what} must be a rotation and a shift, got a matrix that is none")
     return matrix
 

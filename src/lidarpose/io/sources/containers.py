@@ -147,12 +147,15 @@ class RecordFile(ABC):
         start = start or len(self.MAGIC)
         size = file.seek(0, 2)
         file.seek(start)
-        for kind, channel, *content in self._records(_Bytes(file, max(size - start, 0))):
-            if kind == "channel":
-                channels[channel], *types = content
-                self.topics.setdefault(channels[channel], Topic(*types))
-            elif channel in channels:
-                yield kind, channels[channel], *content
+        try:
+            for kind, channel, *content in self._records(_Bytes(file, max(size - start, 0))):
+                if kind == "channel":
+                    channels[channel], *types = content
+                    self.topics.setdefault(channels[channel], Topic(*types))
+                elif channel in channels:
+                    yield kind, channels[channel], *content
+        except (struct.error, IndexError) as error:
+            raise FormatError(f"is damaged ({error}): what is before that is read") from None
 
     def _unpacked(self, stream: _Bytes, compression: str, size: int, unpacked_size: int) -> Iterator[tuple]:
         """The records of a compressed chunk. One that cannot be unpacked costs itself."""
@@ -274,27 +277,32 @@ class SqliteFile:
         self.path = path
         self.num_damaged, self.damage = 0, ""
         self.topics: dict[str, Topic] = {}
-        with closing(self._connect()) as connection:
-            try:
-                tables = connection.execute(_TABLES).fetchone()[0]
-                if tables != 2:
-                    raise FormatError(
-                        "the tables messages and topics of rosbag2", f"{tables} of them", "record it anew"
-                    )
-                for name, type_, encoding in connection.execute("SELECT name, type, serialization_format FROM topics"):
-                    self.topics[str(name)] = Topic(str(type_), str(encoding))
-            except sqlite3.Error as error:
-                raise FormatError(f"is no recording of rosbag2 ({shorten(str(error))}); record it anew") from None
-            counts = f"SELECT name, COUNT(*) FROM {_MESSAGES} GROUP BY name"
-            # of a damaged file the messages tell
-            with suppress(sqlite3.Error):
-                for name, count in connection.execute(counts):
-                    self.topics[str(name)].count = count
+        # SQLite says of a file without rights no more than of a damaged one
+        path.open("rb").close()
+        try:
+            with closing(self._connect()) as connection:
+                self._read_topics(connection)
+        except sqlite3.Error as error:
+            raise FormatError(f"is no recording of rosbag2 ({shorten(str(error))}); record it anew") from None
+
+    def _read_topics(self, connection: sqlite3.Connection) -> None:
+        tables = connection.execute(_TABLES).fetchone()[0]
+        if tables != 2:
+            raise FormatError("the tables messages and topics of rosbag2", f"{tables} of them", "record it anew")
+        for name, type_, encoding in connection.execute("SELECT name, type, serialization_format FROM topics"):
+            self.topics[str(name)] = Topic(str(type_), str(encoding))
+        counts = f"SELECT name, COUNT(*) FROM {_MESSAGES} GROUP BY name"
+        # of a damaged file the messages tell
+        with suppress(sqlite3.Error):
+            for name, count in connection.execute(counts):
+                self.topics[str(name)].count = count
 
     def _connect(self) -> sqlite3.Connection:
         # unless a recorder left its journal, nothing is written beside the file
         mode = "ro" if self.path.with_name(self.path.name + "-wal").exists() else "ro&immutable=1"
-        connection = sqlite3.connect(f"{self.path.absolute().as_uri()}?mode={mode}", uri=True)
+        # a recording that goes on is begun in one thread and read in another, one after the other
+        address = f"{self.path.absolute().as_uri()}?mode={mode}"
+        connection = sqlite3.connect(address, uri=True, check_same_thread=False)
         # a file that is shorter than its header says is refused otherwise
         connection.execute("PRAGMA writable_schema=ON")
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MAX_MESSAGE)

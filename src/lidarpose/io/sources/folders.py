@@ -13,8 +13,6 @@ from lidarpose.io.sources.frame import IndexedRecording, ReadingOptions, Sweep
 
 # files of text may be notes, tables or labels: they are points where nothing else is
 _TEXT = (".csv", ".txt", ".xyz")
-# tables of joints, which `lidarpose predict` writes
-_POSES = ".poses.csv"
 # of files without a header the width of a row is taken from the first that can be read, among so many
 _MOST_TRIED = 10
 
@@ -22,6 +20,11 @@ _MOST_TRIED = 10
 _TIME = re.compile(r"(.*\D|)(\d{10}|\d{13}|\d{16}|\d{19})(?:(?<!\d{11})([._])(\d{1,9}))?")
 # 2001 to 2033; 16 digits that are a date are larger
 _FIRST_TIME, _LAST_TIME = 1e9, 2e9
+
+
+def is_result(path: Path) -> bool:
+    """Whether a file's name is that of a table of joints, which `lidarpose predict` writes."""
+    return path.name.endswith(".poses.csv")
 
 
 def natural_key(path: str | os.PathLike) -> tuple:
@@ -49,7 +52,7 @@ def scan_files(folder: Path, other: Sequence[str] = ()) -> tuple[list[Path], lis
     Raises InputError, which says what is there, where there is none.
     """
     entries = list_folder(folder)
-    suffixes = {path: path.suffix.lower() for path in entries if path.is_file() and not path.name.endswith(_POSES)}
+    suffixes = {path: path.suffix.lower() for path in entries if path.is_file() and not is_result(path)}
     kinds = ([s for s in SUFFIXES if s not in _TEXT], other, _TEXT)
     groups = [[path for path, suffix in suffixes.items() if suffix in kind] for kind in kinds]
     files = next(filter(None, groups), [])

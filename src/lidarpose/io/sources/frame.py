@@ -150,8 +150,7 @@ class ChainedRecording:
         self.name = name
         self.parts = parts
         self._warnings = warnings
-        first_frames = [next(self._frames(part), None) for part in parts]
-        self._has_times = all(frame is None or frame.time is not None for frame in first_frames)
+        self._has_times = all(map(_has_times, parts))
 
     @property
     def warnings(self) -> list[str]:
@@ -179,6 +178,15 @@ class ChainedRecording:
             yield from part.lazy_frames(first)
         except InputError as error:
             yield LazyFrame("end", None, partial(_refuse, error))
+
+
+def _has_times(part: Recording) -> bool:
+    """Whether its frames have times; True of one that has no frame to say so."""
+    try:
+        first_frame = next(part.lazy_frames(0), None)
+    except InputError:
+        return True
+    return first_frame is None or first_frame.time is not None
 
 
 def _refuse(error: InputError) -> Sweep:

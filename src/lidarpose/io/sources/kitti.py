@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.errors import LidarPoseError
-from lidarpose.geometry import inverse_transform, rigid_transform, rotation_about
+from lidarpose.geometry import inverse_transform, is_rotation, rigid_transform, rotation_about
 from lidarpose.io.files import read_bytes
 from lidarpose.io.point_cloud import KITTI_FIELDS, read_points
 from lidarpose.io.sources.folders import scan_files
@@ -80,7 +80,7 @@ def _recording(folder: Path, files: Sequence[Path], times, notes: list[str], T_w
     def read(i: int) -> Sweep:
         cloud = read_points(files[i], columns=len(KITTI_FIELDS))
         pose = T_world_velo(i)
-        pose = pose if pose is not None and np.isfinite(pose).all() else None
+        pose = pose if pose is not None and np.isfinite(pose).all() and is_rotation(pose[:3, :3]) else None
         lines = cloud.warnings if pose is not None else (*cloud.warnings, "the sensor's pose is not known")
         return Sweep(points=cloud.points, T_world_sensor=pose, origin=np.zeros(3), warnings=lines)
 

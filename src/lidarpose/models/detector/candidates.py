@@ -155,8 +155,8 @@ class SceneIndex:
         )
 
     def _near(self, centers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Points within `RADIUS` and at the heights looked at of centers (K, 3) m, one center's after the other's: where
-        they lie from their center, x, y, z (m,) float32 m, and how many each has (K,)."""
+        """Points within `RADIUS` and at the heights looked at of centers (K, 3) m, one center's after the other's:
+        where they lie from their center, x, y, z (m,) float32 m, and how many each has (K,)."""
         owner, start, size = self._runs(centers[:, :2] - self._corner)
         row = np.arange(size.sum()) + np.repeat(start - (np.cumsum(size) - size), size)
         sizes = np.bincount(owner, size, minlength=len(centers)).astype(np.int64)
@@ -170,7 +170,7 @@ class SceneIndex:
         return x[inside_index], y[inside_index], z, count
 
     def _runs(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Runs of sorted rows in the cells within `RADIUS` of places (K, 2) m from the corner: owner, first row, length."""
+        """Runs of sorted rows in the cells about places (K, 2) m from the corner: owner, first row, length."""
         low = np.floor((place - RADIUS) / self._cell).astype(np.int64)
         high = np.floor((place + RADIUS) / self._cell).astype(np.int64)
         low, high = np.maximum(low, 0), np.minimum(high, np.array(self._shape) - 1)

@@ -152,9 +152,7 @@ class Detector:
         points = np.ascontiguousarray(points[rows[rows_that_matter(points[rows], origin, places)]].T).T
         return self._detections(SceneIndex(points, ground, origin), places, True, None)
 
-    def _detections(
-        self, scene: SceneIndex, places: np.ndarray, has_ground: bool, limit: int | None
-    ) -> Detections:
+    def _detections(self, scene: SceneIndex, places: np.ndarray, has_ground: bool, limit: int | None) -> Detections:
         # memory that each piece uses again: to get as much anew takes longer than all else
         fine = np.empty((min(len(places), CHUNK), SLICES, SIDE, SIDE), np.float32)
         pieces = (render(piece, fine=fine[: len(piece)]) for piece in scene.pieces(places))

@@ -117,7 +117,9 @@ def estimate_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Gro
         # what carries the sensor has a hole around it, in which a steeper cone reaches over hood and roof
         is_near = np.hypot(x - origin[0], y - origin[1]) < _OWN_REACH
         is_floor &= ~is_near | _is_low(np.where(is_floor, residual, np.nan), _OWN_SLOPE)
-    is_seen = np.isfinite(residual) & ((residual < _TALL) if origin is None else (floors.heights < origin[2] - origin[:2] @ slope))
+    # below the sensor, whose height is without the slope as theirs are; of an unknown one what is not tall
+    is_low = residual < _TALL if origin is None else floors.heights < origin[2] - origin[:2] @ slope
+    is_seen = np.isfinite(residual) & is_low
     if is_floor.sum() < max(_LEAST_CELLS, _LEAST_SHARE * is_seen.sum()):
         return None
     residual = np.where(is_floor, residual, np.nan)
