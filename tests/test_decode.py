@@ -75,13 +75,12 @@ def test_window_is_better_than_the_peak_and_keeps_to_one_of_two():
     assert decode.window(two, low=0.0, step=1.0) == pytest.approx(20, abs=0.01)
 
 
-def test_reach_is_the_width_of_the_window():
-    logits = np.array([0.0, 0.0, 3.0, 1.0, 2.0, -50.0, -50.0])
-    at = {reach: decode.window(logits, low=0.0, step=1.0, reach=reach) for reach in (0, 1, 2, 5)}
-    weight = np.exp(logits[1:4])
-    assert at[0] == 2 and at[1] == pytest.approx((weight * [1, 2, 3]).sum() / weight.sum())
-    # two bins before the mode is the edge: wider windows are no wider
-    assert at[2] == at[5] != at[1]
+@pytest.mark.parametrize("mode, bins", [(5, [2, 3, 4, 5, 6, 7, 8]), (2, [0, 1, 2, 3, 4]), (10, [9, 10, 11]), (0, [0])])
+def test_a_window_has_three_bins_on_either_side_fewer_near_an_edge(mode, bins):
+    logits = np.random.default_rng(1).normal(size=12)
+    logits[mode] = 5
+    weight = np.exp(logits[bins])
+    assert decode.window(logits, low=0.0, step=1.0) == pytest.approx((weight * bins).sum() / weight.sum())
 
 
 @pytest.mark.parametrize("name", decode.DECODERS)

@@ -9,7 +9,6 @@ from hypothesis.extra.numpy import arrays
 from lidarpose.errors import InputError
 from lidarpose.geometry import (
     UP_AXES,
-    Strips,
     axis_angle_to_matrix,
     distance_to_segments,
     from_spherical,
@@ -192,31 +191,17 @@ def test_rigid_transforms_and_quaternions(seed):
     np.testing.assert_allclose(quaternion_to_matrix(-7 * quaternion), R, atol=1e-12)
 
 
-@given(
-    x=arrays(float, st.integers(0, 200), elements=st.floats(-1e6, 1e6)),
-    low=st.floats(-2e6, 2e6),
-    size=st.floats(0, 1e6),
-)
-def test_strips_hold_all_rows_between(x, low, size):
-    rows = Strips(x).rows(low, low + size)
-    assert len(np.unique(rows)) == len(rows)
-    assert set(np.flatnonzero((x >= low) & (x <= low + size))) <= set(rows.tolist())
-
-
-def test_strips_leave_most_rows_out():
-    x = 5e5 + np.random.default_rng(0).uniform(0, 1000, 10_000)
-    assert len(Strips(x).rows(5e5 + 500, 5e5 + 501)) < 100
-
-
 @quick
 @given(
     points=arrays(float, st.tuples(st.integers(0, 40), st.just(3)), elements=coordinate),
     centers=arrays(float, st.tuples(st.integers(0, 4), st.just(2)), elements=coordinate),
-    reach=st.floats(0.1, 20),
+    reach=st.one_of(st.floats(0.1, 20), st.lists(st.floats(0.1, 1e6), min_size=4, max_size=4)),
+    scale=st.sampled_from([1.0, 1e5]),
 )
-def test_rows_near_are_those_of_a_square(points, centers, reach):
-    for center, rows in zip(centers, rows_near(centers, points, reach), strict=True):
-        assert rows.tolist() == np.flatnonzero((np.abs(points[:, :2] - center) < reach).all(1)).tolist()
+def test_rows_near_are_those_of_a_square(points, centers, reach, scale):
+    points, centers, reach = scale * points, scale * centers, np.broadcast_to(reach, 4)[: len(centers)]
+    for center, own_reach, rows in zip(centers, reach, rows_near(centers, points, reach), strict=True):
+        assert rows.tolist() == np.flatnonzero((np.abs(points[:, :2] - center) < own_reach).all(1)).tolist()
 
 
 @quick

@@ -311,6 +311,13 @@ def test_a_part_without_a_single_frame_takes_nobodys_times():
     assert [frame.time for frame in frames] == [None, 100.0, 100.5]
 
 
+@pytest.mark.parametrize("wrong", [5, b"drive", None])
+def test_what_is_no_path_is_said(wrong):
+    for read in (open_source, learn_background):
+        with pytest.raises(InputError, match="expected"):
+            read(wrong)
+
+
 def test_background_is_learned_of_any_source(tmp_path):
     rng = np.random.default_rng(0)
     wall = rng.uniform((5, -3, 0), (5.01, 3, 3), (4000, 3))

@@ -23,7 +23,7 @@ from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.synth.shard_job import Job, Maker, write_dataset
 from lidarpose.synth.street import Street
-from lidarpose.train.torch_dataset import ShardPeople, SyntheticPeople
+from lidarpose.train.torch_dataset import SyntheticPeople
 
 COUNT, PER_SHARD = 60, 10
 WORDS = ["-n", str(COUNT), "--per-shard", str(PER_SHARD), "--sensor", "os1-64,vlp-16", "--seed", "5"]
@@ -285,23 +285,12 @@ def test_people_are_the_same_in_any_number_of_workers(workers, batch):
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("workers", [0, 2, 3])
-def test_shards_give_the_same_people_in_any_number_of_workers(dataset, workers):
-    expected = [sample.points for sample in open_dataset(dataset)]
-    found = clouds(ShardPeople(folder=dataset, batch=7), batch_size=7, num_workers=workers)
-    assert len(found) == COUNT
-    for a, b in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 def test_people_go_on_without_end_and_settings_are_checked():
     people = iter(SyntheticPeople(scene=SCENE, seed=2))
     assert len([next(people) for _ in range(3)]) == 3
     for wrong in ({"seed": -1}, {"start": 5, "stop": 2}, {"batch": 0}, {"hard": 3.0}, {"captured": 0.5}):
         with pytest.raises(InputError):
             SyntheticPeople(**{"scene": SCENE, "seed": 0} | wrong)
-    with pytest.raises(InputError, match="is no dataset"):
-        ShardPeople(folder="none")
 
 
 def test_difficulty_asked_for_is_the_people_s(tmp_path):

@@ -32,7 +32,6 @@ RENAMED = {
     "model.network": "models.posenet",
     "model.plan": "models.voxelize",
     "model.presets": "models.config",
-    "models.expand": "models.posenet",
     "synth.garments": "synth.props.garments",
     "synth.generate": "synth.generator",
     "synth.mesh": "synth.environment.mesh",

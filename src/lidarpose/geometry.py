@@ -189,38 +189,28 @@ def distance_to_segments(points: np.ndarray, starts: np.ndarray, ends: np.ndarra
     return np.sqrt(nearest)
 
 
-# strips are numbered by 16 bits, which sort in linear time
-_LAST_STRIP = 65_535
+# width of a strip, m; strips are numbered by 16 bits, which sort in linear time: the last one holds the rest
+_STRIP, _LAST_STRIP = 2.5, 65_535
 
 
-class Strips:
-    """Points by strips along one axis, so that nobody who asks for a place has to look at all of millions of them.
+def rows_near(centers: np.ndarray, points: np.ndarray, reach: float | np.ndarray) -> list[np.ndarray]:
+    """Of each of centers (K, 2+) m the rows (k,) of points (n, 3) m within `reach` m of it, or reach (K,), in x and in
+    y, ascending.
 
-    Args:
-        x: (n,) m, finite; of more than 65,536 strips the last one holds the rest.
-        width: of a strip, m.
+    Points are sorted into strips along x first, so that nobody has to look at all of millions of them.
     """
-
-    def __init__(self, x: np.ndarray, *, width: float = 2.5):
-        self._start, self._width = x.min() if len(x) else 0.0, width
-        strip = np.minimum((x - self._start) / width, _LAST_STRIP).astype(np.uint16)
-        self._order = np.argsort(strip, kind="stable")
-        self._ends = np.concatenate([[0], np.cumsum(np.bincount(strip, minlength=_LAST_STRIP + 1))])
-
-    def rows(self, low: float, high: float) -> np.ndarray:
-        """The rows (k,) of all points between low and high m, and of some around, by strips."""
-        ends = (np.array([low, high]) - self._start) / self._width
-        first, last = np.clip(ends, 0, _LAST_STRIP).astype(int)
-        return self._order[self._ends[first] : self._ends[last + 1]]
-
-
-def rows_near(centers: np.ndarray, points: np.ndarray, reach: float) -> list[np.ndarray]:
-    """Of each of centers (K, 2+) m the rows (k,) of points (n, 3) m within `reach` m of it in x and in y, ascending."""
-    strips, rows = Strips(points[:, 0]), []
-    for x, y in centers[:, :2]:
-        near_rows = strips.rows(x - reach, x + reach)
-        near_rows = near_rows[np.abs(points[near_rows, 1] - y) < reach]
-        rows.append(np.sort(near_rows[np.abs(points[near_rows, 0] - x) < reach]))
+    x, y = points[:, 0], points[:, 1]
+    start = x.min() if len(x) else 0.0
+    strip = np.minimum((x - start) / _STRIP, _LAST_STRIP).astype(np.uint16)
+    order = np.argsort(strip, kind="stable")
+    ends = np.concatenate([[0], np.cumsum(np.bincount(strip, minlength=_LAST_STRIP + 1))])
+    rows = []
+    for center, own_reach in zip(centers[:, :2], np.broadcast_to(reach, len(centers)), strict=True):
+        low, high = (center[0] + side * own_reach for side in (-1, 1))
+        first, last = np.clip((np.array([low, high]) - start) / _STRIP, 0, _LAST_STRIP).astype(int)
+        near_rows = order[ends[first] : ends[last + 1]]
+        near_rows = near_rows[np.abs(y[near_rows] - center[1]) < own_reach]
+        rows.append(np.sort(near_rows[np.abs(x[near_rows] - center[0]) < own_reach]))
     return rows
 
 

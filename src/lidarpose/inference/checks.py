@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidarpose.errors import first_names
-from lidarpose.geometry import Strips
+from lidarpose.geometry import rows_near
 from lidarpose.inference.results import Poses
 from lidarpose.sample import MIN_POINTS, Box, Pose
 
@@ -297,14 +297,11 @@ def everybody_lies(scan: Scan, people: Poses) -> str | None:
 
 def rows_inside(boxes: list[Box], points: np.ndarray) -> list[np.ndarray]:
     """points (n, 3) m, z up -> of each `Box` the rows (k,) of the points in it, ascending."""
-    strips, rows = Strips(points[:, 0]), []
-    for box in boxes:
-        # twice what a corner reaches, whatever the yaw
-        reach = np.hypot(*box.size[:2])
-        near_rows = strips.rows(box.center[0] - reach, box.center[0] + reach)
-        near_rows = np.sort(near_rows[np.abs(points[near_rows, 1] - box.center[1]) < reach])
-        rows.append(near_rows[box.contains(points[near_rows])])
-    return rows
+    centers = np.array([box.center for box in boxes]).reshape(-1, 3)
+    # twice what a corner reaches, whatever the yaw
+    reach = np.array([np.hypot(*box.size[:2]) for box in boxes])
+    near_rows = rows_near(centers, points, reach)
+    return [rows[box.contains(points[rows])] for box, rows in zip(boxes, near_rows, strict=True)]
 
 
 def _heights(boxes: list[Box], points: np.ndarray, rows: list[np.ndarray]) -> np.ndarray:

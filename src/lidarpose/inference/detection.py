@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lidarpose.errors import InputError, check_int
+from lidarpose.errors import InputError, check_int, counted
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
 from lidarpose.inference.background import is_static, read_background
 from lidarpose.inference.checks import flat_along_another_axis, flat_axis, scan_unit_warning, unlikely_origin
@@ -146,9 +146,9 @@ def other_up_axis(places: "Places", search: Search) -> str | None:
     other_axes = [up for up in UP_AXES if up != input_scan.up]
     boxes = {up: find_people(replace(input_scan, up=up), search).boxes or [] for up in other_axes}
     best_axis = max(other_axes, key=lambda up: sum(box.score or 0.0 for box in boxes[up]))
-    if not (count := len(boxes[best_axis])):
+    if not boxes[best_axis]:
         return None
-    people = "a person" if count == 1 else f"{count} people"
+    people = counted(len(boxes[best_axis]), "person", "people")
     return f"nobody is found with up {input_scan.up}, but {people} with up {best_axis}: try up {best_axis}"
 
 

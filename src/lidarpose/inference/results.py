@@ -382,7 +382,7 @@ def _rounded(values: np.ndarray | None, digits: int) -> list:
 
 def _count(items: Sequence[str], name: str) -> str:
     """ ", 2 warnings", or nothing for none."""
-    return f", {len(items)} {name}{'s' * (len(items) > 1)}" if items else ""
+    return f", {counted(len(items), name)}" if items else ""
 
 
 def _mean(values: np.ndarray | None) -> str:

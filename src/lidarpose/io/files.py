@@ -79,7 +79,9 @@ def unreadable(path: object, error: OSError) -> InputError:
 
 
 def listed(paths: str | os.PathLike | Iterable[str | os.PathLike]) -> list[str | os.PathLike]:
-    """Paths or names as a list; one alone is one, not a list of letters."""
+    """Paths or names as a list; one alone is one, not a list of letters. Raises InputError for anything else."""
+    if isinstance(paths, bytes) or not isinstance(paths, str | os.PathLike | Iterable):
+        raise InputError(f"expected a path, or several, got {type(paths).__name__}: name a file or folder")
     return [paths] if isinstance(paths, str | os.PathLike) else list(paths)
 
 

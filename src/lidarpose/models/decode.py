@@ -57,10 +57,8 @@ def dark(logits: np.ndarray, *, low: float | np.ndarray, step: float | np.ndarra
     return low + (mode - np.where(np.abs(offset) > _MOST, 0, offset)) * step
 
 
-def window(
-    logits: np.ndarray, *, low: float | np.ndarray, step: float | np.ndarray, reach: int = HALF_WIDTH
-) -> np.ndarray:
-    """logits (..., W) -> (...) m: the mean position under the softmax of the bins within `reach` of the mode.
+def window(logits: np.ndarray, *, low: float | np.ndarray, step: float | np.ndarray) -> np.ndarray:
+    """logits (..., W) -> (...) m: the mean position under the softmax of the bins within `HALF_WIDTH` of the mode.
 
     A mean over all bins would fall between the two peaks of a left/right doubt. The window has as many bins on either
     side: one that an edge cuts would lean inwards, so near an edge it is narrower. Raises InputError for no bins.
@@ -68,7 +66,7 @@ def window(
     logits = _checked(logits)
     bins = logits.shape[-1]
     mode = logits.argmax(-1)[..., None]
-    half_width = np.minimum(np.minimum(mode, bins - 1 - mode), reach)
+    half_width = np.minimum(np.minimum(mode, bins - 1 - mode), HALF_WIDTH)
     index = np.arange(bins)
     weight = np.exp(logits - np.take_along_axis(logits, mode, -1)) * (np.abs(index - mode) <= half_width)
     return low + (weight * index).sum(-1) / weight.sum(-1) * step

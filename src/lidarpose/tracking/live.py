@@ -109,9 +109,9 @@ class LiveFilter:
         }
 
     @classmethod
-    def from_state(cls, state: dict[str, Any], skeleton: Skeleton | None = None) -> "LiveFilter":
-        """The filter of a `state`; skeleton: only where it is none of lidarpose's own."""
-        live_filter = cls(skeleton_of(state["skeleton"]) if skeleton is None else skeleton)
+    def from_state(cls, state: dict[str, Any]) -> "LiveFilter":
+        """The filter of a `state`."""
+        live_filter = cls(skeleton_of(state["skeleton"]))
         live_filter._time, live_filter._seen, live_filter._frames = state["time"], state["seen"], state["frames"]
         live_filter._arrays = {name: np.array(value) for name, value in state["arrays"].items()}
         live_filter._belief = Belief(**{name: np.array(value) for name, value in state["belief"].items()})

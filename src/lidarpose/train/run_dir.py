@@ -27,7 +27,7 @@ from lidarpose.train.optim import Muon
 from lidarpose.train.recipes import FREE, AnyRecipe, Recipe
 
 # where numbered runs go
-RUNS = "runs"
+RUNS = Path("runs")
 STATE, MODEL, BEST = "state.safetensors", "model.safetensors", "best.safetensors"
 CONFIG, LOG, PICTURES = "config.json", "log.jsonl", "pictures"
 # of the files in a run's folder, the last part of a long name
@@ -48,12 +48,12 @@ _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 MEMORY = {torch.optim.AdamW: _MOMENTS, torch.optim.Adam: _MOMENTS, Muon: ("momentum_buffer",)}
 
 
-def numbered(kind: str, parent: str | Path = RUNS) -> Path:
-    """A new folder KIND-001, -002, ... in `parent`, made here and now, so that two runs never share one."""
-    number = max([0, *_numbers(Path(parent), kind)])
+def numbered(kind: str) -> Path:
+    """A new folder KIND-001, -002, ... in `RUNS`, made here and now, so that two runs never share one."""
+    number = max([0, *_numbers(kind)])
     while True:
         number += 1
-        folder = Path(parent) / f"{kind}-{number:03d}"
+        folder = RUNS / f"{kind}-{number:03d}"
         try:
             folder.mkdir(parents=True)
             return folder
@@ -63,17 +63,17 @@ def numbered(kind: str, parent: str | Path = RUNS) -> Path:
             raise file_error(folder, f"cannot be made ({error.strerror}); name a folder for the run") from None
 
 
-def latest(kind: str, parent: str | Path = RUNS) -> Path:
+def latest(kind: str) -> Path:
     """The numbered folder of the run that was started last. Raises InputError where there is none."""
-    folders = [Path(parent) / f"{kind}-{number:03d}" for number in sorted(_numbers(Path(parent), kind))]
+    folders = [RUNS / f"{kind}-{number:03d}" for number in sorted(_numbers(kind))]
     runs = [folder for folder in folders if (folder / CONFIG).is_file()]
     if not runs:
-        raise InputError(f"{parent} has no run {kind}-... to resume: name its folder")
+        raise InputError(f"{RUNS} has no run {kind}-... to resume: name its folder")
     return runs[-1]
 
 
-def _numbers(parent: Path, kind: str) -> list[int]:
-    matches = (re.fullmatch(rf"{re.escape(kind)}-(\d{{3,}})", path.name) for path in parent.glob(f"{kind}-*"))
+def _numbers(kind: str) -> list[int]:
+    matches = (re.fullmatch(rf"{re.escape(kind)}-(\d{{3,}})", path.name) for path in RUNS.glob(f"{kind}-*"))
     return [int(match[1]) for match in matches if match]
 
 

@@ -1,16 +1,16 @@
 """Datasets to learn from: labeled samples in memory, and samples for a torch DataLoader.
 
-`SyntheticPeople` and `ShardPeople` yield one `Sample` each, the same ones whatever the number of workers. Worker w of W
-makes the runs of `batch` samples whose number is w modulo W, so a DataLoader gives them in order where its batch_size
-is `batch` (1, as by default, also goes with batch_size=None); with other sizes they are the same samples, batched
-differently. A Sample is no tensor: give the DataLoader a collate_fn, `list` if nothing else.
+`SyntheticPeople` yields the same samples whatever the number of workers. Worker w of W makes the runs of `batch`
+samples whose number is w modulo W, so a DataLoader gives them in order where its batch_size is `batch` (1, as by
+default, also goes with batch_size=None); with other sizes they are the same samples, batched differently. A Sample is
+no tensor: give the DataLoader a collate_fn, `list` if nothing else.
 
 Legend: N samples, M points of all of them.
 """
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -237,25 +237,6 @@ class SyntheticPeople(IterableDataset):
             last = first + self.batch
             for index in range(first, last if self.stop is None else min(last, self.stop)):
                 yield generator.person(self.seed, index, hard=self.hard).sample
-
-
-@dataclass(frozen=True, kw_only=True)
-class ShardPeople(IterableDataset):
-    """The samples of a dataset that `lidarpose synth` wrote, in its order. Raises InputError where it is none."""
-
-    folder: str | Path
-    batch: int = 1
-    dataset: DatasetReader = field(init=False, repr=False)
-
-    def __post_init__(self):
-        check_int("batch", self.batch, least=1)
-        object.__setattr__(self, "dataset", open_dataset(self.folder))
-
-    def __iter__(self) -> Iterator[Sample]:
-        worker, workers = _worker()
-        for number, row in enumerate(self.dataset.rows()):
-            if number // self.batch % workers == worker:
-                yield self.dataset.sample(row)
 
 
 def _worker() -> tuple[int, int]:

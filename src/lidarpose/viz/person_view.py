@@ -5,7 +5,7 @@ from typing import TypeGuard
 
 import numpy as np
 
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, counted
 from lidarpose.geometry import rotation_about
 from lidarpose.sample import MIN_POINTS, Box, Pose, facing
 from lidarpose.skeleton import Skeleton
@@ -113,8 +113,7 @@ def describe(person: Panel) -> str:
     """The line under a person: the caption, by default number of points, distance from the origin, mean confidence."""
     if person.caption:
         return person.caption
-    count = len(person.points)
-    words = [f"{count:,} point{'' if count == 1 else 's'}"]
+    words = [counted(len(person.points), "point")]
     distance = person.distance
     if distance is None:
         center = middle(person)

@@ -21,7 +21,7 @@ import numpy as np
 from lidarpose.data.readers import base
 from lidarpose.data.readers.base import Reader, Skipped, SmplJoints
 from lidarpose.errors import InputError
-from lidarpose.io.files import file_error
+from lidarpose.io.files import file_error, unreadable
 from lidarpose.io.pickles import load_pickle
 from lidarpose.sample import LabeledSample
 from lidarpose.skeleton import SMPL24
@@ -57,7 +57,7 @@ class _Entry:
         try:
             return base.as_cloud(path, np.fromfile(path, "<f4"))
         except OSError as error:
-            raise file_error(path, f"cannot be read ({error.strerror or error})") from None
+            raise unreadable(path, error) from None
 
     def sample(self, points: np.ndarray, joints: np.ndarray, **labels: Any) -> LabeledSample | Skipped:
         """labels: track, source and what else a `LabeledSample` has."""

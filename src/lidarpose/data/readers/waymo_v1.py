@@ -20,7 +20,7 @@ import numpy as np
 from lidarpose.data.readers import waymo_frames as frames
 from lidarpose.data.readers.base import BAD_REST, Skipped
 from lidarpose.errors import InputError, MissingExtra
-from lidarpose.io.files import file_error
+from lidarpose.io.files import file_error, unreadable
 from lidarpose.sample import LabeledSample
 
 try:
@@ -137,7 +137,7 @@ def records(path: Path) -> Iterator[bytes]:
                 yield data
                 number += 1
     except OSError as error:
-        raise file_error(path, f"cannot be read ({error.strerror or error}); check the path and its rights") from None
+        raise unreadable(path, error) from None
 
 
 def _masked_checksum(data: bytes) -> int:

@@ -120,16 +120,16 @@ class PacketRecording(ABC):
 
     Args:
         path: the capture.
-        packet_bytes: the size of the sensor's packets.
-        flow: whose packets are read; None for those that come first.
+        packet_bytes: the size of the sensor's packets; those of the flow that comes first are read.
     """
 
     count = None
 
-    def __init__(self, path: Path, packet_bytes: int, flow: tuple[bytes, int] | None = None):
+    def __init__(self, path: Path, packet_bytes: int):
         self.name = str(path)
         self.capture = Capture(path)
-        self.packet_bytes, self.flow = packet_bytes, flow
+        self.packet_bytes = packet_bytes
+        self.flow: tuple[bytes, int] | None = None
         self.num_other = 0
         self._damage: InputError | None = None
 

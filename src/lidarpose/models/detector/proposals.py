@@ -44,6 +44,7 @@ _APART = 0.3
 # a column stays whose logit is above this: at 0, three in a thousand of those who have columns lose all of theirs, and
 # in a row of people, who are rare in training, those in the middle
 _LEAST_LOGIT = -0.75
+_MOST = 600
 
 # points whose heights are looked up in one go
 _PIECE = 16_384
@@ -51,19 +52,19 @@ _PIECE = 16_384
 _kept = threading.local()
 
 
-def propose(points: np.ndarray, ground: Ground, *, limit: int = 600, heights: np.ndarray | None = None) -> np.ndarray:
-    """Centers (K, 3) m of columns that may be people: x, y, and z of the ground there; the likeliest first.
+def propose(points: np.ndarray, ground: Ground, *, heights: np.ndarray | None = None) -> np.ndarray:
+    """Centers (K, 3) m of columns that may be people, `_MOST` at most: x, y, and z of the ground there; the likeliest
+    first.
 
     Args:
         points: (n, 3) m, z up.
         ground: under them.
-        limit: the most that are returned.
         heights: (n,) m of the points above the ground, where they are known.
     """
     xy, features = columns(points, heights_above(points, ground) if heights is None else heights)
     logit = _likeness(features)
     order = np.argsort(-logit, kind="stable")
-    xy = xy[order[logit[order] > _LEAST_LOGIT][:limit]]
+    xy = xy[order[logit[order] > _LEAST_LOGIT][:_MOST]]
     return np.concatenate([xy, ground.at(xy)[:, None]], 1)
 
 
