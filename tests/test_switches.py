@@ -209,6 +209,16 @@ def test_lipd_s_joints_are_motion_where_there_are_no_poses(tmp_path):
     assert np.linalg.norm(again - joints, axis=-1)[:, files.MAIN].max() < 0.03
 
 
+def test_joints_among_poses_are_left_out(tmp_path):
+    rotations, way = files.a_clip(5)
+    poses, joints = files.to_smpl(rotations, "z"), files.joints_of(rotations)
+    entries = [{"motion_id": "a", "gt": pose, "T_1": place} for pose, place in zip(poses, way, strict=True)]
+    entries[2] = {"motion_id": "a", "gt_joint": joints[2], "T_1": way[2]}
+    motion = load_motion(_written(tmp_path, entries))
+    assert len(motion.rotations) == 4
+    np.testing.assert_allclose(motion.rotations, np.delete(rotations, 2, 0), atol=1e-4)
+
+
 def test_a_list_without_poses_is_no_motion(tmp_path):
     with pytest.raises(InputError, match="gt_joint"):
         load_motion(_written(tmp_path, [{"pc": 3}, 4]))

@@ -160,7 +160,7 @@ def listing() -> list[str]:
             count = len(device.frame(0).azimuth)
             kind = "rosette" if device.duration else "camera"
             beams = f"{count:,} in {device.duration * 1e3:.0f} ms" if device.duration else f"{count:,} pixels"
-            field_of_view = np.degrees(device.azimuths[1] - device.azimuths[0])
+            field_of_view = np.degrees(device.field_of_view)
         else:
             kind, beams, field_of_view = "spinning", f"{device.rows} x {device.columns}", 360.0
         source = _SOURCES.get(name, "nominal" if name.startswith("os") else "maker")
@@ -200,7 +200,7 @@ def load_sensor(path: str | Path) -> Sensor:
         raise file_error(path, "holds no elevations; expected one a laser, in degrees")
     if np.abs(elevations).max() >= 90:
         raise file_error(path, f"elevations must be within +-90 degrees, got {np.abs(elevations).max():g}")
-    # a fan of under 2.3 degrees with more than one laser is in radians
+    # a fan of under 2.3 degrees with more than three lasers is in radians
     if len(elevations) > 3 and np.ptp(elevations) < 2.3 and np.abs(elevations).max() < 1.6:
         raise file_error(path, f"elevations reach over {np.ptp(elevations):g}: they seem to be radians, give degrees")
     order = np.argsort(elevations, kind="stable")

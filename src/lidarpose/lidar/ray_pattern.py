@@ -63,6 +63,16 @@ class RayPattern:
             raise InputError(f"RayPattern.duration must be 0 s or more, got {self.duration}")
         check_limits(self)
 
+    @property
+    def field_of_view(self) -> float:
+        """Rad, in azimuth."""
+        return self.azimuths[1] - self.azimuths[0]
+
+    @property
+    def is_narrow(self) -> bool:
+        """Whether it does not see all around itself."""
+        return self.field_of_view < 2 * np.pi - 1e-3
+
     def __getstate__(self) -> dict:
         # frames are made again in another process
         return self.__dict__ | {"_made": {}}
@@ -208,8 +218,13 @@ def _mid360(frame: int):
     return -azimuth, elevation, share, line
 
 
-def _pinhole(frame: int, *, columns: int = 320, rows: int = 240, width_deg: float = 58.4, height_deg: float = 45.5):
+# a camera's columns and rows, and its field of view, degrees
+_PIXELS, _PINHOLE = (320, 240), (58.4, 45.5)
+
+
+def _pinhole(frame: int):
     """A pinhole camera's pixels, all at once; the line is the row, 0 the lowest."""
+    (columns, rows), (width_deg, height_deg) = _PIXELS, _PINHOLE
     y = np.tan(np.radians(width_deg / 2)) * (1 - 2 * (np.arange(columns) + 0.5) / columns)
     z = np.tan(np.radians(height_deg / 2)) * (2 * (np.arange(rows) + 0.5) / rows - 1)
     y, z = (grid.ravel() for grid in np.meshgrid(y, z))
@@ -241,8 +256,8 @@ PATTERNS = (
         rays=_pinhole,
         frames=1,
         duration=0.0,
-        azimuths=_fan(58.4),
-        elevations=_fan(45.5),
+        azimuths=_fan(_PINHOLE[0]),
+        elevations=_fan(_PINHOLE[1]),
         range_min=0.3,
         range_max=8.0,
         range_sigma=0.012,

@@ -130,11 +130,6 @@ class Sensor:
             origins.append((float(height), origin_sensor, rings))
         return tuple(origins)
 
-    @property
-    def heads(self) -> tuple[tuple[float, "Sensor", np.ndarray], ...]:
-        """Old name of `origins`."""
-        return self.origins
-
     def window(self, left: float, right: float, low: float, high: float) -> Window:
         """The beams with azimuth in [left, right] and elevation in [low, high], rad; left <= right, unwrapped."""
         first_column = int(np.ceil((left - self.azimuth_start - self.azimuth_shifts.max()) / self.azimuth_step))

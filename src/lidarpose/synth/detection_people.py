@@ -1,6 +1,6 @@
 """The people of whole scans: groups of them in the free areas of a place, with what they carry, push and ride."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import pi
 
 import numpy as np
@@ -42,10 +42,6 @@ class PlacedPerson:
     def mounted(self) -> bool:
         return any(prop.name in _MOUNTED for prop in self.props)
 
-    def _lifted(self) -> Place:
-        lift = max((prop.lift for prop in self.props), default=0.0)
-        return replace(self.place, feet=self.place.feet + [0, 0, lift])
-
     def _poses(self, duration: float) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Vertices, joints and what to add to them, m, when a frame of `duration` s begins and, if it lasts, ends."""
         poses = [(self.bodies.vertices[self.row], self.bodies.joints[self.row], np.zeros(3, np.float32))]
@@ -58,13 +54,13 @@ class PlacedPerson:
 
     def label(self, duration: float) -> tuple[np.ndarray, np.ndarray]:
         """Vertices (k V, 3) m of the body at all times of a frame, and joints (26, 3) m in the middle of it."""
-        place, poses = self._lifted(), self._poses(duration)
+        place, poses = self.place.on_props(self.props), self._poses(duration)
         vertices = np.concatenate([place.of_body(vertices + displacement) for vertices, _, displacement in poses])
         return vertices, np.mean([place.of_body(joints + displacement) for _, joints, displacement in poses], axis=0)
 
     def meshes(self, duration: float) -> list[tuple[str | None, Mesh]]:
         """Kinds, None for the body and clothes, and meshes; with where they are when the frame ends."""
-        place, poses = self._lifted(), self._poses(duration)
+        place, poses = self.place.on_props(self.props), self._poses(duration)
         body = [place.of_body(vertices + displacement) for vertices, _, displacement in poses]
         meshes: list[tuple[str | None, Mesh]] = [(None, Mesh(body[0], self.bodies.faces, None, *body[1:]))]
         for prop in self.props:
@@ -130,7 +126,7 @@ def draw_people(site: Site, is_smeared: bool, is_training: bool, rng: np.random.
 def _draw_belongings(bodies: Bodies, row: int, indoors: bool, rng: np.random.Generator) -> list[Prop]:
     """What somebody carries, pushes, sits on or rides."""
     kind, joints = bodies.kinds[row], bodies.joints[row]
-    if kind == "sit" and not indoors or kind == "sit" and rng.random() < 0.15:
+    if kind == "sit" and (not indoors or rng.random() < 0.15):
         mount = MOUNTS[pick(rng, dict(_SEATS))](joints.tolist(), rng.random(12).tolist())
         if mount is not None:
             return [mount]

@@ -98,8 +98,8 @@ def draw_mount(device: Sensor | RayPattern, layout: Layout, rng: np.random.Gener
     if device.name == "livox-mid360" and (height > 2.0 or rng.random() < 0.2):
         # it sees little below itself: hung upside down
         roll += pi
-    is_narrow = isinstance(device, RayPattern) and device.azimuths[1] - device.azimuths[0] < 2 * pi - 1e-3
-    half_width = (device.azimuths[1] - device.azimuths[0]) / 2 if isinstance(device, RayPattern) else pi
+    is_narrow = isinstance(device, RayPattern) and device.is_narrow
+    half_width = device.field_of_view / 2 if isinstance(device, RayPattern) else pi
     yaw = rng.uniform(-pi, pi)
     if is_narrow:
         yaw = -float(rng.choice(layout.ahead)) + rng.uniform(-0.5, 0.5)

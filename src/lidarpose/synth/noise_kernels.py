@@ -5,15 +5,10 @@ Slow twin: `lose_returns_reference` in tests/reference.
 
 import numpy as np
 
-from lidarpose.errors import MissingExtra
-
-try:
-    from numba import njit
-except ImportError as error:  # pragma: no cover - numba is an optional extra
-    raise MissingExtra("synthesis", "synth") from error
+from lidarpose.lidar.raycast_kernels import compiled
 
 
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 def lose_returns(points, face, vertices, faces, keep, error, chance, dropout, intensity_dropout, reach):
     """The returns (k, 3) float32 m that come back, and their indices (k,).
 

@@ -94,7 +94,7 @@ def _draw_sample(
     thing_points = scan.points[scan.part > 0]
     if not len(thing_points) and name in THINGS:
         points, ring = points[:0], ring[:0]
-    elif name not in THINGS or rng.random() < config.noise.clutter:
+    elif name not in THINGS or rng.random() < config.noise.clutter * config.hard:
         clusters = noise.noise_clusters(center, most=_MOST_CLUTTER, rng=rng).astype(np.float32)
         points, ring = np.concatenate([points, clusters]), np.concatenate([ring, np.zeros(len(clusters), ring.dtype)])
     if len(thing_points):

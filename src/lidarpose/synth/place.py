@@ -3,6 +3,7 @@
 Frames: the level frame at the sensor, z up, the ground under the person at -height, and the sensor's own.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import atan2, cos, pi, sin, tan
@@ -12,6 +13,7 @@ import numpy as np
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.lidar.sensor import Sensor
+from lidarpose.synth.props.attachments import Prop
 from lidarpose.synth.scene import SceneConfig
 
 # a standing adult fills about this much of a sphere seen from one meter (silhouette, m2)
@@ -41,6 +43,11 @@ class Place:
     yaw: float
     distance: float
     R_sensor_level: np.ndarray | None = None
+
+    def on_props(self, props: Sequence[Prop]) -> "Place":
+        """Where a body is that stands on some of these: above the ground."""
+        lift = max((prop.lift for prop in props), default=0.0)
+        return replace(self, feet=self.feet + [0, 0, lift]) if lift else self
 
     def of_body(self, points: np.ndarray) -> np.ndarray:
         """Points (n, 3) of a body that faces +x on the origin, where it stands: in the level frame."""
@@ -129,8 +136,7 @@ def _beam(device: Sensor | RayPattern) -> float:
             gap = np.median(gaps) if len(gaps) else np.radians(1.0)
             gap *= (len(gaps) + 1) / len(device.elevations)
         return device.azimuth_step * float(gap)
-    width = device.azimuths[1] - device.azimuths[0]
-    return float(width * np.diff(np.sin(device.elevations))[0] / len(device.frame(0).directions))
+    return float(device.field_of_view * np.diff(np.sin(device.elevations))[0] / len(device.frame(0).directions))
 
 
 def _aim_inverted(

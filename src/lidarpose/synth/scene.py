@@ -156,6 +156,11 @@ class SceneConfig:
         """Whether people may be seen otherwise than in one scan of an upright sensor."""
         return any((self.merged, self.accumulated, self.inverted, self.integration, self.sparse, self.crowded))
 
+    @property
+    def follows_paper(self) -> bool:
+        """Whether every sample is as the paper says: on bare ground, of one difficulty, masked always."""
+        return self.name in ("paper", "reference")
+
     def eased(self, hard: float) -> "SceneConfig":
         """The same scenes at a difficulty of `hard` in [0, 1]."""
         return replace(self, hard=hard)

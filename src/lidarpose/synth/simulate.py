@@ -83,9 +83,8 @@ class Scene:
 
     @property
     def body_place(self) -> Place:
-        """Where the body is: above the ground by what it stands on."""
-        lift = max((prop.lift for prop in self.props), default=0.0)
-        return replace(self.place, feet=self.place.feet + [0, 0, lift]) if lift else self.place
+        """Where the body is."""
+        return self.place.on_props(self.props)
 
     @property
     def is_smeared(self) -> bool:

@@ -115,7 +115,7 @@ def _draw_plan(device: Sensor | RayPattern, rng: np.random.Generator) -> StreetP
     on_road = d < 0.6
     sensor_y = (2 * e - 1) * (road - 2.0) if on_road else (road + front) / 2 * (1 if e < 0.5 else -1)
     height = device.height + 0.15 * (2 * g - 1) + (0 if on_road else kerb)
-    ahead = isinstance(device, RayPattern) and device.azimuths[1] - device.azimuths[0] < 2 * pi - 1e-3
+    ahead = isinstance(device, RayPattern) and device.is_narrow
     turn = (2 * f - 1) * (0.3 if ahead else pi)
     return StreetPlan(road=road, front=front, kerb=kerb, sensor_y=sensor_y, height=height, turn=turn, ahead=ahead)
 
@@ -303,10 +303,10 @@ def _scan_turn(
     ring_normals: np.ndarray,
     rng: np.random.Generator,
 ) -> StreetFrame:
-    is_pattern = isinstance(device, RayPattern)
+    is_smeared = isinstance(device, RayPattern) and device.duration > 0
     people = []
     for bodies, place in walkers:
-        later_vertices = place.of_body(bodies.moved(frame)[0].astype(np.float32)) if is_pattern else None
+        later_vertices = place.of_body(bodies.moved(frame)[0]) if is_smeared else None
         people.append(Mesh(place.of_body(bodies.vertices[frame]), bodies.faces, bodies.face_part, later_vertices))
     scene = union([*people, scenery])
     R_sensor_level = rotation_about("y", -device.tilt).astype(np.float32)

@@ -60,8 +60,6 @@ _POLL = 1.0
 _SHARED_MEMORY, _SHARED_OF_WORKER = Path("/dev/shm"), 2**30
 # bytes to whose multiples arrays are aligned in it
 _ALIGNED = 64
-# scenes of which every sample is as the paper says, masked always
-_OF_ONE_DIFFICULTY = ("paper", "reference")
 
 
 class Source(Protocol):
@@ -127,7 +125,7 @@ class SyntheticSource:
     def _difficulty(self, index: int, rng: np.random.Generator) -> float:
         """Of example `index`, in [0, 1]."""
         ceiling = min(index / self.easy, 1.0) if self.easy else 1.0
-        return ceiling if self.scene in _OF_ONE_DIFFICULTY else ceiling * np.sqrt(rng.random())
+        return ceiling if self._generator.config.follows_paper else ceiling * np.sqrt(rng.random())
 
     def clip(self, index: int, *, trans_center: bool) -> ClipExample:
         """A clip of somebody as difficult as the scene is."""

@@ -20,7 +20,7 @@ LiDARHuman26M: a folder of one JSON file a frame, labels/3d/pose/<sequence>/<fra
 
 LIPD, FreeMotion, NoiseMotion: pickles of a list of dicts as in `data.readers.corpora`, of which `gt` (72 or (3, 72)
 rad, the middle one) and `T_1` or `trans` (3) m are taken, or LIPD's `gt_joint` (24, 3) m where there are no poses.
-Consecutive entries of one `motion_id` or `seq_path` are a clip.
+All entries of one `motion_id` or `seq_path`, in their order, are a clip.
 """
 
 import json
@@ -141,9 +141,8 @@ def load_amass(path: str | os.PathLike, *, up: str | None = None, fps: float | N
     return motion_from_smpl(path, pose, arrays["trans"], name=Path(path).stem, fps=fps, up=up, kind="AMASS")
 
 
-def load_sloper4d(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
-    """The motion of a SLOPER4D label file: a clip for each person that has poses, NAME_first and NAME_second."""
-    labels = load_pickle(path)
+def _load_sloper4d(path: str | os.PathLike, labels: Any, up: str | None, fps: float | None) -> Motion:
+    """The motion of SLOPER4D's labels: a clip for each person that has poses, NAME_first and NAME_second."""
     if not isinstance(labels, dict):
         raise file_error(path, f"expected SLOPER4D's labels, a dict, got {type(labels).__name__}")
     motions = []
@@ -163,17 +162,20 @@ def load_sloper4d(path: str | os.PathLike, *, up: str | None = None, fps: float 
 def load_pkl(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
     """The motion of a pickle: SLOPER4D's labels, or a corpus of LIPD, FreeMotion or NoiseMotion."""
     content = load_pickle(path)
-    return _load_corpus(path, content, up, fps) if isinstance(content, list) else load_sloper4d(path, up=up, fps=fps)
+    return (_load_corpus if isinstance(content, list) else _load_sloper4d)(path, content, up, fps)
 
 
 def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: float | None) -> Motion:
-    """A clip for each sequence of a corpus's entries; those of another form are left out where some are left."""
+    """A clip for each sequence of a corpus's entries; those of another form are left out where some are left, and
+    joints where some are poses."""
     clips: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
-    for entry in (entry for entry in entries if isinstance(entry, dict)):
+    entries = [entry for entry in entries if isinstance(entry, dict)]
+    key = "gt" if any(entry.get("gt") is not None for entry in entries) else "gt_joint"
+    for entry in entries:
         name = str(entry.get("seq_path", entry.get("motion_id", Path(path).stem)))
         try:
-            pose = np.asarray(entry["gt"] if entry.get("gt") is not None else entry["gt_joint"], float)
-            position = next((entry[key] for key in ("T_1", "trans") if entry.get(key) is not None), np.zeros(3))
+            pose = np.asarray(entry[key], float)
+            position = next((entry[name] for name in ("T_1", "trans") if entry.get(name) is not None), np.zeros(3))
             trans = np.asarray(position, float).reshape(3)
             # of NoiseMotion's three the middle one, as its reader
             pose = pose.reshape(-1, _SMPL)[pose.size // _SMPL // 2]
@@ -182,10 +184,9 @@ def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: fl
         clips.setdefault(name, []).append((pose, trans))
     if not clips:
         raise file_error(path, "expected LIPD's, FreeMotion's or NoiseMotion's dicts with gt (72) or gt_joint (24, 3)")
-    has_poses = any(isinstance(entry, dict) and entry.get("gt") is not None for entry in entries)
     rate, length = fps or LIDARHUMAN26M_FPS, [len(frames) for frames in clips.values()]
     poses, positions = map(np.array, zip(*(frame for frames in clips.values() for frame in frames), strict=True))
-    if not has_poses:
+    if key == "gt_joint":
         joints = poses.reshape(-1, 24, 3) + positions[:, None]
         return motion_from_joints(path, joints, list(clips), length, fps=rate, up=up, kind="LIPD", unit_m=1.0)
     # their loaders do not say which axis is up

@@ -67,7 +67,7 @@ def street(rng: np.random.Generator) -> Layout:
     items: list[Item] = [("ground", grid(_XS, ys, heights[None]))]
     for side in (-1, 1):
         items += _fronts(side, front, kerb, rng)
-        items += _parked(side, road, kerb, rng)
+        items += _parked(side, road, rng)
     areas = [(-40.0, 40.0, 0.2 - front, -road - 0.3, kerb), (-40.0, 40.0, road + 0.3, front - 0.2, kerb)]
     areas.append((-40.0, 40.0, -road + 2.0, road - 2.0, 0.0))
     is_on_road = rng.random() < 0.6
@@ -97,7 +97,7 @@ def _fronts(side: int, front: float, z: float, rng: np.random.Generator) -> list
     return items
 
 
-def _parked(side: int, road: float, kerb: float, rng: np.random.Generator) -> list[Item]:
+def _parked(side: int, road: float, rng: np.random.Generator) -> list[Item]:
     """Cars along the kerb or across it; with gaps that people and corners show through."""
     items: list[Item] = []
     is_across, car_share = rng.random() < 0.2, rng.choice([0.0, 0.35, 0.75], p=[0.25, 0.45, 0.3])

@@ -55,16 +55,14 @@ class Site:
         self.elevations = device.elevations[0], device.elevations[-1]
         self.reach = min(_FARTHEST, 0.95 * device.range_max)
         self.areas = np.array(layout.areas) - [x, x, y, y, 0]
-        self.items: list[Item] = []
-        self.low = np.zeros((0, 5))
         moved_items = [(name, mesh.moved((-x, -y, 0))) for name, mesh in layout.items]
         rows = np.array([_footprint(mesh) for _, mesh in moved_items])
         is_structure = np.array([name in ("ground", "ceiling", "wall") for name, _ in moved_items])
         is_clear = is_structure | (_gap(rows, np.zeros(2)) > 0.5)
-        self.items = [item for item, keep in zip(moved_items, is_clear, strict=True) if keep]
+        self.items: list[Item] = [item for item, keep in zip(moved_items, is_clear, strict=True) if keep]
         is_standing = np.array([name not in ("ground", "ceiling") for name, _ in moved_items])
-        self.low = rows[is_clear & is_standing]
-        self.low = self.low[np.isfinite(self.low[:, 0])]
+        rows = rows[is_clear & is_standing]
+        self.low = rows[np.isfinite(rows[:, 0])]
 
     def add(self, name: str, mesh: Mesh) -> None:
         """Puts a mesh of a kind of `things.KINDS` where it is."""

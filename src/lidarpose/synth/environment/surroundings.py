@@ -17,8 +17,6 @@ from lidarpose.synth.scene import SceneConfig
 # Paper: a square of ground of half width 1 m; elsewhere it reaches beyond any crop
 _PAPER_HALF = 1.0
 _WILD_HALF = 3.0
-# presets that have the paper's ground
-_BARE = ("paper", "reference")
 # share of grounds, at full difficulty, that have a kerb by the feet, that are rough, that have grass, for clutter 1
 _KERB, _ROUGH, _GRASS = 0.35, 0.45, 0.15
 # which draws of a kind are walls and cars, and the share of all directions from the person, away from the sensor,
@@ -217,7 +215,7 @@ def ground(config: SceneConfig, feet: np.ndarray, rng: np.random.Generator) -> M
     normal, heading = sqrt(-2 * log(1 - u)) * cos(2 * pi * v), (2 * heading_draw - 1) * pi
     tilt = tan(config.slope * normal)
     slope = (tilt * cos(heading), tilt * sin(heading))
-    if config.name in _BARE:
+    if config.follows_paper:
         return shapes.quad(_PAPER_HALF, slope).moved(feet)
     share_scale = config.clutter * config.hard
     if kind < _KERB * share_scale:

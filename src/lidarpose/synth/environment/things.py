@@ -406,8 +406,8 @@ def car(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 
 def _car_corner(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """A car's corner beside what hides the rest: only a strip of it is seen."""
-    vehicle, occluder = car(u * [0.9] + [0.0] * 8, rng), _box((0.15, 2.0 + 2 * u[4], 1.6 + 0.8 * u[5]))
+    """A car's corner beside what hides the rest: only a strip of it is seen. Never a lorry's."""
+    vehicle, occluder = car(0.9 * u, rng), _box((0.15, 2.0 + 2 * u[4], 1.6 + 0.8 * u[5]))
     gap = 0.25 + 0.5 * u[6]
     low, high = vehicle.vertices.min(0), vehicle.vertices.max(0)
     lateral_offset = (2.0 + 2 * u[4]) / 2

@@ -120,7 +120,7 @@ def skirt(points: Points, u: list[float]) -> tuple[Callable[[Points], np.ndarray
         rings: list[tuple[Point, Point, float]] = [(waist, half_axis, 0.92 * depth), (hip_center, half_axis, depth)]
         for level, share in ((half_hem, 0.5), (hem, 1.0)):
             legs = [_leg(points, name, level) for name in ("left", "right")]
-            radius = thigh * (1 + (_KNEE - 1) * min(level, 1.0) if level < 1 else _CALF) + ease + flare * share
+            radius = thigh * (1 + (_KNEE - 1) * level if level < 1 else _CALF) + ease + flare * share
             half_distance = tuple((a - b) / 2 for a, b in zip(*legs, strict=True))
             rings.append((tuple(middle(*legs)), half_distance, max(radius, 0.6 * depth * (1 - 0.3 * level))))
         centers, halves, radii = (np.array(part) for part in zip(*rings, strict=True))
