@@ -20,8 +20,8 @@ from backbones import Draft, GroupedViT, PointNet2, count
 from torch import nn
 
 from lidarpose.models.config import preset
+from lidarpose.models.onnx import voxelize_people
 from lidarpose.models.posenet import Batch, PoseNet
-from lidarpose.models.voxelize import voxelize
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
@@ -150,14 +150,8 @@ class Ours(Runner):
         self.steps = 0
 
     def voxelize(self, people: list[Example]):
-        return voxelize(
-            np.concatenate([person.points for person in people]),
-            np.array([len(person.points) for person in people]),
-            grid=self.config.grid,
-            max_voxels=self.config.max_voxels,
-            view=np.stack([person.view for person in people]),
-            neighbors=self.config.convolution,
-        )
+        view = np.stack([person.view for person in people])
+        return voxelize_people([person.points for person in people], view, self.config)
 
     def tables(self, people):
         return Batch.from_arrays(self.voxelize(people).arrays(), self.device)

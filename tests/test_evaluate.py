@@ -125,15 +125,15 @@ def test_clean_shows_what_lies_in_a_displaced_box(sets):
     assert (setting.protocol, setting.centring, setting.split) == ("clean", "points alone", "test")
 
 
+class Asked(Fake):
+    def predict_in(self, points, origin, skeleton=None, progress=False, *, box_centers):
+        self.centers += list(box_centers)
+        return self.predict(points, sensor_origin=origin, skeleton=skeleton)
+
+
 @pytest.mark.parametrize("name", ["humanm3", "waymo"])
 def test_clean_tells_the_center_of_the_displaced_box_alone(sets, name):
     """By which a network chooses between two people: that of the labeled box would tell where the true joints are."""
-
-    class Asked(Fake):
-        def predict_in(self, points, origin, skeleton=None, progress=False, *, box_centers):
-            self.centers += list(box_centers)
-            return self.predict(points, sensor_origin=origin, skeleton=skeleton)
-
     model = Asked(standing)
     evaluated(sets, name, model, seed=3)
     people = [person for person in open_eval_dataset(sets / name) if person.sample.box is not None]
@@ -141,6 +141,15 @@ def test_clean_tells_the_center_of_the_displaced_box_alone(sets, name):
     for center, person in zip(model.centers, people, strict=True):
         box = jittered(person.sample.box, np.random.default_rng([3, person.shard, person.row]))
         np.testing.assert_array_equal(center, box.center)
+
+
+def test_people_without_a_box_take_nobody_s_box_away(sets):
+    setup = eval_setup(Asked(standing), open_eval_dataset(sets / "humanm3"), protocol="clean")
+    people = [setup.shown(person)[0] for person in open_eval_dataset(sets / "humanm3")]
+    boxless = [replace(person, crop_box=None) if k % 2 else person for k, person in enumerate(people)]
+    poses = setup.predict(boxless).pred
+    np.testing.assert_array_equal(setup.model.centers, [person.crop_box.center for person in people[::2]])
+    np.testing.assert_array_equal(poses, setup.predict(people).pred)
 
 
 def test_clean_uses_no_label_of_who_was_segmented(sets):

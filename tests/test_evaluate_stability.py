@@ -248,7 +248,8 @@ def test_a_frame_out_of_level_moves_points_and_labels_alike(synthetic, monkeypat
     R = u @ vt
     assert np.degrees(np.arccos((np.trace(R) - 1) / 2)) == pytest.approx(20, abs=0.1)
     np.testing.assert_allclose(turned.sample.joints, before.sample.joints @ R.T, atol=1e-3)
-    np.testing.assert_allclose(turned.sample.box.center, R @ before.sample.box.center, atol=1e-3)
+    for moved, still in ((turned.sample.box, before.sample.box), (turned.crop_box, before.crop_box)):
+        np.testing.assert_allclose(moved.center, R @ still.center, atol=1e-3)
 
 
 def test_nobody_posed_is_drawn_and_without_the_extra_other_sensors_are_left_out(synthetic, monkeypatch):
@@ -266,15 +267,18 @@ def test_nobody_posed_is_drawn_and_without_the_extra_other_sensors_are_left_out(
 def test_a_displaced_box_lets_in_what_lies_around(humanm3):
     setup, gained = set_up(humanm3), 0
     for person in module.people_to_perturb(setup):
-        whole, box = person.whole.points, person.box
+        whole, box = person.whole.points, person.shown.crop_box
         np.testing.assert_array_equal(person.shown.points, whole[box.contains(whole)])
         # a box so small that the person reaches beyond it
         small = replace(box, size=box.size * 0.6)
-        shown = replace(person.shown, points=whole[small.contains(whole)])
-        points = module._perturbed(setup, replace(person, box=small, shown=shown), "crop", 0.2).points
+        shown = replace(person.shown, points=whole[small.contains(whole)], crop_box=small)
+        perturbed = module._perturbed(setup, replace(person, shown=shown), "crop", 0.2)
+        points = perturbed.points
         # the same draws as of the perturbation
         step = level_step([0, zlib.crc32(b"crop"), shown.shard, shown.row], 0.2)
         inside = replace(small, center=small.center + step).contains(whole)
+        # the network is told where the displaced box is
+        np.testing.assert_allclose(perturbed.crop_box.center, small.center + step)
         assert rows(points) == rows(whole[inside].astype(float))
         gained += (inside & ~small.contains(whole)).sum()
     assert gained > 0

@@ -12,28 +12,27 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from lidarpose.geometry import rotation_between
-from lidarpose.models.detector.ground import estimate_ground, estimate_up, without_ground
+from lidarpose.models.detector.detector import BEYOND, MAX_RANGE
+from lidarpose.models.detector.ground import estimate_ground, without_ground
 from lidarpose.models.detector.proposals import columns, heights_above
 from lidarpose.synth.detection_scene import detection_scene
+from lidarpose.train.detector.candidate_source import as_detected
 
 OUT = Path(__file__).parent.parent / "src" / "lidarpose" / "models" / "weights" / "proposals.npz"
-SEED, RANGE, HIDDEN, EPOCHS, LOST = 9001, 40.0, 16, 25, 0.003
+SEED, HIDDEN, EPOCHS, LOST = 9001, 16, 25, 0.003
 
 
 def scene_columns(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Features (K, F), distance (K,) m to the nearest person with 5 points, and who that is: index and number."""
     scene = detection_scene(SEED, index)
+    scene = as_detected(scene, scene.origin)
     points, origin = scene.points.astype(float), scene.origin
-    up = estimate_up(points, origin)
-    rotation = np.eye(3) if up is None else rotation_between(up, np.array([0.0, 0.0, 1.0]))
-    points, origin = points @ rotation.T, rotation @ origin
-    points = points[np.hypot(*(points - origin)[:, :2].T) < RANGE + 6]
+    points = points[np.hypot(*(points - origin)[:, :2].T) < MAX_RANGE + BEYOND]
     ground = estimate_ground(points, origin) or without_ground(points, origin)
     places, features = columns(points, heights_above(points, ground))
-    is_near = np.hypot(*(places - origin[:2]).T) < RANGE
+    is_near = np.hypot(*(places - origin[:2]).T) < MAX_RANGE
     is_visible = np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes)) >= 5
-    people = np.array([(rotation @ box.center)[:2] for box in scene.boxes]).reshape(-1, 2)
+    people = np.array([box.center[:2] for box in scene.boxes]).reshape(-1, 2)
     distances = np.where(is_visible, np.hypot(*(places[is_near][:, None] - people).transpose(2, 0, 1)), 99.0)
     distances = np.concatenate([distances, np.full((len(distances), 1), 99.0)], 1)
     return features[is_near], distances.min(1), distances.argmin(1) + 1000 * index

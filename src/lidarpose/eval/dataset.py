@@ -69,8 +69,9 @@ class EvalSample:
     """A sample and its place in the dataset.
 
     points: (n, 3) m, what the network is shown, at first all that the dataset holds, as precise as it holds them;
-    shard, row: where in the dataset; condition, poses, family: as in lidarpose-bench, "" elsewhere; moving: a frame of
-    a clip that is scored for motion alone.
+    crop_box: the box that cut these out, None where nothing is cut and the dataset has none; shard, row: where in the
+    dataset; condition, poses, family: as in lidarpose-bench, "" elsewhere; moving: a frame of a clip that is scored for
+    motion alone.
     """
 
     sample: LabeledSample
@@ -81,6 +82,7 @@ class EvalSample:
     poses: str = ""
     family: str = ""
     moving: bool = False
+    crop_box: Box | None = None
 
     @property
     def info(self) -> PersonInfo:
@@ -346,7 +348,7 @@ def _bench_sample(bench: Bench, row: int) -> EvalSample:
         time=frame / 10 if clip >= 0 else np.nan,
         info=PersonInfo(**{name: columns[name] for name in info_names}),
     )
-    categories = {name: str(columns[name]) for name in ("condition", "poses", "family")}
+    categories: dict[str, Any] = {name: str(columns[name]) for name in ("condition", "poses", "family")}
     return EvalSample(sample=sample, points=bench.points[row], shard=0, row=row, moving=clip >= 0, **categories)
 
 

@@ -177,19 +177,23 @@ class EvalSetup:
                 return None, f"people without the center {center!r}"
             if kind == "humanm3" and (person.sample.joint_labels == UNLABELED).all():
                 return None, "people without a labelled joint, whom their box is made of"
-        points, _ = self.crop(person)
+        points, box = self.crop(person)
         if len(points) < min_points:
             return None, f"people of under {min_points} points, as the released code skips them"
-        return replace(person, points=points), ""
+        return replace(person, points=points, crop_box=box), ""
 
     def predict(self, samples: Sequence[EvalSample]) -> Predictions:
-        """What is known of people as the protocol shows them, and what the network answers."""
+        """What is known of people as the protocol shows them, see `shown`, and what the network answers."""
         answers: list[dict] = [{} for _ in samples]
         answer = self._predict_clean if self.setting.protocol == "clean" else self._predict_dapt
-        sensors_known = [person.sample.sensor_known and self.setting.sensor == "known" for person in samples]
-        for origin in (np.zeros(3), None):
-            rows = [k for k, is_known in enumerate(sensors_known) if is_known == (origin is not None)]
-            for k, values in zip(rows, answer([samples[k] for k in rows], origin) if rows else (), strict=True):
+        is_single = self._frames == 1
+        rows_by_kind: dict[tuple[bool, bool], list[int]] = {}
+        for k, person in enumerate(samples):
+            is_known = person.sample.sensor_known and self.setting.sensor == "known"
+            rows_by_kind.setdefault((is_known, is_single and person.crop_box is not None), []).append(k)
+        for (is_known, _), rows in rows_by_kind.items():
+            origin = np.zeros(3) if is_known else None
+            for k, values in zip(rows, answer([samples[k] for k in rows], origin), strict=True):
                 answers[k] = self._known(samples[k]) | values
         return stack(self.joints, answers)
 
@@ -197,10 +201,9 @@ class EvalSetup:
         clouds = [person.points for person in samples]
         model: Any = self.model
         name, clips = model.skeleton.name, self._clips(samples)
-        # the boxes that cut, not those that labels made
-        boxes = [self.crop(person)[1] for person in samples]
-        centers = [box.center for box in boxes if box is not None]
-        if hasattr(model, "predict_in") and not clips and len(centers) == len(boxes):
+        # all of them have one, or none; of the boxes that cut, not those that labels made
+        centers = [person.crop_box.center for person in samples if person.crop_box is not None]
+        if hasattr(model, "predict_in") and not clips and centers:
             people = model.predict_in(clouds, origin, name, box_centers=np.stack(centers))
         else:
             people = model.predict(clouds, sensor_origin=origin, skeleton=name, **clips)

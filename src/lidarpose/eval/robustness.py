@@ -82,15 +82,19 @@ def behind_an_edge(points: np.ndarray, box: Box | None, amount: float, rng: np.r
     return points[is_visible]
 
 
-def box_moved(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
-    """What of the points lies in the person's box after that was moved by `amount` m in a level direction; without a
-    box, in that of the points with 5 cm of room."""
+def moved_box(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> Box:
+    """The person's box moved by `amount` m in a level direction; without a box, that of the points with 5 cm of
+    room."""
     if box is None:
         low, high = points.min(0) - _MARGIN, points.max(0) + _MARGIN
         box = Box(center=(low + high) / 2, size=high - low)
     angle = rng.uniform(0, 2 * np.pi)
-    moved_box = replace(box, center=box.center + amount * np.array([np.cos(angle), np.sin(angle), 0]))
-    return points[moved_box.contains(points)]
+    return replace(box, center=box.center + amount * np.array([np.cos(angle), np.sin(angle), 0]))
+
+
+def inside_moved_box(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
+    """What of the points lies in the `moved_box`."""
+    return points[moved_box(points, box, amount, rng).contains(points)]
 
 
 def out_of_level(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
@@ -138,7 +142,7 @@ PERTURBATIONS = {
         "all is gone that lies on one side of an edge, straight as the sensor sees it, of a random direction",
     ),
     "crop": Perturbation(
-        box_moved,
+        inside_moved_box,
         "box displaced, cm",
         (0.05, 0.1, 0.2, 0.3, 0.4),
         "the crop's box is moved in a random level direction; what it leaves is lost, nothing new comes in unless "
@@ -220,11 +224,10 @@ def to_json(studies: Sequence[Stability], *, head: dict[str, Any]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class CroppedPerson:
-    """Somebody as the protocol shows them; whole: with all points that the dataset holds; box: that of the crop."""
+    """Somebody as the protocol shows them; whole: with all points that the dataset holds."""
 
     shown: EvalSample
     whole: EvalSample
-    box: Box | None
 
 
 def people_to_perturb(setup: EvalSetup) -> list[CroppedPerson]:
@@ -238,9 +241,7 @@ def people_to_perturb(setup: EvalSetup) -> list[CroppedPerson]:
     # who is not scored is not perturbed either
     pairs = [(setup.shown(person)[0], person) for person in samples]
     people = [
-        CroppedPerson(shown=crop, whole=person, box=setup.crop(person)[1])
-        for crop, person in pairs
-        if crop is not None and len(crop.points)
+        CroppedPerson(shown=crop, whole=person) for crop, person in pairs if crop is not None and len(crop.points)
     ]
     if not people:
         raise InputError(f"none of the {_who(setup)} has a point to perturb: score more people, or leave stability out")
@@ -321,13 +322,13 @@ def _who(setup: EvalSetup) -> str:
 
 
 def _perturbed(setup: EvalSetup, person: CroppedPerson, name: str, amount: float) -> EvalSample:
-    eval_sample, sample = person.shown, person.shown.sample
+    eval_sample, sample, box = person.shown, person.shown.sample, person.shown.crop_box
     seed = [setup.setting.seed, zlib.crc32(name.encode()), eval_sample.shard, eval_sample.row]
     # a displaced box may let in what the dataset holds around the person
     points = (person.whole if name == "crop" else eval_sample).points.astype(float)
 
     def apply(positions: np.ndarray) -> np.ndarray:
-        return PERTURBATIONS[name].apply(positions, person.box, amount, np.random.default_rng(seed))
+        return PERTURBATIONS[name].apply(positions, eval_sample.crop_box, amount, np.random.default_rng(seed))
 
     if PERTURBATIONS[name].rigid:
         sample = replace(
@@ -336,7 +337,10 @@ def _perturbed(setup: EvalSetup, person: CroppedPerson, name: str, amount: float
             box=sample.box and replace(sample.box, center=apply(sample.box.center)),
             centers={name: apply(center) for name, center in sample.centers.items()},
         )
-    return replace(eval_sample, points=apply(points), sample=sample)
+        box = box and replace(box, center=apply(box.center))
+    elif name == "crop" and box is not None:
+        box = moved_box(points, box, amount, np.random.default_rng(seed))
+    return replace(eval_sample, points=apply(points), sample=sample, crop_box=box)
 
 
 def _point(predictions: Predictions, base_errors: np.ndarray, amount: float, label: str, setting: Setting) -> Point:

@@ -22,15 +22,13 @@ from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.scan import Scan, read_scan, up_text
 from lidarpose.inference.verification import rounded, verified
 from lidarpose.io.boxes import Boxes
-from lidarpose.models.detector.detector import Detections, Detector
+from lidarpose.models.detector.detector import MAX_RANGE, Detections, Detector
 from lidarpose.models.detector.ground import estimate_up
 from lidarpose.sample import MIN_POINTS, Box
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-# how far from the sensor people are searched, m
-MAX_RANGE = 40.0
 # detections that may be verified, and posed
 MOST_POSED = 60
 # a scan of more points is thinned, of an unknown sensor and of a known one; what is farther away than this beyond the

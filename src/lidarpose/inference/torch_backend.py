@@ -126,8 +126,7 @@ class BaselineBackend(_PaperBackend):
         arrays = pad_clouds(clouds, view, config, [0] * len(clouds))
         inputs = (torch.as_tensor(arrays[name]).to(self.device) for name in ("points", "valid", "center"))
         joints = self.network(*inputs).joints.float().cpu().numpy() + arrays["middle"][:, None]
-        order = [config.joints.index(joint) for joint in self.header.skeleton.joints]
-        return Raw.from_joints(joints[:, order])
+        return Raw.from_joints(joints[:, config.order_in(self.header.skeleton)])
 
 
 class ClipBackend(_PaperBackend):

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, get_args
 
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.models import VERIFIER
-from lidarpose.skeleton import BODY26, skeleton
+from lidarpose.skeleton import BODY26, Skeleton, skeleton
 
 # heatmaps in a window about each joint's vote; over the whole person, as the paper's; or votes alone
 HEATMAPS = ("window", "full", "none")
@@ -51,6 +51,16 @@ class Config:
     def poses(self) -> bool:
         """Whether it predicts joints."""
         return bool(getattr(self, "joints", ()))
+
+    @property
+    def columns(self) -> list[int]:
+        """Columns of body26 that its joints are."""
+        return [BODY26.index(joint) for joint in getattr(self, "joints", ())]
+
+    def order_in(self, skeleton: Skeleton) -> list[int]:
+        """For each joint of a skeleton that has no others, its place among the network's joints."""
+        joints = getattr(self, "joints", ())
+        return [joints.index(joint) for joint in skeleton.joints]
 
     def __post_init__(self):
         for f in fields(self):

@@ -156,7 +156,9 @@ def mean_pose_error(target: Target, result: Result, out: Path) -> float:
         train_offsets = [
             _offset(person, result) for person in open_eval_dataset(folders[0], split=split, limit=_MEAN_POSE)
         ]
-        test_offsets = [_offset(person, result) for person in open_eval_dataset(folders[1], split=None)]
+        least = DAPT[result.setting.kind].least if result.setting.protocol == PROTOCOL else 1
+        test_people = (person for person in open_eval_dataset(folders[1], split=None) if len(person.points) >= least)
+        test_offsets = [_offset(person, result) for person in test_people]
         mean = np.nanmean(train_offsets, 0)
         errors = 1e3 * np.linalg.norm(np.array(test_offsets) - mean, axis=-1)
         error = aggregate.mean(errors)

@@ -28,7 +28,6 @@ LEAST_POINTS = 10
 FALSE_PER_SCAN = (0.3, 1.0, 3.0, 10.0)
 REFERENCE = 1.0
 POINT_EDGES = (LEAST_POINTS, 20, 50, np.inf)
-DISTANCE_EDGES = (0.0, 10.0, 20.0, 30.0, np.inf)
 # conditions: another person or a thing so near, m, and people who are less tall, m
 _COMPANY, _TOUCHING, _LOW = 1.0, 0.3, 1.4
 CONDITIONS = ("person within 1 m", "thing within 0.3 m", "under 1.4 m tall", "none of these")
@@ -317,7 +316,7 @@ def _groups_of_people(people: pd.DataFrame) -> Iterator[tuple[str, str, np.ndarr
         yield f"kind{suffix}", "indoors", mask & people.kind.isin(INDOORS).to_numpy()
         for name in CONDITIONS:
             yield f"condition{suffix}", name, mask & people[name].to_numpy(bool)
-        for name, rows in aggregate.span_rows(people.distance.to_numpy(), DISTANCE_EDGES).items():
+        for name, rows in aggregate.span_rows(people.distance.to_numpy(), aggregate.DISTANCE_EDGES).items():
             yield f"distance, m{suffix}", name, mask & rows
 
 

@@ -12,7 +12,7 @@ from lidarpose.errors import InputError
 from lidarpose.models.config import Config, check_joints, probability
 from lidarpose.models.voxelize import WINDOW
 from lidarpose.sample import CLIP_FRAMES
-from lidarpose.skeleton import BODY26, HUMAN15, SMPL24
+from lidarpose.skeleton import HUMAN15, SMPL24
 
 # points of a person that a network reads at most, as published
 MOST_POINTS = 1024
@@ -46,11 +46,6 @@ class BaselineConfig(Config):
     @property
     def name(self) -> str:
         return self.kind
-
-    @property
-    def columns(self) -> list[int]:
-        """Columns of body26 that the network's joints are."""
-        return [BODY26.index(joint) for joint in self.joints]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarpose.errors import InputError, check_name
 from lidarpose.models.config import MOST, Config, at_least, check_counts, check_joints, is_number, probability
-from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, Skeleton
+from lidarpose.skeleton import BODY26, HUMAN15, SMPL24
 
 # the order in which the released Waymo network knows its joints: Waymo's own numbers, limb after limb
 WAYMO_JOINTS = tuple(
@@ -130,20 +130,6 @@ class DaptConfig(Config):
     def step(self) -> np.ndarray:
         """(3,) m: how far apart the bins of each axis are. position = low + index * step, as in the released code."""
         return np.array([(high - low) / n for (low, high), n in zip(self.ranges, self.bins, strict=True)])
-
-    def order_in(self, skeleton: Skeleton) -> np.ndarray:
-        """(len(skeleton),) int: for each joint of `skeleton` its place among this network's joints.
-
-        `values[:, config.order_in(WAYMO14)]` brings (B, J, ...) into the skeleton's order. Raises InputError where the
-        network lacks one.
-        """
-        missing = [joint for joint in skeleton.joints if joint not in self.joints]
-        if missing:
-            raise InputError(
-                f"the network {self.name} has no {', '.join(missing)}, which {skeleton.name} needs: "
-                f"use a skeleton of its joints, {', '.join(self.joints)}"
-            )
-        return np.array([self.joints.index(joint) for joint in skeleton.joints])
 
     @classmethod
     def from_dict(cls, entries: dict) -> "DaptConfig":

@@ -20,8 +20,9 @@ from lidarpose.models.detector.range_image import SIDE, SLICES
 from lidarpose.models.detector.render import render
 from lidarpose.models.onnx import check_names, open_network
 
-# what lies farther than this beyond the range, m, is left out: a candidate at its end still has its surroundings
-_BEYOND = 6.0
+# how far people are looked for by default, m; what lies farther beyond the range is left out, m: a candidate at its end
+# still has its surroundings
+MAX_RANGE, BEYOND = 40.0, 6.0
 # of an unknown sensor there is no range: points so far, m, from nearly all others, percents, are stray ones, which
 # would make the cells of all that is looked at larger
 _STRAY, _NEARLY_ALL = 100.0, (0.1, 99.9)
@@ -86,7 +87,7 @@ class Detector:
         points: np.ndarray,
         origin: np.ndarray | None,
         *,
-        max_range: float | None = 40.0,
+        max_range: float | None = MAX_RANGE,
         limit: int | None = None,
         moving: np.ndarray | None = None,
     ) -> Detections:
@@ -106,7 +107,7 @@ class Detector:
         columns = list(np.asarray(points).T)
         if origin is not None and max_range is not None:
             square_distance = (columns[0] - origin[0]) ** 2 + (columns[1] - origin[1]) ** 2
-            rows = np.flatnonzero(square_distance < (max_range + _BEYOND) ** 2)
+            rows = np.flatnonzero(square_distance < (max_range + BEYOND) ** 2)
         else:
             rows = np.flatnonzero(_is_near_others(columns[0]) & _is_near_others(columns[1]))
         if len(rows) < len(points):

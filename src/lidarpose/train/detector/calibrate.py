@@ -14,10 +14,10 @@ import numpy as np
 from lidarpose.errors import InputError, check_int
 from lidarpose.eval.detector.detection_scores import MATCH_RADIUS, match
 from lidarpose.eval.detector.evaluate_detector import run_detector
-from lidarpose.inference.detection import MAX_RANGE, MOST_POSED
+from lidarpose.inference.detection import MOST_POSED
 from lidarpose.inference.verification import FEATURES, People, verification_features, verified
 from lidarpose.models.checkpoint import load_checkpoint
-from lidarpose.models.detector.detector import Detections, Detector
+from lidarpose.models.detector.detector import MAX_RANGE, Detections, Detector
 from lidarpose.models.detector.network import DetectorNet
 from lidarpose.models.export import export_detector
 from lidarpose.progress import Progress

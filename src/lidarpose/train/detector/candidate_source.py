@@ -16,14 +16,13 @@ import numpy as np
 
 from lidarpose.geometry import rotation_between
 from lidarpose.models.detector.candidates import Candidates, SceneIndex
+from lidarpose.models.detector.detector import BEYOND, MAX_RANGE
 from lidarpose.models.detector.ground import estimate_ground, estimate_up, without_ground
 from lidarpose.models.detector.proposals import heights_above, propose
 from lidarpose.models.detector.render import Augmentation, draw_augmentation
 from lidarpose.synth.detection_scene import DetectionScene, detection_scene
 from lidarpose.synth.scene import RandomStream
 
-# how far people are looked for, and how far points beyond are taken along, as when people are detected, m
-RANGE, _BEYOND = 40.0, 6.0
 # of a candidate's distance to a person's center in x and y: one up to the first is the person's, and their nearest one
 # up to the second; one beyond the second is nobody's, and what lies between teaches nothing, m
 POSITIVE, IGNORED = 0.35, 0.5
@@ -170,11 +169,11 @@ class CandidateSource(SceneSource[DetectorExample, DetectorExample]):
 def scan_example(seed: int, number: int, *, family: str = "train") -> DetectorExample:
     """All candidates of a scene, found as in any scan: leveled first where it is tilted."""
     scene, origin = scene_to_search(seed, number, family)
-    points = scene.points[_distance(scene.points, scene) < RANGE + _BEYOND]
+    points = scene.points[_distance(scene.points, scene) < MAX_RANGE + BEYOND]
     ground = estimate_ground(points, origin) or without_ground(points, origin)
     heights = heights_above(points, ground)
     centers = propose(points, ground, heights=heights)
-    centers = centers[_distance(centers, scene) < RANGE]
+    centers = centers[_distance(centers, scene) < MAX_RANGE]
     candidates = SceneIndex(points, ground, origin, heights=heights).candidates(centers)
     return DetectorExample(candidates=candidates, labels=labels_of(candidates, scene))
 

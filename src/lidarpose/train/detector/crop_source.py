@@ -9,10 +9,10 @@ from functools import cache, partial
 import numpy as np
 
 from lidarpose.geometry import rows_near
-from lidarpose.inference.detection import MAX_RANGE, MOST_POSED
+from lidarpose.inference.detection import MOST_POSED
 from lidarpose.inference.tta import IDENTITY, apply
 from lidarpose.inference.verification import AROUND, inside_column
-from lidarpose.models.detector.detector import Detector
+from lidarpose.models.detector.detector import MAX_RANGE, Detector
 from lidarpose.sample import MIN_POINTS
 from lidarpose.train.detector.candidate_source import NOBODY, UNCLEAR, SceneSource, scene_to_search
 

@@ -14,7 +14,6 @@ from lidarpose.errors import InputError, check_name
 from lidarpose.models.dapt.dapt_config import PARTS, DaptConfig, named_config
 from lidarpose.models.dapt.dapt_net import DaptNet, to_tensors
 from lidarpose.models.dapt.voxel_tables import LAYOUTS, Tables, build_tables
-from lidarpose.skeleton import BODY26
 from lidarpose.train.augment import UNKNOWN_PART, Example
 from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, pretraining, prn
 from lidarpose.train.objectives.objective import Share, alone, in_body26, majority_part
@@ -73,11 +72,6 @@ class DaptObjective:
                 f"and parts={config.parts}: see pretraining_config"
             )
 
-    @property
-    def _columns(self) -> list[int]:
-        """Columns of body26 that the network's joints are."""
-        return [BODY26.index(name) for name in self.config.joints]
-
     def network(self) -> DaptNet:
         return DaptNet(self.config)
 
@@ -97,7 +91,7 @@ class DaptObjective:
         )
         # the last entry: of the stand-in for an empty cloud
         part = np.concatenate([*(part for _, part in samples), [UNKNOWN_PART]])
-        joints = np.stack([example.joints for example in examples])[:, self._columns].astype(np.float32)
+        joints = np.stack([example.joints for example in examples])[:, self.config.columns].astype(np.float32)
         if self.config.neck == "prn":
             nearest_labels = nearest_joints(tables.features, np.repeat(joints, tables.levels[0].lengths, axis=0))
             labels: np.ndarray | None = np.where(tables.kept < 0, UNKNOWN_PART, nearest_labels)
@@ -124,7 +118,7 @@ class DaptObjective:
         """Of the heatmaps; in pre-training of the coordinates, which are what it teaches."""
         outputs = network(to_tensors(arrays.tables, device))
         joints = outputs.coordinates if self.stage == "pretrain" else outputs.joints()
-        return in_body26(joints, self._columns)
+        return in_body26(joints, self.config.columns)
 
 
 def pretraining_config() -> DaptConfig:

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from lidarpose.models.config import BIN, NetworkConfig
 from lidarpose.models.layers import encode
 from lidarpose.models.posenet import Batch, Outputs, PoseNet, Targets
-from lidarpose.models.voxelize import voxelize
+from lidarpose.models.voxelize import VoxelPyramid, voxelize
 from lidarpose.sample import CONFIDENCE_RADIUS
 from lidarpose.skeleton import BODY26
 from lidarpose.train.augment import Example
@@ -39,6 +39,21 @@ _PAIRS = torch.tensor(
 )
 
 
+def training_voxels(
+    clouds: list[np.ndarray], view: np.ndarray, seeds: np.ndarray, config: NetworkConfig
+) -> VoxelPyramid:
+    """The voxels of examples' clouds (n, 3) m, as many as memory holds; view (B, 5); seeds (B,): of what is drawn."""
+    return voxelize(
+        np.concatenate(clouds),
+        np.array([len(cloud) for cloud in clouds]),
+        grid=config.grid,
+        max_voxels=MAX_VOXELS,
+        view=view,
+        seeds=seeds,
+        neighbors=config.convolution > 0,
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class PoseNetObjective:
     """The `Objective` of a `PoseNet` with this configuration. bone, symmetry: weights, see `losses`."""
@@ -52,15 +67,8 @@ class PoseNetObjective:
 
     def collate(self, examples: list[Example]) -> dict[str, np.ndarray]:
         """The arrays of a `VoxelPyramid`, and those of `Targets`."""
-        pyramid = voxelize(
-            np.concatenate([e.points for e in examples]),
-            np.array([len(e.points) for e in examples]),
-            grid=self.config.grid,
-            max_voxels=MAX_VOXELS,
-            view=np.stack([e.view for e in examples]),
-            seeds=np.array([e.seed for e in examples]),
-            neighbors=self.config.convolution > 0,
-        )
+        clouds, view, seeds = ([getattr(e, name) for e in examples] for name in ("points", "view", "seed"))
+        pyramid = training_voxels(clouds, np.stack(view), np.array(seeds), self.config)
         part = np.concatenate([e.part for e in examples]).astype(np.int64)
         valid = pyramid.fine.valid
         part = majority_part(pyramid.point_voxel, part, voxels=valid.size, parts=self.config.parts)

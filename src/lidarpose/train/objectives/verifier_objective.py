@@ -13,12 +13,11 @@ from torch.nn import functional as F
 
 from lidarpose.models.config import NetworkConfig
 from lidarpose.models.posenet import Batch, PoseNet
-from lidarpose.models.voxelize import voxelize
 from lidarpose.train.detector.candidate_source import NOBODY
 from lidarpose.train.detector.crop_source import CropExample
 from lidarpose.train.objectives.detector_objective import average_precision, share_missed
 from lidarpose.train.objectives.objective import Share, alone, at_least_one
-from lidarpose.train.objectives.posenet_objective import MAX_VOXELS
+from lidarpose.train.objectives.posenet_objective import training_voxels
 
 # weight of whether people ride or sit in wheelchairs
 MOUNTED = 0.5
@@ -48,15 +47,7 @@ class VerifierObjective:
         groups = []
         for start in range(0, len(order), _GROUP):
             rows = order[start : start + _GROUP]
-            pyramid = voxelize(
-                np.concatenate([clouds[row] for row in rows]),
-                np.array([len(clouds[row]) for row in rows]),
-                grid=self.config.grid,
-                max_voxels=MAX_VOXELS,
-                view=view[rows],
-                seeds=seeds[rows],
-                neighbors=self.config.convolution > 0,
-            )
+            pyramid = training_voxels([clouds[row] for row in rows], view[rows], seeds[rows], self.config)
             groups.append(pyramid.arrays() | {"person": labels[rows]})
         return groups
 
