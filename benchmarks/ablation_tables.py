@@ -37,7 +37,7 @@ _HEADER = tuple(WORDS.get(name, name) for name in _SHOWN)
 
 
 def own_lines(result: Result) -> list[MetricRow]:
-    """The lines of what was judged, without the floors', by this package's arithmetic."""
+    """The lines of what was judged, without the baselines', by this package's arithmetic."""
     return [x for x in result.lines if x.method == result.setting.method and x.arithmetic == OURS]
 
 
@@ -96,7 +96,7 @@ class Runs:
         point = next(value for freedom, value in reversed(_STUDENT.items()) if freedom <= self.freedom)
         return float(point * self.deviation * (contrast @ self._inverse @ contrast) ** 0.5)
 
-    def told(self, variant: str) -> str:
+    def difference_text(self, variant: str) -> str:
         """The difference and its interval, and whether it is one."""
         difference, reach = self.difference(variant), self.reach(variant)
         if math.isnan(difference):
@@ -133,7 +133,7 @@ def _row(runs: Runs, variant: str) -> tuple[str, ...]:
     what = runs.by[variant, runs.seeds(variant)[0]]["what"]
     cells = [f"{runs.mean(variant, figure):.1f}" for figure in ("all", *_SHOWN)]
     cells[-1] += " %"
-    difference = "" if variant == BASE else runs.told(variant)
+    difference = "" if variant == BASE else runs.difference_text(variant)
     return what, cells[0], difference, *cells[1:], str(len(runs.seeds(variant)))
 
 

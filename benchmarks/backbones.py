@@ -195,7 +195,7 @@ def _padded(rows: Tensor, level: DraftLevel) -> Tensor:
 
 
 def _ragged(level: VoxelLevel, coarser: VoxelLevel | None) -> DraftLevel:
-    """A plan's padded level as ragged rows; `above`: the next coarser one."""
+    """A pyramid's padded level as ragged rows; coarser: the next one."""
     children = parent = None
     if coarser is not None:
         lengths = coarser.valid.sum(1)

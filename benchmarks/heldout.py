@@ -13,6 +13,7 @@ import time
 
 import numpy as np
 
+from lidarpose.eval.dataset import facing
 from lidarpose.geometry import rotation_about
 from lidarpose.inference.predictor import load
 from lidarpose.metrics import auroc, calibration_error, mpjpe, pa_mpjpe
@@ -41,14 +42,6 @@ def people(bank: PoseBank, count: int, least: int, seed: int) -> list[SyntheticP
     return persons
 
 
-def facing(joints: np.ndarray) -> np.ndarray:
-    """joints (n, 15, 3) -> (n,) rad: where the hips and shoulders face."""
-    index = HUMAN15.index
-    left = joints[:, index("left_hip")] - joints[:, index("right_hip")]
-    left = left + joints[:, index("left_shoulder")] - joints[:, index("right_shoulder")]
-    return np.arctan2(-left[:, 0], left[:, 1])
-
-
 def score(predicted, persons: list[SyntheticPerson]) -> dict:
     """Figures in millimeters or shares."""
     pred = np.stack([p.pose.to(HUMAN15).joints for p in predicted])
@@ -58,7 +51,7 @@ def score(predicted, persons: list[SyntheticPerson]) -> dict:
     plain = np.array([f.plain for f in facts])
     visible = np.array([f.visible for f in facts])
     clutter = np.array([f.clutter for f in facts])
-    turn = np.abs((facing(pred) - facing(true) + np.pi) % (2 * np.pi) - np.pi)
+    turn = np.abs((facing(pred, HUMAN15) - facing(true, HUMAN15) + np.pi) % (2 * np.pi) - np.pi)
     error = np.linalg.norm(pred - true, axis=-1)
     confidence = np.stack([p.pose.to(HUMAN15).confidence for p in predicted])
     spread = np.stack([p.pose.to(HUMAN15).spread for p in predicted])
@@ -124,7 +117,7 @@ def main() -> None:
         predictions = model.predict(clouds, sensor_origin=origin, skeleton="body26")
         results[name] = score(predictions, persons)
         results[name]["ms_a_person"] = round((time.perf_counter() - start) * 1e3 / len(persons), 2)
-    results["mean pose, true facing"] = {"mpjpe": round(_floor(persons), 1)}
+    results["mean pose, true facing"] = {"mpjpe": round(_mean_pose_error(persons), 1)}
     for name, result in results.items():
         print(f"--- {name}")
         for group, figures in result.get("groups", {}).items():
@@ -137,10 +130,10 @@ def main() -> None:
             )
 
 
-def _floor(persons: list[SyntheticPerson]) -> float:
+def _mean_pose_error(persons: list[SyntheticPerson]) -> float:
     """MPJPE of the mean pose, turned to where each person truly faces, about the center of their points."""
     true = np.stack([p.sample.pose.to(HUMAN15).joints - p.sample.center for p in persons])
-    R_world_person = rotation_about("z", facing(true))
+    R_world_person = rotation_about("z", facing(true, HUMAN15))
     local_joints = true @ R_world_person
     return mpjpe(local_joints.mean(0) @ np.swapaxes(R_world_person, -1, -2), true)
 

@@ -175,7 +175,7 @@ class Report:
         return rows
 
     def _figures(self, statistic: Callable[..., float]) -> list[tuple[str, str, bool, float, float]]:
-        """what, unit, whether a ceiling, target, figure; take: `median` or `best`."""
+        """what, unit, whether a ceiling, target, figure; statistic: `median` or `best`."""
         figures = [
             ("`tiny` ONNX, one person of 512 points", "ms", True, 3, statistic("latency", "tiny ONNX", 512) * 1e3),
             ("`tiny` in torch, one person of 512 points", "ms", True, 8, statistic("latency", "tiny", 512) * 1e3),

@@ -266,7 +266,7 @@ class Paper(Runner):
         tables = self._tables(people)
         part = np.concatenate([person.part for person in people])[tables.kept]
         true = np.stack([person.joints for person in people])
-        # the place of each of this skeleton's joints among the network's, turned round
+        # the place of each of this skeleton's joints among the network's, inverted
         place = np.argsort(self.order)
         return tables, torch.as_tensor(true[:, place]), torch.as_tensor(part, dtype=torch.int64)
 

@@ -253,8 +253,8 @@ def run(
     progress = progress or (lambda dataset, done, total: None)
     evaluations, studies = [], []
     for setup, people in zip(setups, perturbed_people, strict=True):
-        name, legacy = setup.dataset.name, dapt_compat or legacy
-        evaluations.append(evaluate_dataset(setup, dapt_compat=legacy, progress=partial(progress, name)))
+        name = setup.dataset.name
+        evaluations.append(evaluate_dataset(setup, dapt_compat=dapt_compat or legacy, progress=partial(progress, name)))
         if people is not None:
             study_progress = partial(progress, f"{name}, perturbed")
             studies.append(study(setup, evaluations[-1].predictions, people=people, progress=study_progress))

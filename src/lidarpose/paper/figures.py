@@ -62,7 +62,7 @@ def _side_by_side(cells: dict[str, Cell], out: Path) -> bytes:
     tables = zip((p.errors() for p in predictions.values()), index_by_key, strict=True)
     errors = np.array([[table[index[key]] for key in common_keys] for table, index in tables])
     # without labels there is no error
-    mean = np.nan_to_num(np.where(np.isnan(errors), 0, errors).sum(-1) / np.maximum((~np.isnan(errors)).sum(-1), 1))
+    mean = np.nansum(errors, -1) / np.maximum((~np.isnan(errors)).sum(-1), 1)
     hardest_keys = [common_keys[k] for k in np.argsort(-mean.mean(0), kind="stable")[:HARDEST]]
     target = next(iter(cells.values())).target
     folder = target.test.product(out) if isinstance(target.test, Step) else target.test

@@ -16,7 +16,8 @@ class RandomStream(IntEnum):
     """Second word of a generator's seed, (seed, stream, index): what is drawn for one never shifts another.
 
     Values must not change: every dataset and bench was made with them. 5 has two uses: boxes in datasets of streets and
-    stored people in training, which never share a sample. 9 and 10 are the training loop's, of torch.
+    stored people in training, which never share a sample. 9 and 10 are the training loop's, of torch. Numpy takes
+    (seed, stream, index, 0) for (seed, stream, index): a further word separates only where it is not 0.
     """
 
     BLOCK = 0

@@ -195,7 +195,9 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
             return [held_out_source.clip(index, trans_center=config.trans_center) for index in clips]
         return [held_out_source.example(index) for index in range(VALIDATION)]
 
-    source: Source = SyntheticSource(seed=recipe.seed, easy=recipe.easy * recipe.people, **synthetic_settings)
+    # of the people who come from this source alone
+    easy_people = recipe.easy * recipe.people * (1 - recipe.whole_scans)
+    source: Source = SyntheticSource(seed=recipe.seed, easy=easy_people, **synthetic_settings)
     if recipe.whole_scans:
         batch = recipe.batch * recipe.whole_scans
         other_source = ScanPeopleSource(seed=recipe.seed, uses=_SCAN_USES, lag=_lag(batch, _SCAN_USES))

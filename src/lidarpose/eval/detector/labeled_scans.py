@@ -36,9 +36,9 @@ class LabeledScan:
     points (n, 3) m; origin: the sensor's position (3,) m, None where nobody knows it; boxes: P; num_points (P,): how
     many points each person has; is_person (P,) bool: False where something else is labeled; mounted (P,) bool: riders
     and wheelchairs; activities: P names; sensor, kind of scene, the sensor's height above the ground and its tilt, in
-    words: "" where it is not known; thing (n,): the kind of thing
-    that a point lies on, an index of `things`, or -1; person (n,): an index of `boxes`, or -1; joints (P, 26, 3) m,
-    body26; changed: the scan is not what it was when its list was frozen.
+    words: "" where it is not known; thing (n,): the kind of thing that a point lies on, an index of `things`, or -1;
+    person (n,): an index of `boxes`, or -1; joints (P, 26, 3) m, body26; changed: the scan is not what it was when its
+    list was frozen.
     """
 
     name: str
