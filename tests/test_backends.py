@@ -1,6 +1,7 @@
 """Two backends, one answer; and everything that needs no torch works without it."""
 
 import json
+import os
 import pickle
 import re
 import subprocess
@@ -506,3 +507,11 @@ def test_poses_of_another_skeleton_keep_what_is_known(models):
         replace(pose, visible=pose.visible[:3])
     with pytest.raises(InputError, match="in_range must be true or false"):
         replace(pose, in_range=pose.visible)
+
+
+def test_the_runtime_notes_nothing_of_the_machine(tmp_path):
+    """ONNX Runtime writes its telemetry into the home folder as soon as it opens a network."""
+    code = "import lidarpose, numpy; lidarpose.load('tiny', tta=1).predict(numpy.ones((9, 3)))"
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("ORT_", "XDG_"))}
+    subprocess.run([sys.executable, "-c", code], env=environment | {"HOME": str(tmp_path)}, check=True, timeout=120)
+    assert not list((tmp_path / ".cache").rglob("*onnxruntime*"))

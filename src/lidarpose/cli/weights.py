@@ -61,11 +61,9 @@ def _info(options: argparse.Namespace) -> None:
 def installed() -> dict[str, Any]:
     """Versions, threads, torch and its device, of each bundled network its size, training and scores, and of what finds
     people how it is calibrated."""
-    import onnxruntime
-
     from lidarpose.models.checkpoint import parameter_count, read_header, runs_of
     from lidarpose.models.detector.detector import open_detector
-    from lidarpose.models.onnx import usable_threads
+    from lidarpose.models.onnx import runtime, usable_threads
 
     weights = {}
     for name in BUNDLED:
@@ -88,7 +86,7 @@ def installed() -> dict[str, Any]:
     return {
         "lidarpose": __version__,
         "python": platform.python_version(),
-        "onnxruntime": onnxruntime.__version__,
+        "onnxruntime": runtime().__version__,
         "threads": usable_threads(),
         "torch": _torch(),
         "weights": weights,

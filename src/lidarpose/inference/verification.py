@@ -31,8 +31,9 @@ AROUND = 2.5
 # a box is so much larger than the joints on each side, m, beside another person no more than this; it ends half way to
 # the next person, less half a body
 _ROOM, _LEAST_ROOM, _HALF_BODY = 0.15, 0.1, 0.25
-# of two people whose pelvises are nearer than this the less certain one is the same person, m
-_SAME_PERSON = 0.3
+# of two people whose pelvises are nearer than this the less certain one is the same person, m; nearer than that they are
+# posed once more, each by the points in their own box
+_SAME_PERSON, _CLOSE = 0.3, 0.8
 # places that are posed for each person that is asked for at most: some are the same person
 _PLACES = 2
 # so is who shares more than this with surer people, of the points in the box
@@ -152,6 +153,14 @@ class Crops:
             yield batch, backend.run(clouds, view)
 
 
+def _pelvises(clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> np.ndarray:
+    """(K, 3) m: of people's clouds (n, 3) m about centers (K, 3) m, by the default network."""
+    backend = _bundled(DEFAULT)
+    raw = backend.run(*apply(TTATransform(), clouds, centers, origin))
+    joints = estimates(raw, decoder("window"), backend.header.skeleton).joints + centers[:, None]
+    return joints[:, backend.header.skeleton.index("pelvis")]
+
+
 def _highest_score(detections: Detections, header: dict) -> np.ndarray:
     """(D,): what `final_score` can be at most, whatever the verifier says."""
     odds = _MOST_ODDS + 1
@@ -214,6 +223,7 @@ def verified(
         thresholds = np.append(thresholds, np.full(len(places.scores) - len(thresholds), least_score))
     places.pelvises[places.scores < thresholds] = np.nan
     people = _boxed(places, points, least_score, max_people, known_boxes)
+    people = _without_repeats(people, places, points, origin)
     kept_rows = [row for row, _, _ in people]
     return People(
         boxes=[replace(box, id=number) for number, (_, box, _) in enumerate(people)],
@@ -317,6 +327,26 @@ def _on_people(
             own_rows = own_rows[distance < _BODY]
         is_body[own_rows] = True
     return is_body
+
+
+def _without_repeats(
+    people: list[tuple[int, Box, np.ndarray]], places: _Places, points: np.ndarray, origin: np.ndarray | None
+) -> list[tuple[int, Box, np.ndarray]]:
+    """The people as of `_boxed`, without those whom the points in their boxes alone show where a surer one is: what is
+    left of somebody's points may look like one more beside them."""
+    pelvises = places.pelvises[[row for row, _, _ in people]].reshape(-1, 3)
+    distance = np.linalg.norm(pelvises[:, None] - pelvises[None], axis=-1)
+    # to the nearest surer one
+    close = np.flatnonzero(np.tril(distance < _CLOSE, -1).any(1))
+    if not len(close):
+        return people
+    clouds, centers = [points[people[k][2]] for k in close], np.array([people[k][1].center for k in close])
+    own_pelvises = _pelvises(clouds, centers, origin)
+    is_repeated = np.zeros(len(people), bool)
+    for k, own_pelvis in zip(close, own_pelvises, strict=True):
+        surer = np.flatnonzero(~is_repeated[:k])
+        is_repeated[k] = (np.linalg.norm(pelvises[surer] - own_pelvis, axis=1) < _SAME_PERSON).any()
+    return [person for person, is_gone in zip(people, is_repeated, strict=True) if not is_gone]
 
 
 def _boxed(

@@ -9,6 +9,7 @@ import hashlib
 import os
 from collections.abc import Sequence
 from importlib import import_module
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -55,8 +56,11 @@ def usable_threads() -> int:
     return min(processors, _MOST_THREADS)
 
 
-def _runtime():
-    """The module onnxruntime. Raises InputError where it cannot be loaded, as for want of a system library."""
+def runtime() -> ModuleType:
+    """The module onnxruntime, without its telemetry. Raises InputError where it cannot be loaded, as for want of a
+    system library."""
+    # read when it is loaded: else it notes machine and process in ~/.cache and sends that to its maker
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     try:
         return import_module("onnxruntime")
     except (ImportError, OSError) as error:
@@ -69,8 +73,8 @@ def _runtime():
 
 def open_session(content: bytes, *, threads: int | None = None):
     """An `onnxruntime.InferenceSession` of a file's content. Raises what ONNX Runtime does."""
-    runtime = _runtime()
-    settings = runtime.SessionOptions()
+    module = runtime()
+    settings = module.SessionOptions()
     # set in any case: left alone it would pin threads to processors, which a container may forbid
     settings.intra_op_num_threads = usable_threads() if threads is None else threads
     settings.inter_op_num_threads = 1
@@ -78,7 +82,7 @@ def open_session(content: bytes, *, threads: int | None = None):
     settings.add_session_config_entry("session.force_spinning_stop", "1")
     # what is wrong is raised; the log would add lines of its own
     settings.log_severity_level = 4
-    return runtime.InferenceSession(content, settings, providers=["CPUExecutionProvider"])
+    return module.InferenceSession(content, settings, providers=["CPUExecutionProvider"])
 
 
 def open_onnx(path: str | os.PathLike, *, threads: int | None = None) -> tuple[Any, Header, str]:
@@ -108,7 +112,7 @@ def open_network(path: str | os.PathLike, *, threads: int | None = None) -> tupl
         raise file_error(path, "expected an ONNX file, got a checkpoint: make one of it with `lidarpose export`")
     has_digest = check_digest(path, content)
     # what is wrong with it is not the file's fault
-    _runtime()
+    runtime()
     try:
         session = open_session(content, threads=threads)
     except Exception as error:
