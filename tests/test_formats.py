@@ -346,6 +346,30 @@ def test_bin_columns_are_told_by_the_values(folder, cloud, n):
         assert "rows of 3 float32, since rows of 4 would mix" in found.warnings[0]
 
 
+@pytest.mark.parametrize("cloud", [_sweep, _person])
+@pytest.mark.parametrize("n", [22, 40, 60, 100, 999, 2000])
+def test_bin_rows_of_six_are_told_by_the_values(folder, cloud, n):
+    """x y z intensity beam time, whose size divides by 3 too and may by 4 and 5."""
+    rng = np.random.default_rng(n)
+    rows = np.column_stack([cloud(rng, n), rng.uniform(0, 1, n), rng.integers(0, 64, n), np.linspace(0, 0.1, n)])
+    found = read(folder, "a.bin", rows.astype(np.float32).tobytes())
+    same(found, rows.astype(np.float32))
+    assert len(found.warnings) == 1 and "read as rows of 6 float32" in found.warnings[0]
+
+
+@pytest.mark.parametrize(
+    "header", ["Points_m_XYZ:0,Points_m_XYZ:1,Points_m_XYZ:2", '"Points:0","Points:1","Points:2"', "x [m],Y(m),z [m]"]
+)
+def test_axes_as_other_programs_name_them(folder, header):
+    same(read(folder, "a.csv", f"{header},intensity\n1.5,-2.25,0.125,7\n10,20,-1,8\n3,4,5,9\n"), fields=None)
+
+
+@pytest.mark.parametrize("mark", [" ", ","])
+def test_a_number_of_points_above_them_is_none_of_them(folder, mark):
+    rows = "\n".join(mark.join(row) for row in (["1.5", "-2.25", "0.125"], ["10", "20", "-1"], ["3", "4", "5"]))
+    same(read(folder, "a.xyz", f"3\n{rows}\n"), fields=None)
+
+
 def test_bin_columns_that_nothing_tells(folder):
     """All columns alike: KITTI's four, which a warning tells where another number fits better by chance."""
     warned = 0
@@ -525,7 +549,7 @@ BAD = {
     "ply odd count": ("a.ply", ply_header("many") + ROWS, ["'many'"]),
     "bin odd size": ("a.bin", ROWS[:-1], ["47 bytes", "cut off"]),
     "bin of three": ("a.bin", np.ones((7, 3), "f4").tobytes(), ["84 bytes", "columns 3"]),
-    "bin of three or six": ("a.bin", np.ones((102, 3), "f4").tobytes(), ["values a row has (columns 3 or 6)"]),
+    "bin of three or six": ("a.bin", np.ones((102, 3), "f4").tobytes(), ["values a row has (--columns 3 or 6)"]),
     "bin garbage": ("a.bin", np.random.default_rng(0).bytes(4000), ["beyond"]),
     "npy objects": ("a.npy", OBJECTS, ["dtype object"]),
     "npz objects": ("a.npz", npz(points=np.array([[1, 2, "a"]], dtype=object)), ["dtype object"]),
@@ -537,6 +561,7 @@ BAD = {
     "npy flat": ("a.npy", npy(POINTS.ravel()), ["(12,)", "(n, 3+)"]),
     "npy two columns": ("a.npy", npy(np.ones((9, 2))), ["(9, 2)", "save x, y and z"]),
     "npy transposed": ("a.npy", npy(np.ones((2, 3)).T[:, :2]), ["points.T"]),
+    "npy depth image": ("a.npy", npy(np.ones((48, 64))), ["(48, 64)", "depth image"]),
     "npy transposed records": ("a.npy", npy(np.ones((5, 51))), ["(5, 51)", "points.T"]),
     "npy batch": ("a.npy", npy(np.ones((2, 5, 4))), ["(2, 5, 4)", "reshape(-1, 4)"]),
     "npy words": ("a.npy", npy(np.array([["a", "b", "c"]])), ["<U1"]),

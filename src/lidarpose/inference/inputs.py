@@ -11,7 +11,7 @@ import numpy as np
 from lidarpose.errors import InputError
 from lidarpose.geometry import vector_of
 from lidarpose.io.files import FormatError, one_line
-from lidarpose.io.text import is_transposed, pick_xyz
+from lidarpose.io.text import is_image, is_transposed, pick_xyz
 from lidarpose.sample import CLIP_FRAMES, FARTHEST, MIN_POINTS, center_of, clip_windows, within_reach
 
 # frames a second of a clip without times
@@ -131,9 +131,10 @@ def as_points(points: Any, what: str = "points") -> np.ndarray:
         )
     if array.dtype.kind not in "fiu":
         raise InputError(f"{what} must be an (n, 3) array of numbers, got {array.dtype} of shape {array.shape}")
-    looks_transposed = is_transposed(array.shape)
-    if array.ndim != 2 or array.shape[1] < 3 or looks_transposed:
+    looks_transposed, looks_depth = is_transposed(array.shape), is_image(array.shape)
+    if array.ndim != 2 or array.shape[1] < 3 or looks_transposed or looks_depth:
         remedy = ": give points.T" if looks_transposed else ""
+        remedy = ": of a depth image give the points that its pixels are" if looks_depth else remedy
         raise InputError(f"{what} must be (n, 3) or (n, 3 + more) with x, y, z first, got shape {array.shape}{remedy}")
     return array[:, :3].astype(np.float64)
 

@@ -21,7 +21,7 @@ from lidarpose.io.files import FormatError, file_error, read_bytes, shorten
 from lidarpose.io.las import parse_las
 from lidarpose.io.npz import load_array, member_header, open_npz, unpack
 from lidarpose.io.pcd_ply import parse_pcd, parse_ply
-from lidarpose.io.text import FEW_ROWS, is_transposed, numbered, parse_text, pick_xyz
+from lidarpose.io.text import FEW_ROWS, is_image, is_transposed, numbered, parse_text, pick_xyz
 
 KITTI_FIELDS = ("x", "y", "z", "intensity")
 NUSCENES_FIELDS = ("x", "y", "z", "intensity", "ring")
@@ -35,6 +35,8 @@ _MAX_BEAMS = 256
 # of raw bytes, rows of another width are taken where their columns are so much narrower, in the mean logarithm: 0.5 and
 # more where the other width is right, below 0.05 where it is wrong, of synthetic sweeps and people of 20 rows and more
 _NARROWER = 0.4
+# x, y, z, intensity, beam and time, or colors
+_SIX, _FEWEST_ROWS = 6, 20
 # no LiDAR sees farther, m; a column of constants is as wide as noise, m
 _FAR, _NARROWEST = 1e3, 1e-3
 
@@ -93,7 +95,7 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
 
     Args:
         columns: values a row of a .bin, x y z first; other formats ignore it. Where it is None, rows have 4 (KITTI) or,
-            where the size or the values say so, 5 (nuScenes) or 3, which a warning tells; `.pcd.bin`, nuScenes' own
+            where the size or the values say so, 5 (nuScenes), 3 or 6, which a warning tells; `.pcd.bin`, nuScenes' own
             suffix, means 5.
 
     Raises:
@@ -170,7 +172,7 @@ def _parse_bin(data: bytes, columns: int | None):
     if len(data) % (4 * columns):
         fitting_columns = [str(c) for c in range(3, 9) if len(data) % (4 * c) == 0]
         remedy = (
-            f"say how many values a row has (columns {' or '.join(fitting_columns)})"
+            f"say how many values a row has (--columns {' or '.join(fitting_columns)})"
             if fitting_columns
             else "it is cut off or not raw float32, copy it again"
         )
@@ -187,9 +189,11 @@ def _parse_bin(data: bytes, columns: int | None):
 
 
 def _guess_columns(data: bytes) -> tuple[int, tuple[str, ...]]:
-    """(values a row, warnings): KITTI's 4 but where the size or the content speaks for nuScenes' 5, or for 3."""
+    """(values a row, warnings): KITTI's 4 but where the size or the content speaks for nuScenes' 5, for 3, or for 6."""
     four, five = len(KITTI_FIELDS), len(NUSCENES_FIELDS)
     candidates = [columns for columns in (four, five, 3) if len(data) % (4 * columns) == 0]
+    if len(data) % (4 * _SIX) == 0 and len(data) >= 4 * _SIX * _FEWEST_ROWS:
+        candidates.append(_SIX)
     guess = four if four in candidates or five not in candidates else five
     reason, alternative = "the size divides by 5 values and not by 4" if guess == five else "", four
     values = np.frombuffer(data[: len(data) // 4 * 4], "<f4")
@@ -198,17 +202,24 @@ def _guess_columns(data: bytes) -> tuple[int, tuple[str, ...]]:
         ring = values.reshape(-1, five)[:, -1]
         if ((ring >= 0) & (ring < _MAX_BEAMS) & (ring == np.floor(ring))).all() and ring.any():
             guess, candidates, reason = five, [five], "every fifth value is a beam number"
-    if guess in candidates and len(candidates) > 1:
+    if len(candidates) > 1:
         widths = {columns: _width(values.reshape(-1, columns)) for columns in candidates}
+        if _SIX in widths:
+            # two rows of 3 are a row of 6 as wide
+            widths[_SIX] += _NARROWER
         narrowest = min(candidates, key=widths.__getitem__)
-        if widths[narrowest] < widths[guess] - _NARROWER:
+        if guess not in candidates:
+            # of a size that neither 4 nor 5 divides
+            if narrowest == _SIX:
+                guess, reason, alternative = _SIX, "rows of 3 would mix its columns up", 3
+        elif widths[narrowest] < widths[guess] - _NARROWER:
             guess, reason = narrowest, f"rows of {guess} would mix its columns up"
         elif narrowest != guess:
             reason, alternative = f"nothing speaks clearly for rows of {narrowest}", narrowest
     if not reason:
         return guess, ()
     names = {four: " (KITTI)", five: " (nuScenes)"}
-    remedy = f"give columns {alternative}{names.get(alternative, '')} if that is wrong"
+    remedy = f"give --columns {alternative}{names.get(alternative, '')} if that is wrong"
     return guess, (f"read as rows of {guess} float32{names.get(guess, '')}, since {reason}; {remedy}",)
 
 
@@ -250,10 +261,12 @@ def _points_of(array: np.ndarray, label: str):
         return np.stack([part.astype(np.float64) for part in parts], axis=-1), names, ()
     if array.dtype.kind not in "fiu":
         raise FormatError(f"numbers in {label}", f"dtype {array.dtype}", "save a float array")
-    if array.ndim != 2 or array.shape[1] < 3 or is_transposed(array.shape):
+    if array.ndim != 2 or array.shape[1] < 3 or is_transposed(array.shape) or is_image(array.shape):
         remedy = "save x, y and z of each point" if array.ndim == 2 else "save a row for each point"
         if array.ndim == 2 and 3 <= array.shape[0] <= FEW_ROWS:
             remedy = "save its transpose, points.T"
+        elif is_image(array.shape):
+            remedy = "of a depth image save the points that its pixels are"
         elif array.ndim > 2 and array.shape[-1] >= 3:
             remedy = f"save points.reshape(-1, {array.shape[-1]})"
         raise FormatError(f"{label} to have the shape (n, 3+)", array.shape, remedy)

@@ -18,12 +18,27 @@ _MISSING = ("", "na", "n/a", "nan", "-nan", "+nan", "null", "none", "<na>")
 
 
 def pick_xyz(names: Sequence[str]) -> list[int]:
-    """The positions of x, y and z among column names, in any case."""
-    lower_names = [name.strip().lower() for name in names]
-    if not {"x", "y", "z"} <= set(lower_names):
+    """The positions of x, y and z among column names, in any case, with or without a unit."""
+    plain_names = _plain(names)
+    if not has_xyz(names):
         actual = shorten(" ".join(names)) or "none"
         raise FormatError("columns x, y and z", actual, "export or rename x, y, z")
-    return [lower_names.index(axis) for axis in "xyz"]
+    return [plain_names.index(axis) for axis in "xyz"]
+
+
+def has_xyz(names: Sequence[str]) -> bool:
+    """Whether x, y and z are among column names."""
+    return {"x", "y", "z"} <= set(_plain(names))
+
+
+def _plain(names: Sequence[str]) -> list[str]:
+    """Names of columns in lower case, without units ("x [m]"); the axes of ParaView and VeloView as x, y and z."""
+    plain_names = []
+    for name in names:
+        name = re.sub(r" ?[\[(]m[\])]$", "", name.strip().lower())
+        axis = re.fullmatch(r"points(?:_m_xyz)?:([0-2])", name)
+        plain_names.append("xyz"[int(axis[1])] if axis else name)
+    return plain_names
 
 
 def numbered(columns: int) -> tuple[str, ...]:
@@ -34,6 +49,11 @@ def numbered(columns: int) -> tuple[str, ...]:
 def is_transposed(shape: tuple[int, ...]) -> bool:
     """Whether an array of this shape (rows, columns) holds points as columns: no format has so many values a point."""
     return len(shape) == 2 and 3 <= shape[0] <= FEW_ROWS and shape[1] > _MANY_COLUMNS
+
+
+def is_image(shape: tuple[int, ...]) -> bool:
+    """Whether an array of this shape (rows, columns) may be a depth image: it is too wide for points."""
+    return len(shape) == 2 and shape[0] > FEW_ROWS and shape[1] > _MANY_COLUMNS
 
 
 def parse_count(text: str, what: str) -> int:
@@ -71,7 +91,8 @@ def parse_rows(text: str, num_rows: int, columns: list[int], num_cells: int, *, 
 
 def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
     """x y z (n, 3), the names of the columns, and no warnings; raises FormatError."""
-    text = decode(data)
+    # .pts and others begin with the number of their points
+    text = re.sub(r"\A[0-9]{1,18}[ \t]*\n(?=[ \t]*[-+.\d]\S*(?:[ \t,;]+[-+.\d]\S*){2})", "\n", decode(data))
     names, num_skipped, has_header, separator, decimal = _find_columns(text)
     # lines that are blank but for a comment would count as rows without values; what is looked for behind keeps every
     # blank of a long run from being tried as the first
@@ -110,14 +131,14 @@ def _find_columns(text: str) -> tuple[Sequence[str], int, bool, str | None, str]
     cells = _split(first_line.removeprefix("//").strip(), separator)
     where = f"on line {num_skipped + 1}, {shorten(first_line)!r}"
     if not all(_is_number(cell, decimal) for cell in cells):
-        if not {"x", "y", "z"} <= {cell.lower() for cell in cells}:
+        if not has_xyz(cells):
             raise FormatError("numbers, or a header with x, y and z", f"others {where}", "export or rename x, y, z")
         return cells, num_skipped + 1, True, separator, decimal
     if len(cells) < 3:
         raise FormatError("at least 3 columns x y z", f"{len(cells)} {where}", "export x, y and z")
     # a comment above names them where it has as many words with x, y and z: numpy.savetxt writes its header so
     for words in (_split(comment, mark) for mark in (None, ",", ";")):
-        if len(words) == len(cells) and {"x", "y", "z"} <= {word.lower() for word in words}:
+        if len(words) == len(cells) and has_xyz(words):
             return words, num_skipped, False, separator, decimal
     return numbered(len(cells)), num_skipped, False, separator, decimal
 
