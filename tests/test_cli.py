@@ -622,3 +622,17 @@ def test_quiet_prints_errors_only(crop, tmp_path, capsys):
     # and does not outlast its command
     assert run(*words) == 0
     assert "1 of 1 people" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words, problem",
+    [
+        ("predct a.pcd", "invalid choice: 'predct', did you mean predict?; see lidarpose --help"),
+        ("qqqq", "invalid choice: 'qqqq' (choose from"),
+        ("detect a.pcd --picture", "unrecognized arguments: --picture; see lidarpose detect --help"),
+    ],
+)
+def test_a_wrong_word_names_the_help_that_says_more(words, problem, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(words.split())
+    assert ended.value.code == 2 and problem in capsys.readouterr().err

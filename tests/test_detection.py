@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from lidarpose.inference import detection, verification
 from lidarpose.lidar.raycast import scan
 from lidarpose.models.detector.candidates import SceneIndex
 from lidarpose.models.detector.detector import Detector, rows_that_matter
+from lidarpose.sample import Box
 from lidarpose.synth.bodies import draw_bodies
 from lidarpose.synth.detection_scene import detection_scene
 from lidarpose.synth.environment.mesh import Mesh, box, quad, union
@@ -624,3 +626,24 @@ def test_of_two_whose_pelvises_meet_the_surer_one_stays():
     ties = np.array([1.0, 2.0, np.nan, 0.0, 0.0])
     assert verification.surest_rows(np.array([0.9, 0.9, 0.9, 0.9, 0.1]), pelvises, ties) == [1, 4]
     assert verification.surest_rows(np.zeros(0), np.zeros((0, 3)), np.zeros(0)) == []
+
+
+def test_what_is_left_of_somebody_s_points_is_nobody_beside_them(monkeypatch):
+    """By the pelvis that the points in each one's own box show, of those who are close to a surer one."""
+    pelvises = np.array([[0.0, 0, 0], [0.5, 0, 0], [1.0, 0, 0], [5, 0, 0]])
+    own = {0: [9.0, 9, 9], 1: [0.2, 0, 0], 2: [0.45, 0, 0], 3: [9.0, 9, 9]}
+    asked = []
+
+    def own_pelvises(clouds, centers, origin):
+        asked.append(centers[:, 0].tolist())
+        return np.array([own[int(cloud[0, 0])] for cloud in clouds])
+
+    monkeypatch.setattr(verification, "_pelvises", own_pelvises)
+    points = np.repeat(np.arange(4.0), 3).reshape(4, 3)
+    people = [(k, Box(center=pelvises[k], size=np.ones(3)), np.array([k])) for k in range(4)]
+    places = SimpleNamespace(pelvises=pelvises)
+    kept = verification._without_repeats(people, places, points, None)
+    # the third is shown where the second was, who is none
+    assert [row for row, _, _ in kept] == [0, 2, 3] and asked == [[0.5, 1.0]]
+    assert verification._without_repeats(people[3:], places, points, None) == people[3:] and len(asked) == 1
+    assert verification._without_repeats([], places, points, None) == []

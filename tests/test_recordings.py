@@ -139,6 +139,8 @@ def test_a_killed_command_goes_on_and_ends_the_same(flag, drive, folder, tracked
 
     monkeypatch.setattr(FramePredictor, "_predicted", killed)
     run(*words, status=130)
+    error = capsys.readouterr().err
+    assert f"stopped: the finished frames are in {path}, and the same command goes on" in error
     # a torn line, and one that is whole but that the predictor's state does not know
     with open(path, "ab") as file:
         file.write(path.read_bytes().splitlines()[0] + b'\n{"schema": "lidar')
@@ -461,6 +463,10 @@ def test_the_command_line(drive, folder, tmp_path, monkeypatch, capsys):
     assert main(["predict", str(drive), "--end", "0.1", "--live", "--out", "-"]) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [line["frame"] for line in lines] == [0, 1] and lines[1]["people"][0]["track"] == 0
+    # pictures of what is printed
+    assert main(["predict", str(drive), "--end", "0.1", "--out", "-", "--html"]) == 0
+    assert "2 frames, 4 people -> drive.poses.html" in capsys.readouterr().err
+    assert (tmp_path / "drive.poses.html").is_file()
 
 
 def test_a_folder_without_one_readable_scan_is_an_error(tmp_path, capsys):
@@ -470,7 +476,7 @@ def test_a_folder_without_one_readable_scan_is_an_error(tmp_path, capsys):
     assert "of 2 frames none can be read, the first: " in capsys.readouterr().err
     assert main(["predict", str(tmp_path), "--out", "-"]) == 2
     assert "of 2 frames none can be read" in capsys.readouterr().err
-    assert not list((tmp_path / "out").iterdir())
+    assert not (tmp_path / "out").exists()
 
 
 def test_tables_of_joints_are_no_scans_and_the_world_may_not_be_known(clouds, tmp_path, capsys):
@@ -481,7 +487,7 @@ def test_tables_of_joints_are_no_scans_and_the_world_may_not_be_known(clouds, tm
         assert main([*words, str(tmp_path)]) == 0
         output = capsys.readouterr()
         assert "2 frames, 4 people" in output.out + output.err
-        assert "of 2 of 2 frames the sensor's place in the world is not known" in output.err
+        assert "in 2 of 2 frames the sensor's place in the world is not known" in output.err
     assert len(list(tmp_path.glob("*.poses.csv"))) == 1
 
 

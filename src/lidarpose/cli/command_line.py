@@ -1,7 +1,9 @@
 """The parser of all commands, and how a command ends. Heavy imports stay inside the commands."""
 
 import argparse
+import difflib
 import os
+import re
 import sys
 import warnings
 from contextlib import suppress
@@ -27,7 +29,11 @@ _SIGNED = ("--sensor-origin", "--up")
 def run(arguments: list[str] | None = None) -> int:
     """As `lidarpose.cli.main`."""
     parser = make_parser()
-    options = parser.parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
+    options, unknown = parser.parse_known_args(_joined(sys.argv[1:] if arguments is None else arguments))
+    if unknown:
+        # the command's own help tells its options
+        parser.prog = " ".join(filter(None, (parser.prog, options.command)))
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     if options.command is None:
         parser.print_help()
         return 0
@@ -95,6 +101,9 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str):
         """One line, as for every other wrong input."""
+        if choice := re.search(r"(invalid choice: '(.*)') \(choose from (.*)\)", message):
+            for likely in difflib.get_close_matches(choice[2], re.findall(r"[\w-]+", choice[3]), 1):
+                message = f"{message[: choice.end(1)]}, did you mean {likely}?"
         self.exit(2, f"lidarpose: error: {message}; see {self.prog} --help\n")
 
 

@@ -16,7 +16,10 @@ from lidarpose.models import DEFAULT, NAMES
 # io.point_cloud.SUFFIXES, which a help text does not import
 _FILES = ".pcd .ply .las .laz .npy .npz .csv .xyz .txt .bin"
 # what to try where somebody should have been found
-_NOBODY = "if somebody is there: points need meters and z up (--up), and a lower --min-score finds more"
+_NOBODY = (
+    "if somebody is there: points need meters and z up (--up), a lower --min-score finds more, and --crop takes all "
+    "points for one person"
+)
 # characters of an id in a warning
 _LONGEST_ID = 40
 
@@ -111,7 +114,8 @@ def _predict(options: argparse.Namespace) -> None:
     if not poses and poses.scan is not None:
         tell(f"nobody found{destination}; {_NOBODY}")
         return
-    tell(f"{num_posed} of {len(poses)} people, {poses.timing_ms['per_person']:.0f} ms each{destination}")
+    search = f"searched in {poses.timing_ms['find'] / 1e3:.1f} s, " if poses.scan is not None else ""
+    tell(f"{num_posed} of {len(poses)} people, {search}{poses.timing_ms['per_person']:.0f} ms each{destination}")
 
 
 def output_paths(

@@ -85,9 +85,6 @@ def _predict_recording(
     frames = {name: getattr(options, name) for name in ("columns", "topic", "meta", "rate", "start", "end")}
     source = open_source(options.source, every=1 if options.every is None else options.every, **frames)
     steps = FramePredictor(name=source.name, track=options.track, live=options.live, **posing_options)
-    if result is None:
-        _print_lines(options, source, steps)
-        return
     tracks_picture = None if picture is None else WaysPicture(steps.up)
     frames_page = None if page is None else RecordingPage(steps.up)
     views = [view for view in (tracks_picture, frames_page) if view is not None]
@@ -96,24 +93,28 @@ def _predict_recording(
         for view in views:
             view.add(line)
 
-    summary = write_recording(
-        source,
-        steps,
-        result,
-        command=_command(options),
-        world=options.world,
-        on_line=on_line,
-        tell=lambda text: tell(f"lidarpose: {text}"),
-    )
+    if result is None:
+        summary = _print_lines(options, source, steps, on_line)
+    else:
+        summary = write_recording(
+            source,
+            steps,
+            result,
+            command=_command(options),
+            world=options.world,
+            on_line=on_line,
+            tell=lambda text: tell(f"lidarpose: {text}"),
+        )
     if tracks_picture is not None and picture is not None:
         write_atomic(picture, tracks_picture.draw(source, steps.wanted, title=Path(source.name).name))
     if frames_page is not None and page is not None:
         write_atomic(page, frames_page.render(source, steps.wanted, title=Path(source.name).name))
-    _report(options, source, summary, f" -> {' and '.join(str(path) for path in (result, picture, page) if path)}")
+    outputs = [str(path) for path in (result, picture, page) if path is not None]
+    _report(options, source, summary, f" -> {' and '.join(outputs)}" if outputs else "")
 
 
-def _print_lines(options: argparse.Namespace, source, steps) -> None:
-    """Frames as they come, on the standard output."""
+def _print_lines(options: argparse.Namespace, source, steps, on_line: Callable[[dict[str, Any]], None]):
+    """Frames as they come, on the standard output. Returns their `Summary`."""
     from lidarpose.recording.coordinates import in_world
     from lidarpose.recording.output import Summary, nothing_read
 
@@ -126,19 +127,20 @@ def _print_lines(options: argparse.Namespace, source, steps) -> None:
         line = frame.to_dict()
         line = in_world(line, steps.up) if options.world else line
         summary.add(line)
+        on_line(line)
         print(json.dumps(line), flush=True)
         last = frame.index, frame.id
     steps.check_boxes(last)
     if summary.damaged == summary.frames:
         raise nothing_read(source.name, summary.frames, summary.first_error)
-    _report(options, source, summary)
+    return summary
 
 
-def _report(options: argparse.Namespace, source, summary, outputs: str = "") -> None:
+def _report(options: argparse.Namespace, source, summary, outputs: str) -> None:
     source_warnings = [f"{source.name}: {line}" for line in source.warnings]
     if options.world and (num_others := summary.frames - summary.in_world):
         source_warnings.append(
-            f"of {num_others:,} of {counted(summary.frames, 'frame')} the sensor's place in the world is not known: "
+            f"in {num_others:,} of {counted(summary.frames, 'frame')} the sensor's place in the world is not known: "
             "joints are in the sensor's frame there"
         )
     for line in [*source_warnings, *summary.warning_lines(_MOST_WARNINGS)]:

@@ -13,6 +13,7 @@ from lidarpose.inference.backend import Backend, OnnxBackend, exported_beside
 from lidarpose.inference.checks import (
     UPSIDE_DOWN,
     company_warning,
+    lies,
     looks_unsure,
     oversize_warning,
     unit_warning,
@@ -325,7 +326,8 @@ class Predictor(PoseEstimator):
         flipped_clouds = [best_poses[i][1] * UPSIDE_DOWN for i in unsure_rows]
         flipped_poses = self.poses(flipped_clouds, None if origin is None else origin * UPSIDE_DOWN)
         for i, flipped_pose in zip(unsure_rows, flipped_poses, strict=True):
-            if warning := upside_down_warning(best_poses[i][0], flipped_pose):
+            # of somebody who lies another axis may be up, which is said of all together
+            if (warning := upside_down_warning(best_poses[i][0], flipped_pose)) and not lies(*best_poses[i]):
                 cleaned_clouds[i][1].append(warning)
         return [
             PersonPose(pose=pose, skeleton=target_skeleton, points=points, warnings=tuple(notes), model=self.model)

@@ -49,7 +49,9 @@ class PartFile:
         self.state: dict[str, Any] | None = None
         self.other: list[str] = []
         check_writable(self.path)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
+        parent = self.path.parent
+        self._new_folders = [folder for folder in (parent, *parent.parents) if not folder.exists()]
+        parent.mkdir(parents=True, exist_ok=True)
         # neither emptied nor read before it is this process's own
         self._file = os.fdopen(os.open(self.path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)), "r+b")
         if not _is_locked(self._file):
@@ -103,6 +105,7 @@ class PartFile:
             yield from map(json.loads, file)
 
     def remove(self) -> None:
+        """Removes it, and the folders that were made for it, where they hold nothing else."""
         # while it is locked: after it is closed, another process may have begun
         for path in (self.state_path, self.path):
             with suppress(OSError):
@@ -112,6 +115,9 @@ class PartFile:
             # Windows does not let go of a file that is open
             with suppress(OSError):
                 self.path.unlink()
+        for folder in self._new_folders:
+            with suppress(OSError):
+                folder.rmdir()
 
 
 def _is_locked(file: BinaryIO) -> bool:
@@ -203,7 +209,11 @@ def write_recording(
             tell(f"{part.path} is of another command ({', '.join(part.other)}): beginning anew")
         elif part.frames:
             tell(f"{part.frames:,} frames are in {part.path}: going on")
-        _add_frames(source, steps, part)
+        try:
+            _add_frames(source, steps, part)
+        except KeyboardInterrupt:
+            place = f"the finished frames are in {part.path}, and the same command goes on"
+            raise KeyboardInterrupt(f"stopped: {place}" if part.frames else "stopped") from None
         if not any(line["error"] is None for line in part.lines()):
             error = next((line["error"] for line in part.lines()), None)
             part.remove()
