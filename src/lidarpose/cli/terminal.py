@@ -58,7 +58,7 @@ def add_command(commands, name: str, run: Callable[[argparse.Namespace], None], 
     epilog = "\n  ".join([f"example{'s' * (len(examples) > 1)}:", *examples])
     description = " ".join(line for line in lines if line[0] not in "$<-[") or f"{help[0].upper()}{help[1:]}."
     parser = commands.add_parser(name, help=help, description=description, epilog=epilog, formatter_class=_Help)
-    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only, no notes and no progress")
+    parser.add_argument("-q", "--quiet", action="store_true", help="no notes and no progress, results and errors alone")
     parser.set_defaults(run=run)
     add_options(parser, "\n".join(line for line in lines if line[0] in "<-["))
     return parser

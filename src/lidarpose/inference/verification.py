@@ -31,8 +31,8 @@ AROUND = 2.5
 # a box is so much larger than the joints on each side, m, beside another person no more than this; it ends half way to
 # the next person, less half a body
 _ROOM, _LEAST_ROOM, _HALF_BODY = 0.15, 0.1, 0.25
-# of two people whose pelvises are nearer than this the less certain one is the same person, m; who is nearer than that to
-# a surer one is posed once more, by the points in the own box
+# of two people whose pelvises are nearer than this the less certain one is the same person, m; nearer than the second
+# distance, the less certain one is posed once more, by the points in the box alone
 _SAME_PERSON, _CLOSE = 0.3, 0.8
 # places that are posed for each person that is asked for at most: some are the same person
 _PLACES = 2
