@@ -205,3 +205,6 @@ def test_windows_do_not_overlap_and_the_last_frame_fills_the_last(count):
     assert clips.shape == (-(-count // CLIP_FRAMES), CLIP_FRAMES)
     flat = clips.ravel()
     assert (flat[:count] == rows).all() and (flat[count:] == rows[-1]).all()
+    longer = clip_windows(rows, following=3)
+    np.testing.assert_array_equal(longer[:, :CLIP_FRAMES], clips)
+    np.testing.assert_array_equal(longer[:, CLIP_FRAMES:], np.minimum(clips[:, -1:] + [1, 2, 3], rows[-1]))

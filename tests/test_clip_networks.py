@@ -7,6 +7,7 @@ import dataset_files as files
 import numpy as np
 import pytest
 import torch
+from accelerate import Accelerator
 from training_runs import few_to_validate_on, refused  # noqa: F401 - a fixture
 
 from lidarpose import evaluation
@@ -236,6 +237,40 @@ def test_a_clip_turns_as_one_and_its_rotations_with_it(clips):
     assert np.abs(again.frames[0].joints - turned.frames[0].joints).max() > 0.01
 
 
+def test_windows_may_begin_later_each_time(folder):
+    """As NE's do; without the setting they are the same each time."""
+    first = {}
+    for shift in (False, True):
+        wanted = recipe(Finetune, "lidarcap", data=(str(folder),), split="all", shift_windows=shift)
+        source = make_setup(wanted).source
+        # both clips many times
+        frames = [source.example(k).frames[0].joints for k in range(40)]
+        assert len(source.example(0).frames) == CLIP_FRAMES == len(source.some(1)[0].frames)
+        np.testing.assert_array_equal(source.example(3).frames[5].joints, source.example(3).frames[5].joints)
+        first[shift] = len(np.unique(np.round([frame[0] - frame[-1] for frame in frames], 4), axis=0))
+    assert first[False] == 2 < 10 < first[True]
+
+
+def test_the_rate_goes_by_the_losses_of_whole_epochs(folder, tmp_path):
+    """Of a run that went on, too: they are those of its log."""
+    wanted = recipe(Finetune, "lidarcap", data=(str(folder),), split="all", size="lidarcap-tiny", batch=32, workers=0)
+    assert wanted.schedule == "reduce-on-plateau"
+    people = loop.BATCHES * wanted.batch
+    made = replace(make_setup(wanted), epoch=2 * people)
+    run = loop._Run(wanted, made, tmp_path, Accelerator(cpu=True), "", None)
+    losses = [3.0, 1.0, 2.0, 2.0, 2.0, 2.0, 2.0]
+    for k, loss in enumerate(losses):
+        run.chunk, run._losses = k + 1, [*run._losses, (people * (k + 1), loss)]
+    # epochs of two chunks, the last one half over: 2, 2, 2
+    assert run.seen == 7 * people and run._plateau_factor() == pytest.approx(0.9)
+    entries = [{"people": seen, "seconds": 1.0, "rotation": loss / 2, "first": loss / 2} for seen, loss in run._losses]
+    (tmp_path / "log.jsonl").write_text("".join(json.dumps(entry | {"mpjpe": 9.0}) + "\n" for entry in entries))
+    run._save()
+    again = loop._Run(wanted, made, tmp_path, run.accelerator, "", None)
+    again.resume()
+    assert again._losses == run._losses and again._plateau_factor() == run._plateau_factor()
+
+
 def test_settings_that_clips_cannot_have_are_refused(folder, tmp_path):
     with refused("lidarcap learns from clips: .* by --shards"):
         make_setup(recipe(Pretrain, "lidarcap"))
@@ -247,6 +282,8 @@ def test_settings_that_clips_cannot_have_are_refused(folder, tmp_path):
         make_setup(recipe(Finetune, "lidarcap", data=(str(folder),), split="all", keep_anchors=False))
     with refused("leave --mix at 0, and --augment at none or turn"):
         make_setup(recipe(Finetune, "ne", data=(str(folder),), split="all", mix=0.25))
+    with refused("shift_windows is of networks of clips, tiny reads single frames"):
+        make_setup(recipe(Finetune, data=(str(folder),), init="tiny", split="all", mix=0.0, shift_windows=True))
     with refused("the joints of lidarcap are SMPL's 24"):
         replace(LidarcapConfig(), joints=BODY26.joints)
     with refused("option of lidarcap"):

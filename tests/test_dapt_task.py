@@ -675,7 +675,7 @@ def test_the_last_layers_of_heatmaps_learn_at_a_rate_of_their_own(task):
     (alike,), (made,) = optimizers(net, SHORT), optimizers(net, recipe)
     assert [len(group["params"]) for group in alike.param_groups] == [len(list(net.parameters()))]
     names = {id(value): name for name, value in net.named_parameters()}
-    set_rates([made], recipe, 0.5)
+    set_rates([made], recipe, rate_factor(0.5, recipe))
     due = {
         name: 10.0 if re.fullmatch(r"heads\.query\.fcs\.[012]\.fc2\.(weight|bias)", name) else 1.0
         for name in names.values()

@@ -534,8 +534,8 @@ def test_the_card_s_command_is_as_it_was_typed(tmp_path, monkeypatch):
 def test_a_run_s_rates_follow_its_schedule(monkeypatch, tmp_path):
     rates, step = [], loop._Run._step
 
-    def recorded(self, arrays, k):
-        terms = step(self, arrays, k)
+    def recorded(self, arrays, *of):
+        terms = step(self, arrays, *of)
         rates.append([group["lr"] for optimizer in self.optimizers for group in optimizer.param_groups])
         return terms
 

@@ -22,7 +22,7 @@ from lidarpose.sample import center_of
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SCENES
-from lidarpose.train import data_loader
+from lidarpose.train import data_loader, optim
 from lidarpose.train.augment import disturbed
 from lidarpose.train.data_loader import BATCHES, Chunks, SyntheticSource, loader
 from lidarpose.train.objectives.objective import total
@@ -187,6 +187,18 @@ def test_the_rate_rises_stays_and_falls_to_nothing():
     assert (np.diff(factor[rise]) >= 0).all() and (np.diff(factor[fall]) < 0).all()
     np.testing.assert_array_equal(factor[~rise & ~fall], 1)
     assert np.abs(np.diff(factor)).max() < 0.03
+
+
+def test_a_rate_is_reduced_where_two_epochs_gain_too_little():
+    assert optim.plateau_factor([], 1e-4) == optim.plateau_factor([1.0, 0.98, 0.975], 1e-4) == 1
+    # the second of two bad ones; then counted anew; a gain of more than 1 % over the best clears the count
+    assert optim.plateau_factor([1.0, 0.995, 0.995], 1e-4) == pytest.approx(0.9)
+    assert optim.plateau_factor([1.0, 1, 1, 1], 1e-4) == pytest.approx(0.9)
+    assert optim.plateau_factor([1.0, 1, 0.9, 0.9, 0.9], 1e-4) == pytest.approx(0.9)
+    # torch leaves off where a step is under 1e-8
+    assert 3e-8 < optim.plateau_factor([1.0] * 400, 1e-4) * 1e-4 < 1e-7
+    with pytest.raises(InputError, match="fine-tuning alone"):
+        recipe(Pretrain, schedule="reduce-on-plateau")
 
 
 def test_the_released_schedule():

@@ -38,10 +38,11 @@ def within_reach(points: np.ndarray) -> np.ndarray:
     return (np.abs(points) < FARTHEST).all(-1)
 
 
-def clip_windows(run: np.ndarray) -> np.ndarray:
-    """A run's rows (n,) as clips (c, `CLIP_FRAMES`) that do not overlap; the last one is filled with the last row.
-    Source: LiDARCap."""
-    return run[np.minimum(np.arange(-(-len(run) // CLIP_FRAMES) * CLIP_FRAMES), len(run) - 1)].reshape(-1, CLIP_FRAMES)
+def clip_windows(run: np.ndarray, *, following: int = 0) -> np.ndarray:
+    """A run's rows (n,) as clips (c, `CLIP_FRAMES`) that do not overlap, each with so many rows that follow; what lies
+    behind the last row is filled with it. Source: LiDARCap."""
+    rows = np.arange(0, len(run), CLIP_FRAMES)[:, None] + np.arange(CLIP_FRAMES + following)
+    return run[np.minimum(rows, len(run) - 1)]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -30,7 +30,7 @@ from threadpoolctl import threadpool_limits
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from lidarpose.errors import InputError
-from lidarpose.sample import LabeledSample
+from lidarpose.sample import CLIP_FRAMES, LabeledSample
 from lidarpose.synth.bodies import PoseBank, smpl_rig
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.objects import draw_object
@@ -172,7 +172,8 @@ class StoredSource(_OfDataset):
 
 @dataclass(frozen=True, kw_only=True)
 class ClipSource(_OfDataset):
-    """The clips of datasets. clips, skipped: see `InMemoryDataset.clips`; trans_center, turn: see `clip_example`."""
+    """The clips of datasets. clips, skipped: see `InMemoryDataset.clips`; trans_center, turn: see `clip_example`. Where
+    rows follow a clip, it begins up to so many later, drawn anew each time."""
 
     clips: np.ndarray
     trans_center: bool
@@ -181,14 +182,18 @@ class ClipSource(_OfDataset):
 
     def example(self, index: int) -> ClipExample:
         clip, rng = self._drawn(index, len(self.clips))
-        samples = [self._sample(row, rng) for row in self.clips[clip]]
+        rows = self.clips[clip]
+        if latest := len(rows) - CLIP_FRAMES:
+            start = rng.integers(latest + 1)
+            rows = rows[start : start + CLIP_FRAMES]
+        samples = [self._sample(row, rng) for row in rows]
         return clip_example(samples, rng, trans_center=self.trans_center, turn=self.turn)
 
     def some(self, count: int) -> list[ClipExample]:
         """So many clips at most, evenly spread, to validate on: centered on their points."""
         rng = np.random.default_rng(self.seed)
         clip_rows = np.unique(np.linspace(0, len(self.clips) - 1, min(count, len(self.clips))).astype(int))
-        clips = [[self.dataset.sample(row) for row in self.clips[clip]] for clip in clip_rows]
+        clips = [[self.dataset.sample(row) for row in self.clips[clip, :CLIP_FRAMES]] for clip in clip_rows]
         return [clip_example(clip, rng, trans_center=self.trans_center, refined=0.0) for clip in clips]
 
 

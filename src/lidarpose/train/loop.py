@@ -16,6 +16,7 @@ from contextlib import ExitStack, contextmanager, nullcontext
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
+from statistics import fmean
 from types import FrameType
 from typing import Any, cast
 
@@ -32,7 +33,7 @@ from lidarpose.synth.scene import RandomStream
 from lidarpose.train import run_dir
 from lidarpose.train.data_loader import BATCHES, Chunks, chunks_of, lanes_of, loader
 from lidarpose.train.objectives.objective import LOGGED, PoseObjective, total
-from lidarpose.train.optim import average, optimizers, set_rates
+from lidarpose.train.optim import average, optimizers, plateau_factor, rate_factor, set_rates
 from lidarpose.train.recipes import PoseRecipe, Recipe
 from lidarpose.train.run_dir import BEST, LOG, MODEL, STATE
 from lidarpose.train.setup import TrainSetup, make_setup
@@ -188,6 +189,8 @@ class _Run:
         self._trained_on: list = []
         self.best = float("inf")
         self.error: float | None = None
+        # of each chunk that is done the samples seen at its end, and its loss
+        self._losses: list[tuple[int, float]] = []
 
     @cached_property
     def _watched(self) -> Sequence[Any]:
@@ -212,6 +215,8 @@ class _Run:
             _warn(f"{self.folder} has no {STATE}, it was stopped before its first was saved: the run starts over")
         if self.is_main:
             run_dir.cut_log(self.folder, self.seen)
+        entries = run_dir.read_log(self.folder) if (self.folder / LOG).is_file() else []
+        self._losses = [(entry["people"], _loss(entry)) for entry in entries if entry["people"] <= self.seen]
 
     @property
     def steps_done(self) -> int:
@@ -276,15 +281,15 @@ class _Run:
 
     def _note(self, terms: dict[str, float]) -> str:
         """What the progress bar shows."""
-        loss = sum(value for name, value in terms.items() if name not in (*LOGGED, "gradient"))
         metric = f"mpjpe {terms['mpjpe'] * 1e3:.0f} mm" if "mpjpe" in terms else f"AP {terms['ap']:.3f}"
-        note = f"loss {loss:.3f}, {metric}"
+        note = f"loss {_loss(terms):.3f}, {metric}"
         return note if self.error is None else f"{note}, validation {self.error:.0f} {self.setup.error_unit}"
 
     def _chunk(self, batches: list, stop: StopRequest) -> tuple[dict[str, float], bool]:
         """Takes the steps of a chunk; returns the mean of each term and of the gradient's norm over them, and whether
         any process was asked to stop. Raises InputError where a term is not finite."""
-        terms = [self._step(arrays, k) for k, arrays in enumerate(batches)]
+        plateau = self._plateau_factor()
+        terms = [self._step(arrays, k, plateau) for k, arrays in enumerate(batches)]
         names = list(terms[0])
         values = torch.stack([torch.stack([t[name] for name in names]) for t in terms])
         flags = values.new_full((len(values), 1), float(stop.number > 0))
@@ -298,13 +303,26 @@ class _Run:
             )
         self.chunk += 1
         means = {name: round(value, 5) for name, value in zip(names, values.mean(0).tolist(), strict=True)}
+        self._losses.append((self.seen, _loss(means)))
         return means, bool(flags.any())
 
-    def _step(self, arrays: object, k: int) -> dict[str, Tensor]:
+    def _plateau_factor(self) -> float:
+        """Share of the rate that is left by the losses of all epochs that are over."""
+        if self.recipe.schedule != "reduce-on-plateau":
+            return 1.0
+        losses: list[list[float]] = [[] for _ in range(self.seen // self.setup.epoch)]
+        for seen, loss in self._losses:
+            # of a chunk that ends in the next epoch most may be of this one
+            epoch = (seen - 1) // self.setup.epoch
+            if epoch < len(losses):
+                losses[epoch].append(loss)
+        return plateau_factor([fmean(own_losses) for own_losses in losses if own_losses], self.recipe.rate)
+
+    def _step(self, arrays: object, k: int, plateau: float) -> dict[str, Tensor]:
         step, recipe, accelerator = self.chunk * BATCHES + k, self.recipe, self.accelerator
         # what a network drops at random follows from the step alone
         torch.manual_seed(_seed(recipe.seed, RandomStream.TRAINING_STEP, step, accelerator.process_index))
-        set_rates(self.optimizers, recipe, step / self.steps)
+        set_rates(self.optimizers, recipe, plateau * rate_factor(step / self.steps, recipe))
         for optimizer in self.optimizers:
             optimizer.zero_grad(set_to_none=True)
         with accelerator.autocast():
@@ -377,6 +395,12 @@ class _Run:
         if self.error is not None:
             card |= self._error_entry(self.error)
         save_checkpoint(self.folder / name, network, card=card | self.setup.card)
+
+
+def _loss(entry: dict[str, float]) -> float:
+    """The sum of the terms of a chunk, of an entry of the log too."""
+    others = ("people", "seconds", "gradient", *LOGGED)
+    return sum(value for name, value in entry.items() if name not in others and not name.startswith("validation_"))
 
 
 def _seed(*words: int) -> int:

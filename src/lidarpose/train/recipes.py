@@ -13,7 +13,7 @@ from lidarpose.io.files import listed
 from lidarpose.models import DEFAULT
 
 # rises, stays, falls to nothing; rises and falls as a cosine; or never changes
-SCHEDULES = ("plateau", "cosine", "constant")
+SCHEDULES = ("plateau", "cosine", "constant", "reduce-on-plateau")
 OPTIMIZERS = ("adamw", "adam")
 PRECISIONS = ("auto", "float32", "bf16")
 # the paper's network, and two of the same design for CPUs, besides the sizes of the package's own
@@ -95,7 +95,11 @@ class Recipe:
     decay: float = _setting(0.01, "weight decay")
     optimizer: str = _setting("adamw", "adamw or adam, where Muon is off")
     betas: tuple[float, ...] = _setting((), "its two betas (default: those of the network)")
-    schedule: str = _setting("plateau", "plateau (rise, stay, fall), cosine or constant")
+    schedule: str = _setting(
+        "plateau",
+        "plateau (rise, stay, fall), cosine, constant, or in fine-tuning reduce-on-plateau (a tenth less where two "
+        "epochs gain less than 1 %% each)",
+    )
     warmup: float = _setting(0.02, "share of the run in which the rate rises", "SHARE")
     cool: float = _setting(0.3, "share of the run in which a plateau's rate falls to nothing", "SHARE")
     ema: float = _setting(0.999, "how much the running mean of the weights keeps each step; 0: no mean", "SHARE")
@@ -112,6 +116,8 @@ class Recipe:
         if self.betas and not (len(self.betas) == 2 and all(0 <= beta < 1 for beta in self.betas)):
             raise InputError(f"betas must be two numbers from 0 to below 1, got {self.betas}")
         check_name("schedule", self.schedule, SCHEDULES)
+        if self.schedule == "reduce-on-plateau" and self.kind != "finetune":
+            raise InputError(f"{self.schedule} goes by epochs, which fine-tuning alone has: choose another --schedule")
         check_name("precision", self.precision, PRECISIONS)
 
     def to_dict(self) -> dict:
@@ -216,6 +222,7 @@ class Finetune(PoseRecipe):
     hold_out: float = _setting(
         0.1, "share of sequences kept for validation where the dataset has no split val", "SHARE"
     )
+    shift_windows: bool = _setting(False, "of clips: each time a window begins 0 to 15 frames later")
     keep_anchors: bool = _setting(True, "of the paper's network: go on with pre-trained anchors and heads")
     head: str = _setting("heatmaps", "of the paper's network: heatmaps or coordinates")
 
@@ -285,12 +292,13 @@ _LPFORMER = _LIDARHMR | {"model": "lpformer", "betas": (0.85, 0.95), "batch": 16
 _LIDARHMR_DATA = {"init": RANDOM, "epochs": 50.0, "augment": "lidarhmr", "mix": 0.0, "hold_out": 0.0}
 # AdamW on everything in one cycle at a rate at which the small network learns within 100,000 people
 _ONE_CYCLE = {"rate": 2e-3, "muon_rate": 0.0, "schedule": "cosine", "warmup": 0.1, "ema": 0.0, "clip": 35.0}
-# LiDARCap's and NE's, which both lower the rate, by a tenth where a pass of all data gains less than 1 %
+# LiDARCap's and NE's
 _CLIPS = {"muon_rate": 0.0, "rate": 1e-4, "schedule": "constant", "warmup": 0.0, "ema": 0.0, "clip": 0.0}
 # 8 clips
 _CLIPS |= {"optimizer": "adam", "decay": 1e-4, "batch": 128}
 _CLIPS_SHARDS = _CLIPS | {"easy": 0.0, "strays": 0.0, "noise": 0.0}
 _CLIPS_DATA = _CLIPS | {"init": RANDOM, "epochs": 200.0, "augment": "none", "mix": 0.0, "hold_out": 0.0}
+_CLIPS_DATA |= {"schedule": "reduce-on-plateau"}
 # by kind and name, what differs from the recipe of the bundled weights. Paper: implementation details
 RECIPES: dict[type[Recipe], dict[str, dict[str, Any]]] = {
     Pretrain: {

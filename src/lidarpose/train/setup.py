@@ -25,6 +25,7 @@ from lidarpose.models.dapt.dapt_config import DaptConfig
 from lidarpose.models.detector.detector import detector_path
 from lidarpose.models.detector.detector_config import DetectorConfig
 from lidarpose.models.posenet import PoseNet, expand_weights
+from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import Skeleton, skeleton
 from lidarpose.synth.scene import scene_config
 from lidarpose.train.augment import Augmentation, ClipExample, Example, augmentation, augmented
@@ -61,7 +62,8 @@ _OBJECTS = 0.2
 class TrainSetup:
     """people: how many samples are seen in all; validation: makes those to validate on, once, none for no validation;
     joints: the skeleton to draw them in, None for no pictures; card: what the checkpoint says besides the recipe;
-    warnings: for the user; frames: of an example, each of which counts as one of `people`; unit: what these are;
+    warnings: for the user; frames: of an example, each of which counts as one of `people`; unit: what these are; epoch:
+    how many of `people` are seen until all of a dataset were, 0 where they never repeat;
     validate: called with (objective, network, examples, batch), the error of a network in evaluation mode, in
     `error_unit`, and the joints to draw, if any."""
 
@@ -75,6 +77,7 @@ class TrainSetup:
     warnings: tuple[str, ...] = ()
     frames: int = 1
     unit: str = "people"
+    epoch: int = 0
     validate: Callable[..., tuple[float, np.ndarray | None]] = validate
     error_unit: str = "mm"
 
@@ -288,6 +291,7 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
         source=source,
         # those that are mixed in come on top
         people=max(round(recipe.epochs * len(dataset) / (1 - recipe.mix)), 1),
+        epoch=max(round(len(dataset) / (1 - recipe.mix)), 1),
         network=network,
         validation=validation,
         joints=joints,
@@ -295,6 +299,8 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
         warnings=_damage(dataset) + ((_NO_VALIDATION,) if held_out_dataset is None else ()),
     )
     if not isinstance(config, LidarcapConfig):
+        if recipe.shift_windows:
+            raise InputError(f"shift_windows is of networks of clips, {config.name} reads single frames: leave it away")
         return setup
     if recipe.mix or recipe.augment not in ("none", "turn"):
         raise InputError(f"{config.name} learns from clips: leave --mix at 0, and --augment at none or turn")
@@ -302,12 +308,14 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
     held_out_clips = None if held_out_dataset is None else _clips(held_out_dataset, config, recipe)
     people = max(round(recipe.epochs * len(clip_source.clips)), 1) * config.frames
     clip_validation = partial(held_out_clips.some, VALIDATION // config.frames) if held_out_clips is not None else list
-    return replace(_of_clips(setup, clip_source), people=people, validation=clip_validation)
+    epoch = len(clip_source.clips) * config.frames
+    return replace(_of_clips(setup, clip_source), people=people, epoch=epoch, validation=clip_validation)
 
 
 def _clips(dataset: InMemoryDataset, config: LidarcapConfig, recipe: Pretrain | Finetune) -> ClipSource:
     """The clips of a dataset. Raises InputError where it has none."""
-    clips, skipped = dataset.clips()
+    shift = isinstance(recipe, Finetune) and recipe.shift_windows
+    clips, skipped = dataset.clips(following=CLIP_FRAMES - 1 if shift else 0)
     if not len(clips):
         reasons = "; ".join(f"{count:,} {reason}" for reason, count in skipped.items())
         raise InputError(

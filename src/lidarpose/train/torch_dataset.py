@@ -102,9 +102,9 @@ class InMemoryDataset:
         visible = np.full(len(BODY26), np.nan, np.float32)
         return replace(sample, pose=replace(sample.pose, visible=visible))
 
-    def clips(self) -> tuple[np.ndarray, Counter[str]]:
-        """Rows (C, `CLIP_FRAMES`) of the clips that consecutive frames with rotations make, and how many frames are
-        left out, by reason."""
+    def clips(self, *, following: int = 0) -> tuple[np.ndarray, Counter[str]]:
+        """Rows (C, `CLIP_FRAMES`) of the clips that consecutive frames with rotations make, each with so many rows
+        that follow, and how many frames are left out, by reason."""
         tracks, frames, has_rotations = [], [], []
         for dataset, rows, _ in self.parts:
             name = "sequence" if "sequence" in rows.column_names else "index"
@@ -122,8 +122,8 @@ class InMemoryDataset:
         runs = consecutive([tracks[k] for k in frame_rows], [frames[k] for k in frame_rows])
         reason = f"frames of fewer than {CLIP_FRAMES} consecutive ones"
         skipped[reason] = sum(len(run) for run in runs if len(run) < CLIP_FRAMES)
-        clips = [usable_rows[clip_windows(run)] for run in runs if len(run) >= CLIP_FRAMES]
-        return np.concatenate([np.zeros((0, CLIP_FRAMES), int), *clips]), +skipped
+        clips = [usable_rows[clip_windows(run, following=following)] for run in runs if len(run) >= CLIP_FRAMES]
+        return np.concatenate([np.zeros((0, CLIP_FRAMES + following), int), *clips]), +skipped
 
     def without(self, sequences: Sequence[str]) -> "InMemoryDataset":
         """The samples that are not of some sequences; the points are shared."""
