@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import dataset_files as files
 import numpy as np
@@ -31,8 +32,9 @@ from lidarpose.models.checkpoint import Header, build, save_checkpoint
 from lidarpose.sample import CLIP_FRAMES, clip_windows
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth.generator import Generator
-from lidarpose.train import loop, setup
+from lidarpose.train import data_loader, loop, setup
 from lidarpose.train.augment import clip_example
+from lidarpose.train.data_loader import ClipSource
 from lidarpose.train.networks import PRETRAINED
 from lidarpose.train.objectives.baseline_objective import ClipObjective
 from lidarpose.train.objectives.objective import total
@@ -107,7 +109,10 @@ def test_512_points_as_published():
     cloud = rng.normal(size=(200, 3)).astype(np.float32)
     published = LidarcapConfig(resample_with_replacement=True)
     points, valid = pad_frames([cloud], published, [0])
-    assert valid.all() and (points[0] == np.concatenate([cloud, cloud, cloud[:112]])).all()
+    # each twice, and the first 56 twice more
+    expected = np.concatenate([np.repeat(cloud, 2, axis=0), np.repeat(cloud[:56], 2, axis=0)])
+    assert valid.all() and (points[0] == expected).all()
+    assert (pad_frames([cloud[:1]], published, [0])[0] == cloud[0]).all()
     many = rng.normal(size=(700, 3)).astype(np.float32)
     drawn = pad_frames([many], published, [0])[0][0]
     assert drawn.shape == (FRAME_POINTS, 3) and len(np.unique(drawn, axis=0)) < 450
@@ -237,18 +242,23 @@ def test_a_clip_turns_as_one_and_its_rotations_with_it(clips):
     assert np.abs(again.frames[0].joints - turned.frames[0].joints).max() > 0.01
 
 
-def test_windows_may_begin_later_each_time(folder):
-    """As NE's do; without the setting they are the same each time."""
-    first = {}
-    for shift in (False, True):
-        wanted = recipe(Finetune, "lidarcap", data=(str(folder),), split="all", shift_windows=shift)
-        source = make_setup(wanted).source
-        # both clips many times
-        frames = [source.example(k).frames[0].joints for k in range(40)]
-        assert len(source.example(0).frames) == CLIP_FRAMES == len(source.some(1)[0].frames)
-        np.testing.assert_array_equal(source.example(3).frames[5].joints, source.example(3).frames[5].joints)
-        first[shift] = len(np.unique(np.round([frame[0] - frame[-1] for frame in frames], 4), axis=0))
-    assert first[False] == 2 < 10 < first[True]
+def test_all_windows_of_an_epoch_may_begin_later(monkeypatch):
+    """As NE's do, but none leaves its run."""
+    monkeypatch.setattr(data_loader, "clip_example", lambda samples, *_, **__: samples)
+    settings = {"dataset": SimpleNamespace(sample=lambda row: row), "seed": 3, "trans_center": False}
+    run = np.arange(40)
+    shifted = ClipSource(clips=clip_windows(run, following=CLIP_FRAMES - 1), **settings)
+    starts = set()
+    for epoch in range(150):
+        first, second, third = sorted(shifted.example(3 * epoch + k) for k in range(3))
+        starts.add(first[0])
+        assert first == list(range(first[0], first[0] + 16)) and second == list(range(second[0], second[0] + 16))
+        assert second[0] == min(16 + first[0], 24) and third == [*range(32, 40), *[39] * 8]
+    assert starts == set(range(16))
+    still = ClipSource(clips=clip_windows(run), **settings)
+    assert sorted(still.example(k) for k in range(3)) == sorted(still.example(k) for k in range(3, 6))
+    # those to validate on do not move
+    assert [clip[0] for clip in shifted.some(3)] == [0, 16, 32]
 
 
 def test_the_rate_goes_by_the_losses_of_whole_epochs(folder, tmp_path):

@@ -28,6 +28,11 @@ _LEGEND = (
     "greatest. *undertrained*: not 20 % better than the mean pose about the protocol's center; nothing can be "
     "concluded from it."
 )
+# beside figures as printed in the paper
+_PRINTED = (
+    " In parentheses what the paper prints, not run here: LiDARCap's and NE's figures are of poses about the root without "
+    "shapes, LPFormer's of detected boxes."
+)
 # people of whom the mean pose is taken at most
 _MEAN_POSE = 5_000
 
@@ -185,7 +190,8 @@ def markdown(content: dict[str, Any]) -> str:
     entries = content["cells"]
     budget = f"Budget: {content['people']:,} people a stage of training"
     budget += f", {content['hours']:g} hours a row" if content["hours"] else ""
-    lines = [f"# {content['title']}", "", f"Target: {content['target']}. {budget}. {_LEGEND}", ""]
+    printed = _PRINTED if any(entry["published"] is not None for entry in entries) else ""
+    lines = [f"# {content['title']}", "", f"Target: {content['target']}. {budget}. {_LEGEND}{printed}", ""]
     lines += result_lines(content)
     lines += ["", "## Cells", "", *cost_lines(entries)]
     return "\n".join([*lines, "", "## Commands", "", *_commands(entries)]) + "\n"

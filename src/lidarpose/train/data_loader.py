@@ -173,7 +173,7 @@ class StoredSource(_OfDataset):
 @dataclass(frozen=True, kw_only=True)
 class ClipSource(_OfDataset):
     """The clips of datasets. clips, skipped: see `InMemoryDataset.clips`; trans_center, turn: see `clip_example`. Where
-    rows follow a clip, it begins up to so many later, drawn anew each time."""
+    rows follow the clips, all of an epoch begin some frames later, as many as they may without leaving their run."""
 
     clips: np.ndarray
     trans_center: bool
@@ -183,8 +183,10 @@ class ClipSource(_OfDataset):
     def example(self, index: int) -> ClipExample:
         clip, rng = self._drawn(index, len(self.clips))
         rows = self.clips[clip]
-        if latest := len(rows) - CLIP_FRAMES:
-            start = rng.integers(latest + 1)
+        if following := len(rows) - CLIP_FRAMES:
+            epoch_rng = np.random.default_rng([self.seed, RandomStream.EPOCH_ORDER, index // len(self.clips), 1])
+            # what lies behind a run is its last row again
+            start = min(int(epoch_rng.integers(following + 1)), max(len(np.unique(rows)) - CLIP_FRAMES, 0))
             rows = rows[start : start + CLIP_FRAMES]
         samples = [self._sample(row, rng) for row in rows]
         return clip_example(samples, rng, trans_center=self.trans_center, turn=self.turn)

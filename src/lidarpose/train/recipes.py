@@ -222,7 +222,7 @@ class Finetune(PoseRecipe):
     hold_out: float = _setting(
         0.1, "share of sequences kept for validation where the dataset has no split val", "SHARE"
     )
-    shift_windows: bool = _setting(False, "of clips: each time a window begins 0 to 15 frames later")
+    shift_windows: bool = _setting(False, "of clips: windows begin 0 to 15 frames later, drawn anew each epoch")
     keep_anchors: bool = _setting(True, "of the paper's network: go on with pre-trained anchors and heads")
     head: str = _setting("heatmaps", "of the paper's network: heatmaps or coordinates")
 

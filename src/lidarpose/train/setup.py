@@ -19,7 +19,7 @@ from lidarpose.data.dataset_card import read_card
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
 from lidarpose.models import NETWORKS, weights_path
-from lidarpose.models.baselines.baseline_config import LidarcapConfig
+from lidarpose.models.baselines.baseline_config import BaselineConfig, LidarcapConfig
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.dapt.dapt_config import DaptConfig
 from lidarpose.models.detector.detector import detector_path
@@ -229,7 +229,9 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     if is_clip:
         return _of_clips(setup, replace(_clips(dataset, config, recipe), strays=recipe.strays, noise=recipe.noise))
     source = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=turn_augmentation, **noise)
-    return replace(setup, source=source, warnings=_damage(dataset) + _no_parts(dataset))
+    # PRN and LPFormer take a point's part from the nearest joint
+    has_parts = config.neck != "prn" if isinstance(config, DaptConfig) else not isinstance(config, BaselineConfig)
+    return replace(setup, source=source, warnings=_damage(dataset) + (_no_parts(dataset) if has_parts else ()))
 
 
 def _check_no_test(folder: str) -> None:

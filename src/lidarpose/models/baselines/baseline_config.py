@@ -139,12 +139,12 @@ FRAME_POINTS = 512
 
 @dataclass(frozen=True, kw_only=True)
 class LidarcapConfig(BaselineConfig):
-    """LiDARCap. resample_with_replacement: every cloud has `most_points` points, fewer are repeated whole times and
-    then from the first on, of more some are drawn, perhaps twice, as published; else each point is there once;
-    order_dependent_neighbors: neighborhoods depend on the order of the points, as its CUDA kernels'; trans_center: in
-    training, frames are centered on SMPL's true trans, as published, so that where the pelvis is need not be learned;
-    else on the points, or on a guess of the pelvis; stock_initialization: weights begin as PyTorch's layers make them,
-    as published; else rotations begin near none, and the layers of NE's encoders as copies of what they read."""
+    """LiDARCap. resample_with_replacement: every cloud has `most_points` points, of fewer all are repeated, of more
+    some are drawn, perhaps twice, as published; else each point is there once; order_dependent_neighbors:
+    neighborhoods depend on the order of the points, as its CUDA kernels'; trans_center: in training, frames are
+    centered on SMPL's true trans, as published, so that where the pelvis is need not be learned; else on the points,
+    or on a guess of the pelvis; stock_initialization: weights begin as PyTorch's layers make them, as published; else
+    rotations begin near none, and the layers of NE's encoders as copies of what they read."""
 
     kind: ClassVar[str] = "lidarcap"
     frames: ClassVar[int] = CLIP_FRAMES
@@ -194,9 +194,15 @@ def pad_frames(
         crop = _near(cloud, window)
         if len(crop) > most_points:
             crop = crop[np.random.default_rng(seed).choice(len(crop), most_points, replace=with_replacement)]
-        # fewer are repeated from the first on
-        frame_clouds.append(np.resize(crop, (most_points, 3)) if with_replacement else crop)
+        frame_clouds.append(_repeated(crop, most_points) if with_replacement else crop)
     return _padded(frame_clouds)
+
+
+def _repeated(points: np.ndarray, count: int) -> np.ndarray:
+    """Points (n, 3) as so many: each as often as all can be, one copy after the other, then the first of these anew.
+    Source: LiDARCap's fix_points_num."""
+    copies = np.repeat(points, count // len(points), axis=0)
+    return np.concatenate([copies, copies[: count - len(copies)]])
 
 
 def _near(cloud: np.ndarray, window: float) -> np.ndarray:
