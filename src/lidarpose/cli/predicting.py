@@ -72,7 +72,7 @@ find the people in a point file
 Writes STEM.boxes.json: a box for each person found, surest first, with its score, the probability that it is a person.
  `lidarpose predict --boxes` takes the file.
 $ lidarpose detect sweep.pcd --out people.json
-$ lidarpose detect sweep.pcd --min-score 0.3 --background recording/
+$ lidarpose detect sweep.pcd --min-score 0.6 --background recording/
 <file> FILE  {_FILES}
 [what is in the file]
 {_FRAME.replace("ORIGIN", "0,0,0")}
