@@ -30,8 +30,8 @@ _LEGEND = (
 )
 # beside figures as printed in the paper
 _PRINTED = (
-    " In parentheses what the paper prints, not run here: LiDARCap's and NE's figures are of poses about the root without "
-    "shapes, LPFormer's of detected boxes."
+    " In parentheses what the paper prints, not run here: LiDARCap's and NE's figures are of poses about the root "
+    "without shapes, LPFormer's of detected boxes."
 )
 # people of whom the mean pose is taken at most
 _MEAN_POSE = 5_000
