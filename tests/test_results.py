@@ -87,10 +87,10 @@ def test_a_difference_of_runs_of_one_seed_is_of_that_seed(changed):
     # seed 2 is harder for all: that x was run on it alone does not tell against x
     own = changed.Runs([run("base", 1, 10.0), run("base", 2, 20.0), run("x", 2, 19.0)], 100)
     assert own.difference("x") == pytest.approx(-1.0)
-    assert np.isnan(own.deviation) and own.told("x") == "-1.0"
+    assert np.isnan(own.deviation) and own.difference_text("x") == "-1.0"
     # nothing is said of what shares no seed with base, nor with anything that does
     own = changed.Runs([run("base", 1, 10.0), run("x", 2, 19.0)], 100)
-    assert own.told("x") == "-"
+    assert own.difference_text("x") == "-"
 
 
 def test_a_variant_without_the_seeds_of_base_is_reached_by_others(changed):
@@ -120,8 +120,8 @@ def test_what_noise_hides_is_called_so(changed):
     runs = [run("base", seed, 100.0) for seed in (1, 2)]
     runs += [run("large", 1, 150.0), run("large", 2, 151.0), run("small", 1, 100.5), run("small", 2, 99.6)]
     own = changed.Runs(runs, 100)
-    assert "unresolved" not in own.told("large") and own.told("large").startswith("+50.5 ± ")
-    assert own.told("small").endswith("unresolved")
+    assert "unresolved" not in own.difference_text("large") and own.difference_text("large").startswith("+50.5 ± ")
+    assert own.difference_text("small").endswith("unresolved")
 
 
 def test_runs_are_added_to_those_known(changed, tmp_path):
