@@ -271,6 +271,11 @@ def test_a_file_of_the_folder_is_not_overwritten(clouds, tmp_path, capsys):
         assert main(["predict", str(source), "--format", "csv", "--out", str(tmp_path / "0.csv")]) == 2
         assert "0.csv" in capsys.readouterr().err
     assert (tmp_path / "0.csv").read_bytes() == before
+    # what an earlier command wrote there is
+    for _ in range(2):
+        words = ["predict", str(tmp_path), "--out", f"{tmp_path}/", "--picture", "--html", "--quiet"]
+        assert main(words) == 0, capsys.readouterr().err
+    assert {path.suffix for path in tmp_path.iterdir()} == {".csv", ".jsonl", ".png", ".html"}
 
 
 def test_csv_and_parquet_have_a_row_a_person_and_joint(tracked, tmp_path):

@@ -124,15 +124,17 @@ def output_paths(
     """Where `predict` writes its result, in one of the formats, a picture and a page, None for what it does not write.
     Raises InputError where one cannot be written, or is a file that is read."""
     from lidarpose.io.files import check_apart, check_writable
-    from lidarpose.io.sources.folders import is_result
+    from lidarpose.io.point_cloud import SUFFIXES
+    from lidarpose.io.sources.folders import is_result, list_folder
 
     result = _result_path(options.out, name, "poses", *(f".{suffix}" for suffix in formats))
     base_path = result or Path(f"{name}.poses.json")
     picture = base_path.with_suffix(".png") if options.picture else None
     page = base_path.with_suffix(".html") if options.html else None
     sources = [path for source in options.source for path in (glob.glob(source) or [source])]
-    folders = [Path(path) for path in sources if os.path.isdir(path)]
-    files = [file for folder in folders for file in folder.iterdir() if not is_result(file)]
+    # of a folder its point files are read, not what an earlier command wrote there
+    files = [file for path in sources if os.path.isdir(path) for file in list_folder(Path(path))]
+    files = [file for file in files if file.suffix.lower() in SUFFIXES and not is_result(file)]
     inputs = (options.boxes, options.calib, options.weights, *(options.background or ()))
     for path in filter(None, (result, picture, page)):
         check_apart(path, *sources, *files, *inputs)

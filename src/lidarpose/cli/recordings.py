@@ -160,4 +160,6 @@ def _command(options: argparse.Namespace) -> dict[str, Any]:
 
 def _changed(path: Path) -> int:
     """When a file, or one in a folder, was changed last, ns."""
-    return max(file.stat().st_mtime_ns for file in (path, *(path.iterdir() if path.is_dir() else ())))
+    files = [path, *(path.iterdir() if path.is_dir() else ())]
+    # a link in a folder may lead nowhere
+    return max(file.stat().st_mtime_ns for file in files if file.exists())
