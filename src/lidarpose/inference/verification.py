@@ -127,7 +127,8 @@ class Crops:
         """features (D, 3), see `FEATURES`, and by the verifier the probability that whoever is there rides or sits in a
         wheelchair (D,); of too few points NaN."""
         logits = np.full((len(self.detections), 2), np.nan)
-        for rows, raw in self._run(np.arange(len(self.detections)), _bundled(VERIFIER)):
+        centers, all_rows = self.detections.centers, np.arange(len(self.detections))
+        for rows, raw in _run(self.columns, centers, self.origin, all_rows, _bundled(VERIFIER)):
             logits[rows] = raw.person
         odds = np.clip(logits[:, 0], -_MOST_ODDS, _MOST_ODDS) + _BEYOND_MOST * logits[:, 0]
         log_points = np.log1p([len(column) for column in self.columns])
@@ -135,30 +136,29 @@ class Crops:
 
     def poses(self, rows: np.ndarray) -> Pose:
         """By the default network, joints (D, 26, 3) m; NaN of all but the rows (C,), and of too few points."""
-        backend, centers = _bundled(DEFAULT), self.detections.centers
-        skeleton = backend.header.skeleton
-        joints = np.full((len(centers), len(skeleton), 3), np.nan)
-        for batch, raw in self._run(rows, backend):
-            joints[batch] = estimates(raw, decoder("window"), skeleton).joints + centers[batch][:, None]
-        return Pose(joints=joints, skeleton=skeleton)
-
-    def _run(self, rows: np.ndarray, backend: Backend) -> Iterator[tuple[list[int], Raw]]:
-        """Batches of those among the rows that have enough points, and what a network says of them."""
-        enough = (i for i in rows.tolist() if len(self.columns[i]) >= MIN_POINTS)
-        ordered = sorted(enough, key=lambda i: len(self.columns[i]))
-        for start in range(0, len(ordered), _BATCH):
-            batch = ordered[start : start + _BATCH]
-            columns = [self.columns[i] for i in batch]
-            clouds, view = apply(TTATransform(), columns, self.detections.centers[batch], self.origin)
-            yield batch, backend.run(clouds, view)
+        return _posed(self.columns, self.detections.centers, self.origin, rows)
 
 
-def _pelvises(clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None) -> np.ndarray:
-    """(K, 3) m: of people's clouds (n, 3) m about centers (K, 3) m, by the default network."""
+def _posed(clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None, rows: np.ndarray) -> Pose:
+    """Clouds (n, 3) m about centers (D, 3) m by the default network: joints (D, 26, 3) m, NaN of all but the rows (C,),
+    and of too few points."""
     backend = _bundled(DEFAULT)
-    raw = backend.run(*apply(TTATransform(), clouds, centers, origin))
-    joints = estimates(raw, decoder("window"), backend.header.skeleton).joints + centers[:, None]
-    return joints[:, backend.header.skeleton.index("pelvis")]
+    skeleton = backend.header.skeleton
+    joints = np.full((len(centers), len(skeleton), 3), np.nan)
+    for batch, raw in _run(clouds, centers, origin, rows, backend):
+        joints[batch] = estimates(raw, decoder("window"), skeleton).joints + centers[batch][:, None]
+    return Pose(joints=joints, skeleton=skeleton)
+
+
+def _run(
+    clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None, rows: np.ndarray, backend: Backend
+) -> Iterator[tuple[list[int], Raw]]:
+    """Batches of those among the rows that have enough points, and what a network says of them."""
+    enough = (i for i in rows.tolist() if len(clouds[i]) >= MIN_POINTS)
+    ordered = sorted(enough, key=lambda i: len(clouds[i]))
+    for start in range(0, len(ordered), _BATCH):
+        batch = ordered[start : start + _BATCH]
+        yield batch, backend.run(*apply(TTATransform(), [clouds[i] for i in batch], centers[batch], origin))
 
 
 def _highest_score(detections: Detections, header: dict) -> np.ndarray:
@@ -340,12 +340,13 @@ def _without_repeats(
     close = np.flatnonzero(np.tril(distance < _CLOSE, -1).any(1))
     if not len(close):
         return people
-    clouds, centers = [points[people[k][2]] for k in close], np.array([people[k][1].center for k in close])
-    own_pelvises = _pelvises(clouds, centers, origin)
+    clouds, centers = [points[own_rows] for _, _, own_rows in people], np.array([box.center for _, box, _ in people])
+    own_poses = _posed(clouds, centers, origin, close)
+    own_pelvises = own_poses.joints[:, own_poses.skeleton.index("pelvis")]
     is_repeated = np.zeros(len(people), bool)
-    for k, own_pelvis in zip(close, own_pelvises, strict=True):
+    for k in close:
         surer = np.flatnonzero(~is_repeated[:k])
-        is_repeated[k] = (np.linalg.norm(pelvises[surer] - own_pelvis, axis=1) < _SAME_PERSON).any()
+        is_repeated[k] = (np.linalg.norm(pelvises[surer] - own_pelvises[k], axis=1) < _SAME_PERSON).any()
     return [person for person, is_gone in zip(people, is_repeated, strict=True) if not is_gone]
 
 
