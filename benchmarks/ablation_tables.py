@@ -37,7 +37,7 @@ _HEADER = tuple(WORDS.get(name, name) for name in _SHOWN)
 
 
 def own_lines(result: Result) -> list[MetricRow]:
-    """The lines of what was judged, without the baselines', by this package's arithmetic."""
+    """The lines of what was evaluated, without the baselines', by this package's arithmetic."""
     return [x for x in result.lines if x.method == result.setting.method and x.arithmetic == OURS]
 
 

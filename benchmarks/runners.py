@@ -357,8 +357,8 @@ def _from_files(ours: Ours, folder: Path, threads: int, left_out: list[str]) -> 
         left_out.append(f"{ours.name} ONNX: {reason(error)}")
     if ours.name != "tiny":
         return
-    of_backend: dict[str, dict] = {"torch": {}, "onnx": {"threads": threads}}
-    for backend, options in of_backend.items():
+    options_by_backend: dict[str, dict] = {"torch": {}, "onnx": {"threads": threads}}
+    for backend, options in options_by_backend.items():
         try:
             from lidarpose.inference.predictor import load
 

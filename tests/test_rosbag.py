@@ -365,35 +365,29 @@ def test_what_is_no_recording_is_one_line(tmp_path):
         open_source(tmp_path / "folder")
 
 
-def test_an_mcap_with_an_odd_statistics_record_is_read_without_it(tmp_path):
-    path = write(tmp_path / "drive.mcap", clouds(".mcap"))
-    data = bytearray(path.read_bytes())
-    # opcode and length of the statistics, whose last field is a map of 10 bytes an entry
-    at = data.rindex(b"\x0b" + struct.pack("<Q", 56))
-    assert struct.unpack_from("<I", data, at + 9 + 42)[0] == 10
-    struct.pack_into("<I", data, at + 9 + 42, 9)
-    path.write_bytes(data)
-    try:
-        frames = list(open_source(path))
-    except InputError as error:
-        assert "\n" not in str(error)
-    else:
-        assert all(np.array_equal(frame.points, points_of(k)) for k, frame in enumerate(frames[:5]))
-
-
-def test_a_bag_whose_record_has_an_empty_operation_is_damaged_there(tmp_path):
+@pytest.mark.parametrize(
+    "changes",
+    [
+        # 7 bytes of what are 8 a connection; a field without a value, and another longer by a byte
+        {b"\x01\x00\x00\x00\x08\x00\x00\x00\x00": b"\x01\x00\x00\x00\x07\x00\x00\x00\x00"},
+        {b"\x04\x00\x00\x00op=\x06": b"\x03\x00\x00\x00op=", b"\x0a\x00\x00\x00count=": b"\x0b\x00\x00\x00count=\x00"},
+    ],
+    ids=["odd length", "no operation"],
+)
+def test_a_damaged_record_at_the_end_of_a_bag_costs_none_before_it(changes, tmp_path):
     path = write(tmp_path / "drive.bag", clouds(".bag"))
-    data = path.read_bytes()
-    name = b"\x04\x00\x00\x00op=\x05"
-    assert data.count(name) == 1
-    # the header's length stays: the field is op= without a value, and one byte of another field
-    path.write_bytes(data.replace(name, b"\x03\x00\x00\x00op=\x05"))
-    try:
-        frames = list(open_source(path))
-    except InputError as error:
-        assert "\n" not in str(error)
-    else:
-        assert len(frames) <= 7
+    # the record that says what a chunk holds
+    at = path.read_bytes().index(b"op=\x06") - 8
+    start, info = path.read_bytes()[:at], path.read_bytes()[at:]
+    for old, new in changes.items():
+        assert info.count(old) == 1
+        info = info.replace(old, new)
+    path.write_bytes(start + info)
+    *frames, last = open_source(path)
+    assert isinstance(last, DamagedFrame) and "drive.bag: is damaged (" in last.error and "\n" not in last.error
+    assert len(frames) == 6
+    for k, frame in enumerate(frames):
+        assert np.array_equal(frame.points, points_of(k))
 
 
 def test_a_stopped_recording_of_sqlite_goes_on_in_another_thread(tmp_path):

@@ -28,7 +28,7 @@ MAX_RANGE, BEYOND = 40.0, 6.0
 _STRAY, _NEARLY_ALL = 100.0, (0.1, 99.9)
 # detections nearer than this are one person, m: the network moves those of one to the same place
 SAME = 0.15
-# beside people somebody is looked for so far away; a proposal is judged by what is so far about it, m
+# beside people somebody is looked for so far away; a proposal depends on what is so far about it, m
 _BESIDE, _COLUMN = (0.3, 0.85), 1.0
 # what is looked at for a place: so far around it, m, and in its direction so far to both sides, m, and a bit more, rad,
 # by so many bins of directions
