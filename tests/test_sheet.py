@@ -19,8 +19,16 @@ from lidarpose.synth import shard_job
 from lidarpose.synth.shard_job import Job, write_dataset
 from lidarpose.synth.street import street
 from lidarpose.viz import contact_sheet
-from lidarpose.viz.bird_eye import MAX_SCANS, ScanPanel, _window, draw_scans, label_offsets
+from lidarpose.viz.bird_eye import (
+    MAX_SCANS,
+    ScanPanel,
+    _window,
+    draw_scan_and_people,
+    draw_scans,
+    label_offsets,
+)
 from lidarpose.viz.contact_sheet import _spread, draw_dataset
+from lidarpose.viz.draw import Panel, draw_people
 
 PNG = b"\x89PNG\r\n"
 
@@ -166,12 +174,22 @@ def test_nothing_and_too_much_are_drawn_too():
     assert many[0] / one[0] == pytest.approx(MAX_SCANS / 2, rel=0.1)
 
 
-def test_everybody_is_inside_the_window_and_the_sensor_too():
-    corner, span = _window(panel(), POINTS)
+@pytest.mark.parametrize("size", [(7, 7), (11, 7)])
+def test_everybody_is_inside_the_window_and_the_sensor_too(size):
+    size = np.array(size, float)
+    center, scale = _window(panel(), POINTS, size)
     for place in ((12, -7), (0, 0)):
-        assert (corner + 2 < place).all() and (corner + span - 2 > place).all()
-    corner, span = _window(panel(boxes=(), tracks=()), POINTS)
-    assert 40 < span < 50
+        assert (abs(place - center) < size * scale / 2 - 2).all()
+    _, scale = _window(panel(boxes=(), tracks=()), POINTS, size)
+    assert 40 < size.min() * scale < 50
+
+
+def test_a_scan_is_as_wide_as_the_cards_below_it():
+    for count in (0, 1, 4, 5):
+        cards = [Panel(points=POINTS[:9]) for _ in range(count)]
+        image = pixels(draw_scan_and_people(panel(), cards))
+        widths = [pixels(draw_people(cards)).shape[1]] if cards else []
+        assert image.shape[1] == pytest.approx(max(widths + [836]), abs=5)
 
 
 def test_view_of_streets_shows_them_from_above(tmp_path, monkeypatch):

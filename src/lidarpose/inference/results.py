@@ -290,15 +290,14 @@ class Poses(Sequence[PersonPose]):
 
         Where people were searched for, the scan from above is over them.
         """
-        from lidarpose.viz.bird_eye import draw_scans
-        from lidarpose.viz.draw import draw_people, stack_pictures
+        from lidarpose.viz.bird_eye import draw_scan_and_people
+        from lidarpose.viz.draw import draw_people
 
         title = title or (self.source or "")
         panels, scan = self._panels()
         if scan is None:
             return Picture(draw_people(panels, path, title=title))
-        scan_picture = draw_scans([scan], title=title)
-        return Picture(stack_pictures([scan_picture, draw_people(panels)] if panels else [scan_picture], path))
+        return Picture(draw_scan_and_people(scan, panels, path, title=title))
 
     def html(self, path: str | Path | None = None, *, title: str = "") -> str:
         """A page on which everybody is turned in 3D, under the scan where people were searched for; also written to

@@ -11,8 +11,7 @@ from lidarpose.io.sources import Frame, Source
 from lidarpose.recording.coordinates import FixedFrame, moved_yaw
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import Skeleton
-from lidarpose.viz.bird_eye import ScanPanel, draw_scans
-from lidarpose.viz.draw import draw_people, stack_pictures
+from lidarpose.viz.bird_eye import ScanPanel, draw_scan_and_people
 from lidarpose.viz.person_view import Panel
 
 # frames whose points are drawn where the sensor moves
@@ -91,9 +90,7 @@ class WaysPicture:
             label=f"{count_text} in {counted(len(self._frames), 'frame')}",
             sensor=self._to_fixed[-1][:2, 3].tolist() if self._to_fixed else None,
         )
-        scan_picture = draw_scans([panel], title=title)
-        cards = list(self._cards(points, skeleton)) if is_single else []
-        return stack_pictures([scan_picture, draw_people(cards)]) if cards else scan_picture
+        return draw_scan_and_people(panel, list(self._cards(points, skeleton)) if is_single else [], title=title)
 
     def _cards(self, points: np.ndarray, skeleton: Skeleton) -> Iterator[Panel]:
         """Everybody in a recording of one frame of points (n, 3) m."""

@@ -13,12 +13,13 @@ from lidarpose.io.files import check_suffix
 from lidarpose.models.detector.ground import Ground, estimate_ground
 from lidarpose.models.detector.proposals import heights_above
 from lidarpose.sample import Box, Pose
-from lidarpose.viz.draw import SIDE_COLORS, png_of, shortened
-from lidarpose.viz.person_view import bone_pairs, bone_sides, box_edges, finite, is_known, thinned
+from lidarpose.viz.draw import SIDE_COLORS, draw_people, png_of, shortened, stack_pictures
+from lidarpose.viz.person_view import Panel, bone_pairs, bone_sides, box_edges, finite, is_known, thinned
 
 MAX_SCANS = 12
 _MAX_POINTS = 120_000  # a scan; more only cover each other at this size
 _DPI, _PANEL, _TITLE = 110, 7.6, 0.6  # inches
+_WIDE, _CARDS_IN_ROW = 11.5, 4  # inches, of a scan over the cards of so many people or more
 _LABEL_RADII, _LABEL_SIZE = (15.0, 26.0, 38.0), 13.0  # points from a box to its number, and about what a number takes
 _MARGIN, _LEAST_SPAN = 3.0, 16.0  # m about the people, and of a view's side at least
 _BELOW, _ABOVE = 0.25, 2.5  # heights above the lowest points over which the colors run, m
@@ -54,13 +55,32 @@ class ScanPanel:
     step: float = 100.0
 
 
-def draw_scans(panels: Sequence[ScanPanel], path: str | Path | None = None, *, title: str = "") -> bytes:
+def draw_scan_and_people(
+    scan: ScanPanel, people: Sequence[Panel], path: str | Path | None = None, *, title: str = ""
+) -> bytes:
+    """A scan from above and, below it, a card of each person, as `draw_scans` and `draw_people` draw them.
+
+    Returns:
+        The PNG's bytes.
+
+    Raises:
+        InputError: a path that does not end in .png or cannot be written.
+    """
+    is_wide = len(people) >= _CARDS_IN_ROW
+    pictures = [draw_scans([scan], title=title, panel_width=_WIDE if is_wide else _PANEL)]
+    return stack_pictures([*pictures, draw_people(list(people))] if people else pictures, path)
+
+
+def draw_scans(
+    panels: Sequence[ScanPanel], path: str | Path | None = None, *, title: str = "", panel_width: float = _PANEL
+) -> bytes:
     """Scans from above, side by side.
 
     Args:
         panels: at most the first 12 are drawn.
         path: where to write the PNG, too.
         title: above all.
+        panel_width: of each, inches.
 
     Returns:
         The PNG's bytes.
@@ -75,12 +95,12 @@ def draw_scans(panels: Sequence[ScanPanel], path: str | Path | None = None, *, t
     panels = list(panels)[:MAX_SCANS]
     columns = min(2, max(len(panels), 1))
     rows = max(-(-len(panels) // columns), 1)
-    width, height = columns * _PANEL, rows * _PANEL + _TITLE
+    width, height = columns * panel_width, rows * _PANEL + _TITLE
     figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
     figure.text(
         0.15 / width,
         1 - 0.15 / height,
-        shortened(title, 36 * columns),
+        shortened(title, int(4.7 * width)),
         fontsize=13,
         weight="bold",
         va="top",
@@ -91,23 +111,26 @@ def draw_scans(panels: Sequence[ScanPanel], path: str | Path | None = None, *, t
     figure.text(0.15 / width, 1 - 0.42 / height, note, fontsize=8, color=_FAINT, va="top")
     for number, panel in enumerate(panels):
         row, column = divmod(number, columns)
-        place = ((column * _PANEL + 0.55) / width, (height - _TITLE - (row + 1) * _PANEL + 0.45) / height)
-        _draw_panel(figure.add_axes((*place, (_PANEL - 0.7) / width, (_PANEL - 0.75) / height)), panel)
+        place = ((column * panel_width + 0.55) / width, (height - _TITLE - (row + 1) * _PANEL + 0.45) / height)
+        size = np.array([panel_width - 0.7, _PANEL - 0.75])
+        _draw_panel(figure.add_axes((*place, *size / (width, height))), panel, size)
     return png_of(figure, path)
 
 
-def _draw_panel(ax, panel: ScanPanel) -> None:
+def _draw_panel(ax, panel: ScanPanel, size: np.ndarray) -> None:
+    """size: width and height of the axes, inches."""
     from matplotlib.collections import LineCollection
 
     points = finite(panel.points)
-    (left, bottom), span = _window(panel, points)
-    ax.set(xlim=(left, left + span), ylim=(bottom, bottom + span), aspect="equal")
+    center, scale = _window(panel, points, size)
+    low, high = center - size * scale / 2, center + size * scale / 2
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     ax.set_xlabel("x, m", fontsize=7, color=_FAINT, labelpad=1)
     ax.set_ylabel("y, m", fontsize=7, color=_FAINT, labelpad=-1)
     ax.set_title(panel.label, fontsize=10, parse_math=False)
     ax.tick_params(labelsize=7, color=_FAINT, labelcolor=_FAINT)
     ax.spines[:].set_color(_HIGH)
-    inside_points = points[(np.abs(points[:, :2] - [left + span / 2, bottom + span / 2]) <= span / 2).all(1)]
+    inside_points = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(1)]
     _draw_points(ax, inside_points[thinned(len(inside_points), _MAX_POINTS)], estimate_ground(points))
     if panel.sensor is not None:
         ax.plot(*panel.sensor, ls="", marker="^", ms=8, color=_INK, mec="white", zorder=5)
@@ -118,7 +141,7 @@ def _draw_panel(ax, panel: ScanPanel) -> None:
     if panel.places is not None and len(panel.places):
         ax.plot(panel.places[:, 0], panel.places[:, 1], ls="", marker="o", ms=2.5, color=_BOX, alpha=0.5, zorder=4)
     centers = np.array([box.center[:2] for box in panel.boxes]).reshape(-1, 2)
-    offsets = label_offsets(centers * 72 * (_PANEL - 0.7) / span)
+    offsets = label_offsets(centers * 72 / scale)
     for box, offset in zip(panel.boxes, offsets.tolist(), strict=True):
         _draw_box(ax, box, offset)
     if is_known(panel.poses):
@@ -130,9 +153,9 @@ def _draw_panel(ax, panel: ScanPanel) -> None:
         )
 
 
-def _window(panel: ScanPanel, points: np.ndarray) -> tuple[np.ndarray, float]:
-    """The lower left corner and the side of a square that holds the people, their tracks and the sensor, else most
-    points."""
+def _window(panel: ScanPanel, points: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, float]:
+    """What axes of a size (2,) inches show: the center (2,) m, and the meters an inch that show the people, their
+    tracks and the sensor, else most points."""
     extent_points = [box.center[None, :2] for box in panel.boxes] + [np.asarray(track)[:, :2] for track in panel.tracks]
     if panel.places is not None and len(panel.places):
         extent_points.append(np.asarray(panel.places)[:, :2])
@@ -141,8 +164,8 @@ def _window(panel: ScanPanel, points: np.ndarray) -> tuple[np.ndarray, float]:
     if not extent_points:
         extent_points = [np.percentile(points[:, :2], (2, 98), axis=0) if len(points) else np.zeros((1, 2))]
     low, high = np.concatenate(extent_points).min(0), np.concatenate(extent_points).max(0)
-    span = max(float((high - low).max()) + 2 * _MARGIN, _LEAST_SPAN)
-    return (low + high) / 2 - span / 2, span
+    scale = max(float(((high - low + 2 * _MARGIN) / size).max()), _LEAST_SPAN / float(size.min()))
+    return (low + high) / 2, scale
 
 
 def _draw_points(ax, points: np.ndarray, ground: Ground | None) -> None:
