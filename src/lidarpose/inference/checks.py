@@ -118,7 +118,7 @@ def oversize_warning(points: np.ndarray, pose: Pose) -> str | None:
 def company_warning(pose: Pose, *, in_box: bool = False) -> str | None:
     """The points show nobody, or more people than the one whose pose it is; in_box: a box says who is meant."""
     if pose.person is not None and pose.person < _NOBODY:
-        return f"the points look unlike a person (person {float(pose.person):.2f}): is somebody in this crop?"
+        return f"the points look unlike a person (person {float(pose.person):.2f}): perhaps nobody is there"
     if pose.second_person is not None and pose.second_person > _TWO:
         if in_box:
             return "the points look like two people: the pose is of the one nearer to the center of the box"

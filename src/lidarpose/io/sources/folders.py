@@ -58,12 +58,16 @@ def scan_files(folder: Path, other: Sequence[str] = ()) -> tuple[list[Path], lis
     files = next(filter(None, groups), [])
     if not files:
         raise file_error(folder, f"expected point files ({' '.join((*SUFFIXES, *other))}), got {describe(entries)}")
-    if files is not groups[2] and len({scan_id(path) for path in files}) == len(files):
-        return files, []
-    (suffix, count), *other_counts = Counter(suffixes[path] for path in files).most_common()
-    names = " and ".join(f"{count} {suffix}" for suffix, count in other_counts)
-    warning = f"only its {count} {suffix} files are read, not {names}: name those by a pattern"
-    return [path for path in files if suffixes[path] == suffix], [warning] if other_counts else []
+    counts = Counter(suffixes[path] for path in files).most_common()
+    left_out = Counter(suffixes[path] for path in groups[1] if files is groups[0]).most_common()
+    if files is groups[2] or len({scan_id(path) for path in files}) < len(files):
+        counts, left_out = counts[:1], counts[1:] + left_out
+    warnings = []
+    if left_out:
+        names, other_names = (" and ".join(f"{n} {suffix}" for suffix, n in each) for each in (counts, left_out))
+        warnings = [f"only its {names} files are read, not {other_names}: name those by a pattern"]
+    suffixes_read = {suffix for suffix, _ in counts}
+    return [path for path in files if suffixes[path] in suffixes_read], warnings
 
 
 def describe(entries: Sequence[Path]) -> str:
