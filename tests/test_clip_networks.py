@@ -440,6 +440,12 @@ def test_clips_that_do_not_fit_the_clouds_are_refused(predictor, clips, told):
         predictor.predict([np.random.default_rng(k).normal(0, 0.3, (20, 3)) for k in range(4)], clips=clips)
 
 
+@pytest.mark.parametrize("given", [{"boxes": []}, {"find": True}])
+def test_clips_are_of_clouds_without_boxes(predictor, given):
+    with refused("leave it away with boxes and find"):
+        predictor.predict(np.zeros((20, 3)), clips=Clips.of_run(1), **given)
+
+
 def test_networks_of_single_frames_take_no_clips():
     with refused("reads single frames"):
         load("tiny").predict([np.zeros((10, 3))] * CLIP_FRAMES, clips=Clips.of_run(CLIP_FRAMES))

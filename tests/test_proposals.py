@@ -12,8 +12,9 @@ from lidarpose.models.detector import proposals
 from lidarpose.models.detector.candidates import SceneIndex, suppress_near
 from lidarpose.models.detector.ground import estimate_ground, estimate_up, without_ground
 from lidarpose.models.detector.proposals import columns, heights_above, propose
-from lidarpose.models.detector.render import Augmentation, draw_augmentation, render
+from lidarpose.models.detector.render import CandidateAugmentation, render
 from lidarpose.synth.street import street
+from lidarpose.train.detector.candidate_source import draw_augmentation
 from tests.reference.detector_reference import (
     context_reference,
     fine_reference,
@@ -369,7 +370,7 @@ def test_without_a_sensor_candidates_keep_the_level_frame(scene):
     assert not chosen.yaw.any() and not chosen.distance.any()
     # as with a sensor that is dropped
     seen = SceneIndex(points, ground, ORIGIN).candidates(centers)
-    dropped = render(seen, Augmentation(drop_origin=True, turn=seen.yaw))
+    dropped = render(seen, CandidateAugmentation(drop_origin=True, turn=seen.yaw))
     assert not dropped["range_view"].any() and not dropped["scalars"][:, [0, 1, 3]].any()
     assert np.mean(np.abs(dropped["fine"] - inputs["fine"]) > 1e-5) < 1e-3
 
@@ -398,20 +399,20 @@ def test_duplicate_points_only_add_to_counts(scene):
 
 def test_augmentation_moves_points_and_labels_alike():
     rng = np.random.default_rng(4)
-    change = Augmentation(turn=0.3, mirror=True, scale=1.05, shift=(0.06, -0.04))
+    change = CandidateAugmentation(turn=0.3, mirror=True, scale=1.05, shift=(0.06, -0.04))
     ball = rng.normal(0, 0.03, (300, 3)) + [0.4, 0.3, 1.0]
     points = np.concatenate([plane(), ball + [6, 0, -1.8]])
     chosen = SceneIndex(points, estimate_ground(points, ORIGIN), ORIGIN).candidates(np.array([[6.0, 0, -1.8]]))
     fine = render(chosen, change)["fine"][0]
     high = fine[10:]
     middle = (np.argwhere(high > 0) * high[high > 0][:, None]).sum(0) / high.sum()
-    expected = change.apply(np.array([[0.4, 0.3, 1.0]]))[0]
-    np.testing.assert_allclose((middle[1:] - 11.5) / 10, expected[:2], atol=0.04)
-    assert (middle[0] + 10.5) / 10 - 0.5 == pytest.approx(expected[2], abs=0.04)
+    expected = change.apply(np.array([[0.4, 0.3]]))[0]
+    np.testing.assert_allclose((middle[1:] - 11.5) / 10, expected, atol=0.04)
+    assert (middle[0] + 10.5) / 10 - 0.5 == pytest.approx(1.05, abs=0.04)
     # by hand: mirror, turn, scale, shift
     x, y = 0.4, -0.3
     x, y = np.cos(0.3) * x - np.sin(0.3) * y, np.sin(0.3) * x + np.cos(0.3) * y
-    np.testing.assert_allclose(expected, [1.05 * x + 0.06, 1.05 * y - 0.04, 1.05])
+    np.testing.assert_allclose(expected, [1.05 * x + 0.06, 1.05 * y - 0.04])
 
 
 def test_augmented_candidates_depend_on_their_own_augmentation_alone(scene):
@@ -422,10 +423,10 @@ def test_augmented_candidates_depend_on_their_own_augmentation_alone(scene):
     alone = render(chosen.take([3]), replace(changes, **{name: values[3:4] for name, values in vars(changes).items()}))
     for name, values in together.items():
         np.testing.assert_allclose(values[3], alone[name][0], atol=1e-6)
-    unchanged = render(chosen, Augmentation())
+    unchanged = render(chosen, CandidateAugmentation())
     for name, values in render(chosen).items():
         np.testing.assert_allclose(unchanged[name], values, atol=0.005)
-    half = render(chosen, Augmentation(keep=0.5, seed=np.arange(6)))
+    half = render(chosen, CandidateAugmentation(keep=0.5, seed=np.arange(6)))
     assert 0.3 < (half["fine"] > 0).sum() / (unchanged["fine"] > 0).sum() < 0.9
 
 
@@ -434,7 +435,7 @@ def test_no_points_and_no_candidates_are_legal():
     empty = SceneIndex(np.zeros((0, 3)), ground, ORIGIN)
     nobody = empty.candidates(np.zeros((0, 3)))
     assert len(nobody) == 0
-    for augmentation in (None, Augmentation(), draw_augmentation(np.random.default_rng(0), 0)):
+    for augmentation in (None, CandidateAugmentation(), draw_augmentation(np.random.default_rng(0), 0)):
         assert render(nobody, augmentation)["fine"].shape == (0, 28, 24, 24)
     alone = empty.candidates(np.array([[4.0, 1, -1.8]]))
     assert alone.count[0] == 0 and not render(alone)["fine"].any()

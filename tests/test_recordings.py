@@ -20,8 +20,7 @@ from lidarpose.recording.frame_boxes import FrameBoxes
 from lidarpose.recording.predict_recording import FramePredictor
 from lidarpose.synth.bodies import draw_bodies
 from lidarpose.synth.environment.mesh import Mesh, quad, union
-from lidarpose.viz.bird_eye import draw_scans
-from lidarpose.viz.draw import draw_people
+from lidarpose.viz.bird_eye import draw_scan_and_people
 
 FRAMES, DAMAGED = 7, 4
 # where two people stand in the first frame, and how far they go in each, m
@@ -509,10 +508,13 @@ def test_warnings_that_differ_in_numbers_and_their_signs_are_one():
 
 def test_of_a_recording_of_one_frame_the_people_are_drawn(drive, tmp_path, monkeypatch):
     drawn, above = [], []
-    monkeypatch.setattr(picture, "draw_people", lambda panels: drawn.extend(panels) or draw_people(panels))
-    monkeypatch.setattr(
-        picture, "draw_scans", lambda panels, **words: above.extend(panels) or draw_scans(panels, **words)
-    )
+
+    def draw(scan, people, **words):
+        above.append(scan)
+        drawn.extend(people)
+        return draw_scan_and_people(scan, people, **words)
+
+    monkeypatch.setattr(picture, "draw_scan_and_people", draw)
     command = ["predict", str(drive), "--track", "--picture", "--out", str(tmp_path / "a.jsonl")]
     assert main([*command, "--end", "0.1"]) == 0 and not drawn
     assert main([*command, "--end", "0.05"]) == 0

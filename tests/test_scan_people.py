@@ -87,7 +87,7 @@ def test_a_scan_without_anybody_is_skipped(monkeypatch, scan):
         return scan if len(asked) > 2 else empty
 
     monkeypatch.setattr(scan_people, "scan_people", people)
-    assert ScanPeopleSource(seed=SEED, uses=1, lag=1).made(5) is scan
+    assert ScanPeopleSource(seed=SEED, uses=1, lag=1).load_scene(5) is scan
     assert len(set(asked)) == 3 and asked[0] == 5
 
 

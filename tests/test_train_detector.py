@@ -18,7 +18,7 @@ from lidarpose.models.detector.detector import detector_path, open_detector
 from lidarpose.models.detector.detector_config import OUTPUT, OUTPUTS, DetectorConfig
 from lidarpose.models.detector.ground import estimate_up
 from lidarpose.models.detector.network import DetectorNet
-from lidarpose.models.detector.render import Augmentation
+from lidarpose.models.detector.render import CandidateAugmentation
 from lidarpose.models.export import export, export_detector
 from lidarpose.models.onnx import open_network
 from lidarpose.sample import Box
@@ -27,8 +27,8 @@ from lidarpose.train import loop, run_dir, setup
 from lidarpose.train.data_loader import BATCHES
 from lidarpose.train.detector import candidate_source
 from lidarpose.train.detector.candidate_source import (
+    IGNORE,
     NOBODY,
-    UNCLEAR,
     CandidateSource,
     DetectorExample,
     Labels,
@@ -69,7 +69,7 @@ def an_example(number, *, count=10):
     is_person = np.arange(count) % 2 == 0
     labels = Labels(
         person=np.where(is_person, np.arange(count), NOBODY),
-        center=np.zeros((count, 3), np.float32),
+        center=np.zeros((count, 2), np.float32),
         foot=np.zeros(count, np.float32),
         height=np.full(count, 1.75, np.float32),
         mounted=np.zeros(count, bool),
@@ -187,18 +187,18 @@ def test_who_is_whose_candidate():
     rng = np.random.default_rng(0)
     candidates = some_candidates(rng, [True] * 5, centers=[(x, y, -0.1) for x, y in places], yaw=np.pi / 2)
     labels = labels_of(candidates, scene)
-    assert labels.person.tolist() == [0, UNCLEAR, NOBODY, UNCLEAR, 1]
+    assert labels.person.tolist() == [0, IGNORE, NOBODY, IGNORE, 1]
     # the view frame's x is the level frame's y
-    np.testing.assert_allclose(labels.center[0], [-0.2, 0.2, 0], atol=1e-6)
+    np.testing.assert_allclose(labels.center[0], [-0.2, 0.2], atol=1e-6)
     np.testing.assert_allclose([labels.foot[0], labels.height[0]], [0.1, 1.8], atol=1e-6)
     assert labels.mounted.tolist() == [False, False, False, False, True]
 
 
 def test_labels_move_with_the_points():
-    labels = replace(an_example(0, count=1).labels, center=np.array([[0.3, 0.1, 0.0]], np.float32))
-    change = Augmentation(turn=np.pi / 2, mirror=True, scale=1.05, shift=(0.02, -0.04))
+    labels = replace(an_example(0, count=1).labels, center=np.array([[0.3, 0.1]], np.float32))
+    change = CandidateAugmentation(turn=np.pi / 2, mirror=True, scale=1.05, shift=(0.02, -0.04))
     after = moved(labels, change)
-    np.testing.assert_allclose(after.center[0, :2], [0.1 * 1.05 + 0.02, 0.3 * 1.05 - 0.04], atol=1e-6)
+    np.testing.assert_allclose(after.center[0], [0.1 * 1.05 + 0.02, 0.3 * 1.05 - 0.04], atol=1e-6)
     np.testing.assert_allclose(after.center[0], change.apply(labels.center)[0], atol=1e-6)
     assert after.height[0] == pytest.approx(1.75 * 1.05)
 
@@ -225,7 +225,7 @@ def test_each_scan_is_shown_so_often_whoever_makes_it(quick_scans, monkeypatch):
 def test_the_hardest_of_nobody_are_learned_from():
     logit = torch.arange(200.0)
     person = torch.full((200,), NOBODY)
-    person[:4], person[199] = torch.arange(4), UNCLEAR
+    person[:4], person[199] = torch.arange(4), IGNORE
     rows = chosen(logit, person, torch.zeros(200, dtype=torch.long)).tolist()
     assert set(range(4)) < set(rows) and 199 not in rows
     assert set(range(189, 199)) < set(rows) and len(rows) < 60

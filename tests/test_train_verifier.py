@@ -104,8 +104,8 @@ def test_people_and_mistakes_are_told_by_distance_and_points():
         np.testing.assert_array_equal(example.mounted, np.append(scene.mounted, False)[example.person])
     label = crop_source._label
     assert label(np.array([0.3, 2.0]), np.array([4, 7]), np.array([-1, 4])) == 4
-    assert label(np.array([0.5, 2.0]), np.array([4, 7]), np.array([-1, -1])) == crop_source.UNCLEAR
-    assert label(np.array([0.9, 2.0]), np.array([4, 7]), np.array([-1, 4])) == crop_source.UNCLEAR
+    assert label(np.array([0.5, 2.0]), np.array([4, 7]), np.array([-1, -1])) == crop_source.IGNORE
+    assert label(np.array([0.9, 2.0]), np.array([4, 7]), np.array([-1, 4])) == crop_source.IGNORE
     assert label(np.array([0.9, 2.0]), np.array([4, 7]), np.array([-1, -1])) == NOBODY
     assert label(np.zeros(0), np.zeros(0, int), np.array([-1])) == NOBODY
 
@@ -115,16 +115,16 @@ def test_a_scan_is_another_each_time_and_the_same_for_every_process(quick_crops)
     first, again = source.example(37), CropSource(seed=1, uses=3, lag=4).example(37)
     for a, b in zip(first.clouds, again.clouds, strict=True):
         np.testing.assert_array_equal(a, b)
-    scan = source.made(2)
+    scan = source.load_scene(2)
     before = [cloud.copy() for cloud in scan.clouds]
-    shown = [source.shown(scan, np.random.default_rng(k)) for k in range(2)]
+    shown = [source.draw_example(scan, np.random.default_rng(k)) for k in range(2)]
     assert not np.array_equal(shown[0].clouds[0], shown[1].clouds[0])
     for cloud, old in zip(scan.clouds, before, strict=True):
         np.testing.assert_array_equal(cloud, old)
     # mirrored with what they are seen from
     scan = replace(scan, view=scan.view + np.float32([0, 0.5, 0, 0, 0]))
     scan = replace(scan, clouds=[cloud + np.float32([0, 5, 0]) for cloud in scan.clouds])
-    shown = source.shown(scan, np.random.default_rng(0))
+    shown = source.draw_example(scan, np.random.default_rng(0))
     sides = np.array([np.sign(cloud[:, 1].mean()) for cloud in shown.clouds])
     assert set(sides) == {-1, 1} and (np.sign(shown.view[:, 1]) == sides).all()
     assert all(MIN_POINTS <= len(a) <= len(b) for a, b in zip(shown.clouds, scan.clouds, strict=True))

@@ -115,6 +115,12 @@ def facing(pose: Pose | None) -> np.ndarray | None:
     return np.array([axis[1], -axis[0], 0.0]) / length
 
 
+def facing_yaw(pose: Pose | None) -> float:
+    """The angle about z, rad, of where a person looks, 0 where `facing` knows none."""
+    forward = facing(pose)
+    return 0.0 if forward is None else float(np.arctan2(forward[1], forward[0]))
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Box:
     """A person's box: center (3,) m, size (length, width, height) m, yaw rad about z. It may only crop.

@@ -85,7 +85,7 @@ def _demo(options: argparse.Namespace) -> None:
 
 
 def _synth(options: argparse.Namespace) -> None:
-    from lidarpose.data.dataset_card import counted
+    from lidarpose.data.dataset_card import content_count
     from lidarpose.synth.shard_job import Job, write_dataset
 
     if options.clips and options.scenes:
@@ -103,7 +103,7 @@ def _synth(options: argparse.Namespace) -> None:
             job, options.out, workers=options.workers, progress=lambda count, _: bar.update(count)
         )
     note = "" if num_written == job.count else f", {job.count - num_written:,} were there"
-    tell(f"{counted(num_written, job.what)} made{note} -> {options.out}")
+    tell(f"{content_count(num_written, job.what)} made{note} -> {options.out}")
 
 
 def _prepare(options: argparse.Namespace) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from lidarpose._version import __version__
 from lidarpose.data.rows import TABLES
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, counted
 from lidarpose.io.files import file_error, read_bytes, write_atomic
 from lidarpose.skeleton import BODY26, skeleton
 
@@ -19,9 +19,9 @@ SENSOR_FRAME = "level frame at the sensor: x forward, y left, z up"
 _SINGULAR = {"people": "person", "clips": "clip", "streets": "street", "parts": "part"}
 
 
-def counted(count: int, what: str) -> str:
+def content_count(count: int, what: str) -> str:
     """ "1 street", "1,200 people"."""
-    return f"{count:,} {_SINGULAR.get(what, what) if count == 1 else what}"
+    return counted(count, _SINGULAR.get(what, what), what)
 
 
 @dataclass(frozen=True, kw_only=True)

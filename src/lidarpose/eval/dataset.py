@@ -50,7 +50,6 @@ BENCHES = {
     BENCH: BenchFile("lidarpose-bench-1", "8abcafc6628c7580b8bdf91f9c05992c7c6e4098d6922973c7cfc39d8fe0e0d2"),
     "bench-2": BenchFile("lidarpose-bench-2", "872355263c4fc6de96e158c177ebb8694753ab5de5110013eb029a6152caf69d"),
 }
-BENCH_NAME, BENCH_SHA256 = BENCHES[BENCH]
 # the word for everybody, whatever split
 EVERYBODY = "all"
 # splits that are scored where none is named, the first that there is. Waymo's papers report on its validation folder
@@ -150,7 +149,7 @@ def count_skipped(skipped: Skipped, reason: str, where: object, count: int = 1) 
     skipped.setdefault(reason, {"count": 0, "first": str(where)})["count"] += count
 
 
-def spread(total: int, limit: int | None) -> np.ndarray:
+def evenly_drawn(total: int, limit: int | None) -> np.ndarray:
     """Indices of `limit` of `total` people, one of each equal share; of everybody without a limit. Drawn, always alike:
     equal steps would fall in step with the order of a dataset, as with the sensors of a bench."""
     count = total if limit is None else min(limit, total)
@@ -182,7 +181,7 @@ def _open_folder(folder: Path, split: str | None, limit: int | None) -> EvalData
     if not total:
         split_names = ", ".join(splits) or "no splits"
         raise file_error(folder, f"has nobody in the split {split!r}; there are {split_names}: say one as split")
-    people = people.iloc[spread(total, limit)]
+    people = people.iloc[evenly_drawn(total, limit)]
     source, _, leaks = str(card.about.get("split", "")).partition("; LEAKS: ")
     dataset_skeleton = skeleton(card.skeleton)
     return EvalDataset(
@@ -316,7 +315,7 @@ def _open_bench(key: str, split: str | None, limit: int | None) -> EvalDataset:
     bench = load_bench(key)
     total = len(bench.people)
     limit = limit if limit is not None and limit < total else None
-    rows = bench.people[spread(total, limit)]
+    rows = bench.people[evenly_drawn(total, limit)]
     if limit is None:
         rows = np.concatenate([rows, *bench.clips])
     return EvalDataset(

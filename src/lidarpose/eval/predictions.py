@@ -23,6 +23,7 @@ A row is one person in one frame; columns:
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -143,8 +144,8 @@ def concatenate(parts: Sequence[Predictions]) -> Predictions:
 # ---- poses.parquet
 
 
-def write_poses(path: str | Path, predictions: dict[str, Predictions]) -> None:
-    """Writes poses.parquet, people of all datasets by their names, into a file that nothing else writes."""
+def poses_parquet(predictions: dict[str, Predictions]) -> bytes:
+    """poses.parquet: people of all datasets by their names."""
     pa, parquet = pyarrow()
     types = [("dataset", pa.string())]
     for column in _COLUMNS:
@@ -160,7 +161,8 @@ def write_poses(path: str | Path, predictions: dict[str, Predictions]) -> None:
         [*types, ("error_mm", pa.list_(pa.float32()))],
         metadata={METADATA: json.dumps({"unit": "m", "datasets": dataset_entries})},
     )
-    with parquet.ParquetWriter(path, schema, compression="zstd", write_page_checksum=True) as writer:
+    buffer = BytesIO()
+    with parquet.ParquetWriter(buffer, schema, compression="zstd", write_page_checksum=True) as writer:
         for name, people in predictions.items():
             values: dict[str, Any] = {
                 "dataset": [name] * len(people),
@@ -174,6 +176,7 @@ def write_poses(path: str | Path, predictions: dict[str, Predictions]) -> None:
                     array = [None if is_null else row for is_null, row in zip(null_mask, flat, strict=True)]
                 values[column.name] = array
             writer.write_table(pa.Table.from_pydict(values, schema=schema))
+    return buffer.getvalue()
 
 
 def read_poses(path: str | Path) -> dict[str, Predictions]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.errors import InputError, MissingExtra
-from lidarpose.eval.dataset import BENCH, EvalSample, spread
+from lidarpose.eval.dataset import BENCH, EvalSample, evenly_drawn
 from lidarpose.eval.metrics.aggregate import interval, joint_groups, mean, paired_interval
 from lidarpose.eval.predictions import Predictions
 from lidarpose.eval.protocols import EvalSetup
@@ -236,7 +236,7 @@ def people_to_perturb(setup: EvalSetup) -> list[CroppedPerson]:
     if setup.setting.kind == BENCH:
         samples = [person for person in setup.dataset if person.condition == _CLEAN and not person.moving]
     else:
-        rows = set(spread(setup.dataset.count, PEOPLE).tolist())
+        rows = set(evenly_drawn(setup.dataset.count, PEOPLE).tolist())
         samples = [person for k, person in enumerate(setup.dataset) if k in rows]
     # who is not scored is not perturbed either
     pairs = [(setup.shown(person)[0], person) for person in samples]

@@ -5,7 +5,6 @@
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -19,12 +18,12 @@ from lidarpose.errors import InputError
 from lidarpose.eval.dataset import BENCH, Bench, EvalDataset, EvalSample, count_skipped, mean_poses, open_eval_dataset
 from lidarpose.eval.metric_rows import baseline_rows, metric_rows, person_rows
 from lidarpose.eval.metrics import aggregate
-from lidarpose.eval.predictions import Predictions, concatenate, write_poses
+from lidarpose.eval.predictions import Predictions, concatenate, poses_parquet
 from lidarpose.eval.protocols import EvalSetup, Model, eval_setup
 from lidarpose.eval.robustness import Stability, people_to_perturb, study, to_json
 from lidarpose.eval.scores import BASELINE, FILE, MetricRow, Result, Scores, Setting
 from lidarpose.inference.predictor import load
-from lidarpose.io.files import atomic_path, check_writable, content_digest, file_error, listed
+from lidarpose.io.files import check_writable, content_digest, file_error, listed, write_all_atomic
 from lidarpose.models import weights_path
 from lidarpose.models.checkpoint import runs_of
 from lidarpose.sample import UNLABELED
@@ -341,10 +340,8 @@ def write(run: Run, folder: str | os.PathLike) -> list[Path]:
     if run.studies:
         head = {"version": __version__, "command": scores.command, "seed": scores.seed, "weights": scores.weights}
         files["stability.json"] = to_json(run.studies, head=head).encode()
-    files = {name: content for name, content in files.items() if content}
-    with ExitStack() as stack:
-        poses = {evaluation.result.setting.dataset: evaluation.predictions for evaluation in run.evaluations}
-        write_poses(stack.enter_context(atomic_path(folder / "poses.parquet")), poses)
-        for name, content in files.items():
-            stack.enter_context(atomic_path(folder / name)).write_bytes(content)
-    return [folder / name for name in (*files, "poses.parquet")]
+    poses = {evaluation.result.setting.dataset: evaluation.predictions for evaluation in run.evaluations}
+    files["poses.parquet"] = poses_parquet(poses)
+    contents = {folder / name: content for name, content in files.items() if content}
+    write_all_atomic(contents)
+    return list(contents)

@@ -135,7 +135,7 @@ def search_alone(scan: Scan, search: Search) -> Scan:
     return replace(result, warnings=(*scan.warnings, hint))
 
 
-def other_up_axis(places: "Places", search: Search) -> str | None:
+def other_up_axis(places: "DetectedScan", search: Search) -> str | None:
     """A scan in which nobody was found -> a line for the user where people are found with another axis up."""
     input_scan, detections = places.given, places.detections
     if detections is None or detections.has_ground and flat_axis(places.scan.points) == input_scan.upright_axis:
@@ -151,7 +151,7 @@ def other_up_axis(places: "Places", search: Search) -> str | None:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Places:
+class DetectedScan:
     """A scan in which people were detected, but not verified: as given, and as it is searched; its points in the level
     frame (n, 3) m; the detections there, None of a scan without points; moving (n,) bool, where a background is known.
     """
@@ -163,7 +163,7 @@ class Places:
     moving: np.ndarray | None = None
 
 
-def detect_places(scan: Scan, search: Search) -> Places:
+def detect_places(scan: Scan, search: Search) -> DetectedScan:
     """The first half of `find_people`, which depends on no other frame."""
     full_scan, count = scan, len(scan.points)
     input_scan, notes = _thinned(scan, search)
@@ -171,7 +171,7 @@ def detect_places(scan: Scan, search: Search) -> Places:
     scan, warnings = input_scan, [*scan.warnings, *notes]
     if len(scan.points) < MIN_POINTS:
         scan = replace(scan, warnings=(*warnings, f"under {MIN_POINTS} points"))
-        return Places(given=input_scan, scan=scan, level=scan.points, detections=None)
+        return DetectedScan(given=input_scan, scan=scan, level=scan.points, detections=None)
     level = _leveled(scan)
     # what else looks odd follows from wrong axes or units
     if frame_warning := flat_along_another_axis(scan):
@@ -212,10 +212,10 @@ def detect_places(scan: Scan, search: Search) -> Places:
     if not (detections.has_ground or frame_warning):
         warnings.append("no ground was found, and people are searched without it: is the up axis right?")
     scan = replace(scan, warnings=tuple(warnings))
-    return Places(given=input_scan, scan=scan, level=level, detections=detections, moving=is_moving)
+    return DetectedScan(given=input_scan, scan=scan, level=level, detections=detections, moving=is_moving)
 
 
-def verify_people(places: Places, search: Search, known: KnownPlaces | None = None) -> Scan:
+def verify_people(places: DetectedScan, search: Search, known: KnownPlaces | None = None) -> Scan:
     """The second half of `find_people`. known: of a recording's frames before; with it the scan has `pelvises`,
     `verified` and `rejected`, too."""
     scan, input_scan, detections = places.scan, places.given, places.detections

@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, rotation_from_up
-from lidarpose.inference.detection import Places, Search, search_alone, search_options, verify_people
+from lidarpose.inference.detection import DetectedScan, Search, search_alone, search_options, verify_people
 from lidarpose.inference.inputs import as_origin
 from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.predictor import Predictor, load
@@ -96,7 +96,7 @@ def predictor_of(model: "Predictor | str | os.PathLike | Callable[[], Predictor]
 
 
 def predict_scan(
-    scan: "Scan | Places",
+    scan: "Scan | DetectedScan",
     model: "Callable[[], Predictor]",
     *,
     search: "Search | None" = None,

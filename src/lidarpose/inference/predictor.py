@@ -215,6 +215,8 @@ class Predictor(PoseEstimator):
             raise InputError(f"clips are for networks of clips, {self.model['name']} reads single frames")
         if find and boxes is not None:
             raise InputError("find is for people who are searched for: leave it away with boxes")
+        if clips is not None and (find or boxes is not None):
+            raise InputError("clips are of a list of clouds, each of one person: leave it away with boxes and find")
         if boxes is not None or find:
             cloud, notes = only_returns(as_points(points))
             origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)

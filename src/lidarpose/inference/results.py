@@ -12,7 +12,7 @@ from lidarpose.errors import counted
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
 from lidarpose.io.boxes import people_json
 from lidarpose.io.files import check_suffix, encodable, write_atomic
-from lidarpose.sample import JOINT_COLUMNS, PER_JOINT, Box, Pose, facing
+from lidarpose.sample import JOINT_COLUMNS, PER_JOINT, Box, Pose, facing_yaw
 from lidarpose.skeleton import Skeleton
 
 if TYPE_CHECKING:
@@ -360,8 +360,7 @@ def _box_around(person: PersonPose) -> Box | None:
     """The extent of a person's points, z up, the way the pose faces."""
     if not person.num_points:
         return None
-    forward = None if person.pose is None else facing(person.pose)
-    yaw = 0.0 if forward is None else float(np.arctan2(forward[1], forward[0]))
+    yaw = facing_yaw(person.pose)
     R_level_local = rotation_about("z", yaw)
     local_points = person.points @ R_level_local
     low, high = local_points.min(0), local_points.max(0)

@@ -13,11 +13,11 @@ import numpy as np
 from lidarpose.geometry import distance_to_segments, rotation_about, rows_near
 from lidarpose.inference.backend import Backend, OnnxBackend, Raw, estimates
 from lidarpose.inference.known_places import KnownPlaces
-from lidarpose.inference.tta import TTATransform, apply
+from lidarpose.inference.tta import IDENTITY, apply
 from lidarpose.models import DEFAULT, VERIFIER, weights_file
 from lidarpose.models.decode import decoder, sigmoid
 from lidarpose.models.detector.detector import Detections
-from lidarpose.sample import MIN_POINTS, Box, Pose, facing
+from lidarpose.sample import MIN_POINTS, Box, Pose, facing_yaw
 
 # rows (m,) of a scan's points that are on nobody, and where people are (K, 2) m -> who else is beside them
 DetectBeside = Callable[[np.ndarray, np.ndarray], Detections]
@@ -158,7 +158,7 @@ def _run(
     ordered = sorted(enough, key=lambda i: len(clouds[i]))
     for start in range(0, len(ordered), _BATCH):
         batch = ordered[start : start + _BATCH]
-        yield batch, backend.run(*apply(TTATransform(), [clouds[i] for i in batch], centers[batch], origin))
+        yield batch, backend.run(*apply(IDENTITY, [clouds[i] for i in batch], centers[batch], origin))
 
 
 def _highest_score(detections: Detections, header: dict) -> np.ndarray:
@@ -236,7 +236,7 @@ def verified(
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Places:
+class _Assessed:
     """What is known of D detections: scores and logits (D,), see `final_score`, NaN where they were not looked at;
     mounted (D,), the probability; joints (D, J, 3) and pelvises (D, 3) m, NaN of who is not posed; near_rows: of each
     the rows of the points about it."""
@@ -248,7 +248,7 @@ class _Places:
     pelvises: np.ndarray
     near_rows: list[np.ndarray]
 
-    def joined(self, other: "_Places", other_rows: np.ndarray) -> "_Places":
+    def joined(self, other: "_Assessed", other_rows: np.ndarray) -> "_Assessed":
         """These, then the others, which know the points of some rows alone."""
         near_rows = self.near_rows + [other_rows[rows] for rows in other.near_rows]
         arrays = {
@@ -256,7 +256,7 @@ class _Places:
             for name, values in vars(self).items()
             if name != "near_rows"
         }
-        return _Places(**arrays, near_rows=near_rows)
+        return _Assessed(**arrays, near_rows=near_rows)
 
 
 def _assessed(
@@ -267,7 +267,7 @@ def _assessed(
     posed_from: np.ndarray,
     max_people: int | None,
     rows: np.ndarray,
-) -> _Places:
+) -> _Assessed:
     """Verifies the detections of some rows, and poses those whose scores are at least `posed_from` (D,); where that is
     infinite nobody is verified."""
     near_rows = [np.zeros(0, int)] * len(detections)
@@ -282,13 +282,13 @@ def _assessed(
         posed_rows = posed_rows[_surest_first(scores[posed_rows], logits[posed_rows])][: _PLACES * max_people]
     poses = crops.poses(posed_rows)
     pelvises = poses.joints[:, poses.skeleton.index("pelvis")].copy()
-    return _Places(
+    return _Assessed(
         scores=scores, logits=logits, mounted=mounted, joints=poses.joints, pelvises=pelvises, near_rows=near_rows
     )
 
 
 def _with_hidden(
-    places: _Places,
+    places: _Assessed,
     known_boxes: dict[int, Box],
     points: np.ndarray,
     origin: np.ndarray | None,
@@ -296,7 +296,7 @@ def _with_hidden(
     least_score: float,
     max_people: int | None,
     detect_beside: DetectBeside,
-) -> _Places:
+) -> _Assessed:
     """The places, and then those beside sure people, of what is left without these people's points."""
     sure_pelvises = np.where(places.scores[:, None] >= _SURE_SCORE, places.pelvises, np.nan)
     people = _boxed(replace(places, pelvises=sure_pelvises), points, _SURE_SCORE, None, known_boxes)
@@ -312,7 +312,7 @@ def _with_hidden(
 
 
 def _on_people(
-    places: _Places, people: list[tuple[int, Box, np.ndarray]], points: np.ndarray, known_boxes: dict[int, Box]
+    places: _Assessed, people: list[tuple[int, Box, np.ndarray]], points: np.ndarray, known_boxes: dict[int, Box]
 ) -> np.ndarray:
     """(n,) bool: which points are on the bodies of people, as of `_boxed`, or in the boxes of known ones."""
     is_body = np.zeros(len(points), bool)
@@ -330,7 +330,7 @@ def _on_people(
 
 
 def _without_repeats(
-    people: list[tuple[int, Box, np.ndarray]], places: _Places, points: np.ndarray, origin: np.ndarray | None
+    people: list[tuple[int, Box, np.ndarray]], places: _Assessed, points: np.ndarray, origin: np.ndarray | None
 ) -> list[tuple[int, Box, np.ndarray]]:
     """The people as of `_boxed`, without those whom the points in their boxes alone show where a surer one is: what is
     left of somebody's points may look like one more beside them."""
@@ -351,7 +351,7 @@ def _without_repeats(
 
 
 def _boxed(
-    places: _Places, points: np.ndarray, least_score: float, max_people: int | None, known_boxes: dict[int, Box]
+    places: _Assessed, points: np.ndarray, least_score: float, max_people: int | None, known_boxes: dict[int, Box]
 ) -> list[tuple[int, Box, np.ndarray]]:
     """The different people of places that have a pelvis, the surest first: rows, boxes, and rows of their points; of
     known people, by row, the boxes where they are expected."""
@@ -382,8 +382,7 @@ def _boxed(
 def box_about(pose: Pose, nearest_distance: float) -> Box:
     """The box of a person by the pose, joints (J, 3) m; nearest_distance: to the next person, m, who is to be kept
     out."""
-    forward = facing(pose)
-    yaw = 0.0 if forward is None else float(np.arctan2(forward[1], forward[0]))
+    yaw = facing_yaw(pose)
     R_level_local = rotation_about("z", yaw)
     local_joints = pose.joints @ R_level_local
     margin = max(_LEAST_ROOM, min(_ROOM, nearest_distance / 2 - _HALF_BODY))

@@ -320,9 +320,9 @@ class JointHead(nn.Module):
 
 class PersonHead(nn.Module):
     """Whether a crop shows a person, and a second one: from the means of anchors and voxels and what the joints' head
-    says of every joint. detached: it learns nothing of its inputs, which are the joints' alone."""
+    says of every joint. detach_inputs: no gradient reaches its inputs, which are the joints' alone."""
 
-    detached = True
+    detach_inputs = True
 
     def __init__(self, channels: int, voxel_channels: int, joints: int):
         super().__init__()
@@ -336,6 +336,6 @@ class PersonHead(nn.Module):
         weight = valid.to(voxels.dtype)[..., None]
         mean = (voxels * weight).sum(1) / weight.sum(1).clamp(min=1)
         inputs = [torch.cat([anchors.mean(1), mean], -1), *certainty]
-        if self.detached:
+        if self.detach_inputs:
             inputs = [value.detach() for value in inputs]
         return self.out(self.hidden(torch.cat([self.norm(inputs[0]), *inputs[1:]], -1)))

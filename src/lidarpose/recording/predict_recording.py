@@ -11,7 +11,7 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_from_up
-from lidarpose.inference.detection import Places, detect_places, least_score, other_up_axis, search_options
+from lidarpose.inference.detection import DetectedScan, detect_places, least_score, other_up_axis, search_options
 from lidarpose.inference.inputs import as_origin, only_returns
 from lidarpose.inference.predict_scan import check_choice, is_wide, predict_scan, predictor_of
 from lidarpose.inference.predictor import Predictor
@@ -189,7 +189,7 @@ class FramePredictor:
     def predict_all(self, frames: Iterator[Frame | DamagedFrame]) -> Iterator[FramePoses]:
         """The people of the next frames; while one is posed the one after is read and searched."""
 
-        def prepare() -> tuple[Frame | DamagedFrame, Scan | Places | InputError] | None:
+        def prepare() -> tuple[Frame | DamagedFrame, Scan | DetectedScan | InputError] | None:
             frame = next(frames, None)
             return None if frame is None else (frame, self._prepared(frame))
 
@@ -203,7 +203,7 @@ class FramePredictor:
         """The people of the next frame."""
         return self._predicted(frame, self._prepared(frame))
 
-    def _prepared(self, frame: Frame | DamagedFrame) -> Scan | Places | InputError:
+    def _prepared(self, frame: Frame | DamagedFrame) -> Scan | DetectedScan | InputError:
         """What depends on no other frame: the scan, searched where people are searched for; or what is wrong."""
         if isinstance(frame, DamagedFrame):
             return InputError(frame.error)
@@ -213,7 +213,7 @@ class FramePredictor:
         except InputError as error:
             return error
 
-    def _predicted(self, frame: Frame | DamagedFrame, prepared_scan: Scan | Places | InputError) -> FramePoses:
+    def _predicted(self, frame: Frame | DamagedFrame, prepared_scan: Scan | DetectedScan | InputError) -> FramePoses:
         no_poses = Poses(people=(), skeleton=self.wanted, model=self.predictor.model, source=self.name)
         frame_poses = partial(FramePoses, index=frame.index, id=frame.id, time=frame.time, is_tracked=self.is_tracked)
         if isinstance(frame, DamagedFrame):
@@ -225,7 +225,7 @@ class FramePredictor:
         try:
             if isinstance(prepared_scan, InputError):
                 raise prepared_scan
-            search = self._search if isinstance(prepared_scan, Places) else None
+            search = self._search if isinstance(prepared_scan, DetectedScan) else None
             if people is not None and search is not None:
                 known_places = people.expected(time, T_fixed_sensor)
             scan, poses = predict_scan(
@@ -233,7 +233,7 @@ class FramePredictor:
             )
         except InputError as error:
             return frame_poses(poses=no_poses, error=str(error))
-        if isinstance(prepared_scan, Places) and not self._was_searched:
+        if isinstance(prepared_scan, DetectedScan) and not self._was_searched:
             self._was_searched = True
             if not len(poses) and (hint := other_up_axis(prepared_scan, self._search)):
                 poses = replace(poses, warnings=(*poses.warnings, hint))

@@ -65,14 +65,14 @@ class ScanPeople:
 class ScanPeopleSource(SceneSource[ScanPeople, Example]):
     """One person of a scan at a time, changed a little."""
 
-    def made(self, number: int) -> ScanPeople:
+    def load_scene(self, number: int) -> ScanPeople:
         for attempt in range(_TRIES):
             people = scan_people(self.seed, number + attempt * _STRIDE)
             if people.boxes:
                 break
         return people
 
-    def shown(self, scan: ScanPeople, rng: np.random.Generator) -> Example:
+    def draw_example(self, scan: ScanPeople, rng: np.random.Generator) -> Example:
         return person_example(scan, int(rng.integers(len(scan.boxes))), rng)
 
 

@@ -155,9 +155,9 @@ def _verification(recipe: TrainVerifier) -> TrainSetup:
 
     def network() -> nn.Module:
         verifier = expand_weights(trained, config)
-        # poses do not matter to it
         assert verifier.person is not None
-        verifier.person.detached = False
+        # whether somebody is there is all that it is to tell: the whole network learns by it
+        verifier.person.detach_inputs = False
         return verifier
 
     return TrainSetup(

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.data.dataset_card import CARD, counted
+from lidarpose.data.dataset_card import CARD, content_count
 from lidarpose.data.shards import DatasetReader, open_dataset
 from lidarpose.errors import InputError
 from lidarpose.io.files import check_apart, file_error
@@ -39,7 +39,7 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
     path = Path(out) if out is not None else Path(f"{name}.{'html' if html else 'png'}")
     check_apart(path, dataset.folder / CARD, *dataset.folder.glob("*.parquet"))
     settings = dataset.card.settings
-    title = f"{name}: {counted(dataset.card.count, settings.get('what', 'people'))}"
+    title = f"{name}: {content_count(dataset.card.count, settings.get('what', 'people'))}"
     if "scene" in settings:
         title += f", scene {settings['scene']}"
     if (num_written := len(dataset.written())) < dataset.card.shards:
@@ -99,6 +99,7 @@ def _street_panel(rows: list[dict], dataset: DatasetReader) -> ScanPanel:
     # everybody is in every frame
     boxes = np.stack([row["box"].reshape(-1, 7) for row in rows if len(row["box"]) == len(first_row["box"])])
     joints = first_row["joints"].reshape(len(first_row["track"]), -1, 3)
+    people = content_count(len(joints), "people")
     return ScanPanel(
         points=first_row["points"].reshape(-1, 3),
         boxes=[
@@ -108,7 +109,7 @@ def _street_panel(rows: list[dict], dataset: DatasetReader) -> ScanPanel:
         poses=Pose(joints=joints, skeleton=skeleton(dataset.card.skeleton)) if len(joints) else None,
         labeled=True,
         tracks=list(boxes[:, :, :2].swapaxes(0, 1)),
-        label=f"#{first_row['index']} {first_row['sensor']}: {counted(len(joints), 'people')}, {len(rows)} frames",
+        label=f"#{first_row['index']} {first_row['sensor']}: {people}, {len(rows)} frames",
     )
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.eval.dataset import spread
+from lidarpose.eval.dataset import evenly_drawn
 from lidarpose.inference.checks import rows_inside
 from lidarpose.inference.inputs import as_origin, only_returns
 from lidarpose.io.boxes import read_boxes
@@ -71,7 +71,7 @@ class ScanSet:
 def heldout_scans(limit: int | None = None) -> ScanSet:
     """The frozen scenes with kinds of things, rooms and poses that no detector was trained on."""
     content = json.loads((resources.files("lidarpose.eval") / "assets" / _HELDOUT_FILE).read_text("utf-8"))
-    rows = spread(len(content["indices"]), limit)
+    rows = evenly_drawn(len(content["indices"]), limit)
     scenes = [(content["seed"], content["indices"][k], content["family"], content["sha256"][k]) for k in rows]
     return ScanSet(name=HELDOUT, loaders=[partial(synthetic_scan, *scene) for scene in scenes])
 
@@ -120,9 +120,8 @@ def labeled_scans(folder: str | os.PathLike, limit: int | None = None) -> ScanSe
         if cloud is None:
             raise file_error(path, f"expected its scan beside it, {path.stem} with {' '.join(SUFFIXES)}, got none")
     pairs = list(zip(labels, clouds, strict=True))
-    return ScanSet(
-        name=folder.resolve().name, loaders=[partial(_read_scan, *pairs[k]) for k in spread(len(pairs), limit).tolist()]
-    )
+    rows = evenly_drawn(len(pairs), limit).tolist()
+    return ScanSet(name=folder.resolve().name, loaders=[partial(_read_scan, *pairs[k]) for k in rows])
 
 
 def _read_scan(labels: Path, cloud: Path) -> LabeledScan:

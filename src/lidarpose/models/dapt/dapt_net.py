@@ -158,17 +158,14 @@ class DaptNet(nn.Module):
             voted=voted,
         )
 
-    def batch(
-        self, clouds: list[np.ndarray], *, layout: str | None = None, rng: np.random.Generator | None = None
-    ) -> Tables[Tensor]:
+    def batch(self, clouds: list[np.ndarray], *, layout: str | None = None) -> Tables[Tensor]:
         """Clouds (n, 3) m, each in its person's frame, as the network's device and precision read them.
 
-        layout and rng as in `build_tables`; None takes the layout that suits the device.
+        layout: as in `build_tables`; None takes the one that suits the device.
         """
         parameter = next(self.parameters())
         layout = layout or ("ragged" if parameter.device.type == "cpu" else "padded")
-        tables = build_tables(clouds, self.config, layout=layout, rng=rng)
-        return to_tensors(tables, parameter.device, parameter.dtype)
+        return to_tensors(build_tables(clouds, self.config, layout=layout), parameter.device, parameter.dtype)
 
     def outputs(self, clouds: list[np.ndarray]) -> dict[str, np.ndarray]:
         """Raw results, in evaluation mode, of people's clouds (n, 3) m, each in its person's frame.

@@ -93,11 +93,10 @@ def build_tables(
     """Tables of people's clouds, each (n, 3) m in its person's frame, n = 0 included.
 
     layout: "ragged", pair lists and one patch after the other, for CPUs; "padded", gather tables and one block of
-    patches, for accelerators: the same results. One point a voxel is kept and curves go from block to block in the
-    configuration's order; with `rng` the point is a random one and the curves are shuffled, as in training; without, it
-    is the one nearest the voxel's middle. Cells are floor(p / grid); with `config.legacy` the cloud's own minimum is
-    subtracted, so that an outlier decides which voxels share a parent. Raises InputError for clouds wider than the
-    cells can count, and for more people than a batch can hold.
+    patches, for accelerators: the same results. Of each voxel the point nearest its middle is kept. Curves go from
+    block to block in the configuration's order, with `rng` in a random one, as in training. Cells are floor(p / grid);
+    with `config.legacy` the cloud's own minimum is subtracted, so that an outlier decides which voxels share a parent.
+    Raises InputError for clouds wider than the cells can count, and for more people than a batch can hold.
     """
     check_name("layout", layout, LAYOUTS)
     if not 1 <= len(clouds) < _MOST_PEOPLE:
@@ -111,7 +110,7 @@ def build_tables(
     cells = _cells(points, lengths, config)
     key = person << (3 * _WIDE) | z_order(cells)
 
-    rows, point_voxel = _one_a_voxel(key, points, config.grid, rng)
+    rows, point_voxel = _one_a_voxel(key, points, config.grid)
     key, cells = key[rows], cells[rows]
     levels: list[Level[np.ndarray]] = []
     stem = _neighbors(key, cells, 2, 0, layout)
@@ -157,19 +156,14 @@ def _cells(points: np.ndarray, lengths: np.ndarray, config: DaptConfig) -> np.nd
     return cells.astype(np.int64)
 
 
-def _one_a_voxel(
-    key: np.ndarray, points: np.ndarray, grid: float, rng: np.random.Generator | None
-) -> tuple[np.ndarray, np.ndarray]:
+def _one_a_voxel(key: np.ndarray, points: np.ndarray, grid: float) -> tuple[np.ndarray, np.ndarray]:
     """Indices (M,) of one point a voxel, in order of the keys, and each point's voxel."""
     order = np.argsort(key, kind="stable")
     _, starts, voxel = _grouped(key[order])
     if len(starts) < len(key):
-        # of several points the random or the nearest one comes first; coordinates settle ties, whatever the input order
-        if rng is not None:
-            order = np.lexsort((rng.random(len(key)), key))
-        else:
-            offset = (points / grid - np.floor(points / grid) - 0.5).astype(np.float64)
-            order = np.lexsort((*points.T, (offset**2).sum(1), key))
+        # of several points the nearest one comes first; coordinates settle ties, whatever the input order
+        offset = (points / grid - np.floor(points / grid) - 0.5).astype(np.float64)
+        order = np.lexsort((*points.T, (offset**2).sum(1), key))
     point_voxel = np.empty(len(key), np.int64)
     point_voxel[order] = voxel
     return order[starts], point_voxel

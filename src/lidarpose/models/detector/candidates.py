@@ -31,6 +31,8 @@ CHUNK = 64
 _LEAST_DISTANCE = 0.5
 # heights above the ground: of the slices whose filling is counted, and what is near the ground, m
 _BAND, _BAND_SLICES, _NEAR_GROUND = (0.3, 2.1), 6, 0.2
+# of each byte the ones; numpy counts them from 2.0 on
+_BIT_COUNTS = np.array([byte.bit_count() for byte in range(256)], np.uint8)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -240,7 +242,7 @@ def _draw_maps(cells: np.ndarray, heights: np.ndarray, shape: tuple[int, ...]) -
     np.bitwise_or.at(slice_bits, cells[band], np.left_shift(np.uint8(1), np.minimum(level, _BAND_SLICES - 1)))
     maps = np.empty((size + 1, CONTEXT_CHANNELS), np.uint8)
     maps[:, 0] = np.minimum(highest * (255 / _TALL), 255)
-    maps[:, 1] = np.bitwise_count(slice_bits) * (255 / _BAND_SLICES)
+    maps[:, 1] = _BIT_COUNTS[slice_bits] * (255 / _BAND_SLICES)
     maps[:, 2], maps[:, 3] = log_bytes(count), log_bytes(near_count)
     return maps.view(np.uint32).ravel()
 

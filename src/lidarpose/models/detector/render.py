@@ -14,7 +14,6 @@ of an unknown sensor, x and y are the level frame's. Inputs, K candidates first:
 """
 
 from dataclasses import dataclass, fields
-from math import pi
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from lidarpose.models.detector.range_image import BOTTOM, CELL, RANGE_CHANNELS, 
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Augmentation:
+class CandidateAugmentation:
     """How candidates are changed in training. Of points in the view frame, in this order: mirror, turn, scale, shift.
 
     Each field is an array with an entry for each of K candidates, or one value for all. turn rad about z; mirror: y to
@@ -41,11 +40,11 @@ class Augmentation:
     drop_origin: Any = False
     seed: Any = 0
 
-    def over(self, count: int) -> "Augmentation":
+    def over(self, count: int) -> "CandidateAugmentation":
         """The same, with an entry for each of so many candidates."""
         shapes = {"shift": (count, 2)}
         values = {f.name: np.broadcast_to(getattr(self, f.name), shapes.get(f.name, (count,))) for f in fields(self)}
-        return Augmentation(**values)
+        return CandidateAugmentation(**values)
 
     @property
     def matrix(self) -> np.ndarray:
@@ -55,30 +54,13 @@ class Augmentation:
         return np.stack([np.stack([c, -s * sign], -1), np.stack([s, c * sign], -1)], -2)
 
     def apply(self, places: np.ndarray) -> np.ndarray:
-        """places (K, 3) m, one a candidate, mirrored, turned, scaled and shifted."""
+        """x and y (K, 2) m of places, one a candidate, mirrored, turned, scaled and shifted."""
         augmentation = self.over(len(places))
-        xy = (augmentation.matrix @ places[:, :2, None])[..., 0] + augmentation.shift
-        return np.column_stack([xy, places[:, 2] * augmentation.scale])
-
-
-def draw_augmentation(rng: np.random.Generator, count: int, *, drop_origin: float = 0.15) -> Augmentation:
-    """A random one for each of `count` candidates; in a share `drop_origin` the sensor is dropped, and the turn is any
-    instead of small."""
-    rows = []
-    for _ in range(count):
-        is_dropped = rng.random() < drop_origin
-        row: dict[str, Any] = {
-            "turn": rng.uniform(-pi, pi) if is_dropped else rng.normal(0, 0.1),
-            "mirror": rng.random() < 0.5,
-        }
-        row |= {"scale": rng.uniform(0.92, 1.08), "shift": rng.uniform(-0.1, 0.1, 2)}
-        row |= {"keep": rng.uniform(0.25, 1.0) if rng.random() < 0.6 else 1.0, "noise": rng.uniform(0, 0.025)}
-        rows.append(row | {"drop_origin": is_dropped, "seed": rng.integers(2**63)})
-    return Augmentation(**{name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())})
+        return (augmentation.matrix @ places[..., None])[..., 0] + augmentation.shift
 
 
 def render(
-    candidates: Candidates, augmentation: Augmentation | None = None, *, fine: np.ndarray | None = None
+    candidates: Candidates, augmentation: CandidateAugmentation | None = None, *, fine: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
     """The network's inputs, float32: see the module. fine: memory (K, 28, 24, 24) float32 for that input."""
     has_sensor, count = candidates.distance > 0, candidates.count
@@ -105,7 +87,7 @@ def render(
 
 
 def _moved_points(
-    points: np.ndarray, owner: np.ndarray, sizes: np.ndarray, change: Augmentation
+    points: np.ndarray, owner: np.ndarray, sizes: np.ndarray, change: CandidateAugmentation
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points (3, n) float32 m of owners (n,), `sizes` (K,) of each, as they are changed, and the owners of those that
     are kept."""
@@ -138,7 +120,7 @@ def _fine(points: np.ndarray, owner: np.ndarray, weight: np.ndarray, fine: np.nd
     return fine
 
 
-def _range_views(pixels: np.ndarray, has_sensor: np.ndarray, change: Augmentation | None) -> np.ndarray:
+def _range_views(pixels: np.ndarray, has_sensor: np.ndarray, change: CandidateAugmentation | None) -> np.ndarray:
     views = np.zeros((len(has_sensor), RANGE_CHANNELS, SLICES, SIDE), np.float32)
     pixels = pixels[has_sensor]
     if change is None:
@@ -172,7 +154,7 @@ def _lose_returns(views: np.ndarray, share: np.ndarray, seeds: list[int]) -> Non
     views[:, 2:] = np.where(views[:, 2:] > 0, np.maximum(views[:, 2:] + byte_offset[:, None], 1), 0)
 
 
-def _moved_contexts(contexts: np.ndarray, change: Augmentation) -> np.ndarray:
+def _moved_contexts(contexts: np.ndarray, change: CandidateAugmentation) -> np.ndarray:
     side = (np.arange(CONTEXT_SIDE) - (CONTEXT_SIDE - 1) / 2) * CONTEXT_CELL
     target = np.stack(np.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
     source = (target - change.shift[:, None]) @ np.swapaxes(np.linalg.inv(change.matrix), 1, 2)

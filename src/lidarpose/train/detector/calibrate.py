@@ -29,7 +29,7 @@ DETECTOR = "detector.onnx"
 # a seed of which neither a run nor a bench has scans
 _SEED = 2**31 - 11
 # false people a scan at the default score
-FALSE = 1.0
+FALSE_PER_SCAN = 1.0
 # who is less likely is not posed to learn what scores mean
 _LEAST_SCORE = 0.01
 # of the logistic, on standardized features; of the piecewise linear curve, its knots at most
@@ -39,8 +39,8 @@ _RIDGE, _KNOTS = 1e-3, 16
 def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = None) -> Path:
     """Writes the detector of a run, its scores calibrated on so many scans, and returns its path.
 
-    labeled: a folder of labeled real scans, see `labeled_scans`; there too the default score lets at most `FALSE` false
-    people a scan pass. Raises InputError where a folder holds no detector or no scans.
+    labeled: a folder of labeled real scans, see `labeled_scans`; there too the default score lets at most
+    `FALSE_PER_SCAN` false people a scan pass. Raises InputError where a folder holds no detector or no scans.
     """
     check_int("--calibrate", scans, least=1)
     path = Path(folder) / MODEL
@@ -70,7 +70,7 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
     export_detector(network, out, card=card)
     if labeled is not None:
         (result,), _ = run_detector(weights=out, heldout=False, folders=[labeled], max_range=MAX_RANGE)
-        card |= {"default_score": max(card["default_score"], result.thresholds[f"{FALSE:g}"])}
+        card |= {"default_score": max(card["default_score"], result.thresholds[f"{FALSE_PER_SCAN:g}"])}
         export_detector(network, out, card=card | {"labeled_scans": result.scans})
     return out
 
@@ -99,8 +99,8 @@ def fit(tables: Sequence[ScanTable]) -> dict:
     """The entries "calibration", "verification" and "default_score" of a header.
 
     What is learned to be told from mistakes are all detections of people: of those of one person all but one go later,
-    and are no mistakes. What the score means, and the default score, which lets `FALSE` false people a scan pass, is
-    fitted to those that are left.
+    and are no mistakes. What the score means, and the default score, which lets `FALSE_PER_SCAN` false people a scan
+    pass, is fitted to those that are left.
     """
     features = np.concatenate([table.features for table in tables])
     is_near = np.concatenate([table.is_near() for table in tables])
@@ -123,9 +123,9 @@ def fit(tables: Sequence[ScanTable]) -> dict:
 
 
 def passing_score(false: np.ndarray, scans: int) -> float:
-    """The score that lets `FALSE` false people a scan pass. false (D,): scores of all of them in so many scans."""
+    """The score that lets `FALSE_PER_SCAN` false people a scan pass. false (D,): scores of all in so many scans."""
     false = np.sort(false)[::-1]
-    last = min(round(FALSE * scans), len(false) - 1)
+    last = min(round(FALSE_PER_SCAN * scans), len(false) - 1)
     # between the last false one that passes and the first that does not
     return float(false[last - 1 : last + 1].mean()) if last > 0 else 0.5
 

@@ -10,7 +10,8 @@ Legend: K candidates, P people of a scan.
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Generic, TypeVar
+from math import pi
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from lidarpose.models.detector.candidates import Candidates, SceneIndex
 from lidarpose.models.detector.detector import BEYOND, MAX_RANGE
 from lidarpose.models.detector.ground import estimate_ground, estimate_up, without_ground
 from lidarpose.models.detector.proposals import heights_above, propose
-from lidarpose.models.detector.render import Augmentation, draw_augmentation
+from lidarpose.models.detector.render import CandidateAugmentation
 from lidarpose.synth.detection_scene import DetectionScene, detection_scene
 from lidarpose.synth.scene import RandomStream
 
@@ -35,20 +36,20 @@ NEGATIVES = 64
 # scans to validate on
 VALIDATION = 30
 # `Labels.person` of nobody's candidates and of those that teach nothing
-NOBODY, UNCLEAR = -1, -2
+NOBODY, IGNORE = -1, -2
 # what boxes have beyond the body on each side, m
 _MARGIN = 0.05
 
-Scan = TypeVar("Scan")
-Shown = TypeVar("Shown")
+SceneT = TypeVar("SceneT")
+ExampleT = TypeVar("ExampleT")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Labels:
     """What is true of K candidates.
 
-    person (K,) int: index into the scene's boxes, `NOBODY` or `UNCLEAR`; of people's candidates also center (K, 3): of
-    the person, x and y in the view frame about the candidate, z the ground, m; foot (K,): lowest point above the ground
+    person (K,) int: index into the scene's boxes, `NOBODY` or `IGNORE`; of people's candidates also center (K, 2): of
+    the person, x and y in the view frame about the candidate, m; foot (K,): lowest point above the ground
     at the candidate; height (K,) m; mounted (K,) bool. All float32 but for those named.
     """
 
@@ -68,7 +69,7 @@ class DetectorExample:
 
     candidates: Candidates
     labels: Labels
-    augmentation: Augmentation | None = None
+    augmentation: CandidateAugmentation | None = None
 
     @property
     def size(self) -> int:
@@ -78,7 +79,7 @@ class DetectorExample:
 def labels_of(candidates: Candidates, scene: DetectionScene) -> Labels:
     """What is true of the candidates of a scene."""
     count, centers, yaw = len(candidates), candidates.centers, candidates.yaw
-    center, foot, height = np.zeros((count, 3), np.float32), np.zeros(count, np.float32), np.zeros(count, np.float32)
+    center, foot, height = np.zeros((count, 2), np.float32), np.zeros(count, np.float32), np.zeros(count, np.float32)
     person, mounted = np.full(count, NOBODY), np.zeros(count, bool)
     if count and scene.boxes:
         true_centers = np.stack([box.center for box in scene.boxes])
@@ -88,7 +89,7 @@ def labels_of(candidates: Candidates, scene: DetectionScene) -> Labels:
         nearest_box, rows = distance.argmin(1), np.arange(count)
         point_counts = np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes))
         min_distance = distance[rows, nearest_box]
-        person[min_distance <= IGNORED] = UNCLEAR
+        person[min_distance <= IGNORED] = IGNORE
         is_near = (min_distance <= POSITIVE) | ((min_distance <= IGNORED) & (distance.argmin(0)[nearest_box] == rows))
         is_found = is_near & (point_counts[nearest_box] >= LEAST_POINTS)
         person[is_found] = nearest_box[is_found]
@@ -101,7 +102,23 @@ def labels_of(candidates: Candidates, scene: DetectionScene) -> Labels:
     return Labels(person=person, center=center, foot=foot, height=height, mounted=mounted)
 
 
-def moved(labels: Labels, augmentation: Augmentation) -> Labels:
+def draw_augmentation(rng: np.random.Generator, count: int) -> CandidateAugmentation:
+    """A random one for each of `count` candidates; in a share `DROP_ORIGIN` the sensor is dropped, and the turn is any
+    instead of small."""
+    rows = []
+    for _ in range(count):
+        is_dropped = rng.random() < DROP_ORIGIN
+        row: dict[str, Any] = {
+            "turn": rng.uniform(-pi, pi) if is_dropped else rng.normal(0, 0.1),
+            "mirror": rng.random() < 0.5,
+        }
+        row |= {"scale": rng.uniform(0.92, 1.08), "shift": rng.uniform(-0.1, 0.1, 2)}
+        row |= {"keep": rng.uniform(0.25, 1.0) if rng.random() < 0.6 else 1.0, "noise": rng.uniform(0, 0.025)}
+        rows.append(row | {"drop_origin": is_dropped, "seed": rng.integers(2**63)})
+    return CandidateAugmentation(**{name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())})
+
+
+def moved(labels: Labels, augmentation: CandidateAugmentation) -> Labels:
     """The labels of candidates that are changed so."""
     scale = np.asarray(augmentation.scale, np.float32)
     center = augmentation.apply(labels.center).astype(np.float32)
@@ -109,7 +126,7 @@ def moved(labels: Labels, augmentation: Augmentation) -> Labels:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneSource(ABC, Generic[Scan, Shown]):
+class SceneSource(ABC, Generic[SceneT, ExampleT]):
     """Each scene of `detection_scene` of a seed `uses` times, `lag` scenes between two times.
 
     Scene j is example uses * j the first time. Where no scene is old enough yet, a younger one stands in.
@@ -120,48 +137,48 @@ class SceneSource(ABC, Generic[Scan, Shown]):
     lag: int
 
     @abstractmethod
-    def made(self, number: int) -> Scan:
+    def load_scene(self, number: int) -> SceneT:
         """What is learned from in a scene."""
 
     @abstractmethod
-    def shown(self, scan: Scan, rng: np.random.Generator) -> Shown:
+    def draw_example(self, scan: SceneT, rng: np.random.Generator) -> ExampleT:
         """An example of it, drawn anew."""
 
     def __getstate__(self) -> dict:
         return {name: value for name, value in vars(self).items() if name != "_kept"}
 
     @cached_property
-    def _kept(self) -> dict[int, Scan]:
+    def _kept(self) -> dict[int, SceneT]:
         """The scans of this process by their numbers."""
         return {}
 
-    def example(self, index: int) -> Shown:
+    def example(self, index: int) -> ExampleT:
         newest_scene, use = divmod(index, self.uses)
         number = newest_scene - use * self.lag
         scan = self._scan(newest_scene // (use + 1) if number < 0 else number, newest_scene)
-        return self.shown(scan, np.random.default_rng([self.seed, RandomStream.CANDIDATES, index]))
+        return self.draw_example(scan, np.random.default_rng([self.seed, RandomStream.CANDIDATES, index]))
 
-    def _scan(self, number: int, newest_scene: int) -> Scan:
+    def _scan(self, number: int, newest_scene: int) -> SceneT:
         scans = self._kept
         if number not in scans:
             for old_number in [old_number for old_number in scans if old_number < newest_scene - self.uses * self.lag]:
                 del scans[old_number]
-            scans[number] = self.made(number)
+            scans[number] = self.load_scene(number)
         return scans[number]
 
 
 class CandidateSource(SceneSource[DetectorExample, DetectorExample]):
     """Candidates of scenes: all of people, and some of nobody."""
 
-    def made(self, number: int) -> DetectorExample:
+    def load_scene(self, number: int) -> DetectorExample:
         return scan_example(self.seed, number)
 
-    def shown(self, scan: DetectorExample, rng: np.random.Generator) -> DetectorExample:
+    def draw_example(self, scan: DetectorExample, rng: np.random.Generator) -> DetectorExample:
         person = scan.labels.person
         negatives = np.flatnonzero(person == NOBODY)
         negatives = rng.choice(negatives, min(NEGATIVES, len(negatives)), replace=False)
         rows = np.concatenate([np.flatnonzero(person >= 0), np.sort(negatives)])
-        augmentation = draw_augmentation(rng, len(rows), drop_origin=DROP_ORIGIN)
+        augmentation = draw_augmentation(rng, len(rows))
         labels = moved(scan.labels.take(rows), augmentation)
         return DetectorExample(candidates=scan.candidates.take(rows), labels=labels, augmentation=augmentation)
 

@@ -14,7 +14,7 @@ from lidarpose.inference.tta import IDENTITY, apply
 from lidarpose.inference.verification import AROUND, inside_column
 from lidarpose.models.detector.detector import MAX_RANGE, Detector
 from lidarpose.sample import MIN_POINTS
-from lidarpose.train.detector.candidate_source import NOBODY, UNCLEAR, SceneSource, scene_to_search
+from lidarpose.train.detector.candidate_source import IGNORE, NOBODY, SceneSource, scene_to_search
 
 # a detection nearer than this to a person is of that person; beyond the second distance, with at most this share of its
 # points on people, it is of nobody; others teach nothing, m
@@ -51,10 +51,10 @@ class CropExample:
 class CropSource(SceneSource[CropExample, CropExample]):
     """Crops of scenes, changed a little each time."""
 
-    def made(self, number: int) -> CropExample:
+    def load_scene(self, number: int) -> CropExample:
         return scan_crops(self.seed, number)
 
-    def shown(self, scan: CropExample, rng: np.random.Generator) -> CropExample:
+    def draw_example(self, scan: CropExample, rng: np.random.Generator) -> CropExample:
         seed, is_mirrored = int(rng.integers(2**31)), rng.random(scan.size) < 0.5
         mirror = np.where(is_mirrored, -1, 1)
         view = scan.view.copy()
@@ -88,7 +88,7 @@ def scan_crops(seed: int, number: int, *, family: str = "train") -> CropExample:
         if len(rows) < MIN_POINTS:
             continue
         label = _label(np.hypot(*(centers - center[:2]).T), visible_people, scene.person[rows])
-        if label == UNCLEAR:
+        if label == IGNORE:
             continue
         if len(rows) > _MOST_POINTS:
             rows = rng.permutation(rows)[:_MOST_POINTS]
@@ -116,7 +116,7 @@ def _label(distances: np.ndarray, visible_people: np.ndarray, owner: np.ndarray)
     if distances.min(initial=np.inf) < _OWN:
         return int(visible_people[distances.argmin()])
     is_nobody = distances.min(initial=np.inf) > _OTHER and (owner >= 0).mean() <= _NOBODYS
-    return NOBODY if is_nobody else UNCLEAR
+    return NOBODY if is_nobody else IGNORE
 
 
 def validation_crops(seed: int) -> list[CropExample]:

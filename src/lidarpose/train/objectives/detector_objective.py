@@ -17,7 +17,7 @@ from lidarpose.models.detector.detector import SAME, predicted_boxes
 from lidarpose.models.detector.detector_config import INPUTS, DetectorConfig
 from lidarpose.models.detector.network import DetectorNet
 from lidarpose.models.detector.render import render
-from lidarpose.train.detector.candidate_source import NOBODY, UNCLEAR, DetectorExample
+from lidarpose.train.detector.candidate_source import IGNORE, NOBODY, DetectorExample
 from lidarpose.train.objectives.objective import Share, alone, at_least_one, on_device
 
 # weights; distances are in meters
@@ -26,7 +26,7 @@ PERSON, OFFSET, FOOT, HEIGHT, MOUNTED = 1.0, 2.0, 1.0, 1.0, 0.5
 # a share of the rest
 HARD, HARD_OF_SCAN, EASY = 1.5, 4, 0.1
 # in validation, the false people a scan at which people are counted
-FALSE = 1.0
+FALSE_PER_SCAN = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ class DetectorObjective:
         with torch.no_grad():
             logit = network(*inputs).float()[:, 0]
             rows = chosen(logit, person, tensors["scan"])
-            precision = average_precision(logit[person != UNCLEAR], person[person != UNCLEAR] >= 0)
+            precision = average_precision(logit[person != IGNORE], person[person != IGNORE] >= 0)
         out = network(*(values[rows] for values in inputs)).float()
         is_person = (person[rows] >= 0).float()
         people = at_least_one(share(is_person.sum()))
@@ -72,7 +72,7 @@ class DetectorObjective:
             return of_people((out[:, column] - tensors[name][rows]).abs())
 
         cross_entropy = F.binary_cross_entropy_with_logits
-        center = tensors["center"][rows, :2]
+        center = tensors["center"][rows]
         mounted = cross_entropy(out[:, 5], tensors["mounted"][rows].float(), reduction="none")
         count = at_least_one(share(torch.ones_like(is_person).sum()))
         return {
@@ -113,7 +113,7 @@ def average_precision(logit: Tensor, is_person: Tensor) -> Tensor:
 def missed_people(
     objective: DetectorObjective, network: nn.Module, examples: Sequence[DetectorExample], batch: int
 ) -> tuple[float, None]:
-    """Per cent of the people that candidates have who are missed at `FALSE` false people a scan. batch: is not used."""
+    """Per cent of the people who have candidates who are missed at `FALSE_PER_SCAN` false ones a scan; no batches."""
     device = next(network.parameters()).device
     false_logits: list[np.ndarray] = []
     best_logits: list[np.ndarray] = []
@@ -129,9 +129,9 @@ def missed_people(
 
 
 def share_missed(false_logits: Sequence[np.ndarray], best_logits: Sequence[np.ndarray]) -> float:
-    """Per cent of people who are missed at `FALSE` false ones a scan, by the logits of the false ones and the best of
-    each person, (n,) of each scan."""
+    """Per cent of people who are missed at `FALSE_PER_SCAN` false ones a scan, by the logits of the false ones and the
+    best of each person, (n,) of each scan."""
     false_ranking = np.sort(np.concatenate([*false_logits, [-np.inf]]))[::-1]
-    threshold = false_ranking[min(round(FALSE * len(false_logits)), len(false_ranking) - 1)]
+    threshold = false_ranking[min(round(FALSE_PER_SCAN * len(false_logits)), len(false_ranking) - 1)]
     person_logits = np.concatenate([*best_logits, np.zeros(0)])
     return float((person_logits <= threshold).mean() * 100) if len(person_logits) else 0.0

@@ -79,8 +79,8 @@ class VerifierObjective:
 def missed_by_verifier(
     objective: VerifierObjective, network: nn.Module, examples: Sequence[CropExample], batch: int
 ) -> tuple[float, None]:
-    """Per cent of the people among the detections who are missed at `detector_objective.FALSE` false people a scan, by
-    the verifier alone. batch: is not used."""
+    """Per cent of the people among the detections who are missed at `detector_objective.FALSE_PER_SCAN` false people a
+    scan, by the verifier alone. batch: not used."""
     device = next(network.parameters()).device
     false_logits: list[np.ndarray] = []
     best_logits: list[np.ndarray] = []
