@@ -40,6 +40,10 @@ class Acquisition:
     distance: tuple[float, float] | None = None
     conditions: tuple[str, ...] = ()
 
+    def source(self, scene: str, sensor: str) -> str:
+        """`Sample.source` of a scene and a sensor of these names; `Sample.conditions` reads it."""
+        return "/".join(("synth", scene, sensor, *filter(None, ["+".join(self.conditions)])))
+
     def placing(self, config: SceneConfig) -> SceneConfig:
         """The scene as far as it says where somebody stands."""
         return replace(config, distance=self.distance, median_points=0) if self.distance else config

@@ -333,7 +333,7 @@ def _crop(scene: Scene, bodies: Bodies, row: int, scan: Scan, rng: np.random.Gen
         pose=Pose(joints=place.of_body(bodies.joints[row]), skeleton=BODY26, frame="sensor"),
         box=box,
         second_person_points=other_count,
-        source="/".join(("synth", config.name, scene.sensor.name, *filter(None, ["+".join(acquisition.conditions)]))),
+        source=acquisition.source(config.name, scene.sensor.name),
     )
 
 

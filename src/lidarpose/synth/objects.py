@@ -108,7 +108,7 @@ def _draw_sample(
         part=np.zeros(len(points), np.uint8),
         ring=ring,
         box=box,
-        source="/".join(("synth", config.name, device.name, *filter(None, ["+".join(acquisition.conditions)]))),
+        source=acquisition.source(config.name, device.name),
     )
 
 
