@@ -288,3 +288,32 @@ def test_bad_paths(tmp_path):
         (None, "path"),
     ):
         refusal(read_boxes, path, words=[word])
+
+
+def test_boxes_picked_from_found_ones_say_what_is_up():
+    found = Boxes([Box(center=[5, 0, 0], size=[1, 1, 2], id=id) for id in "ab"], up="-y")
+    for some in ([box for box in found if box.id == "a"], found.copy(), found + [], sorted(found, key=lambda b: b.id)):
+        assert read_boxes(some).up == "-y" and "up" not in read_boxes(some).to_dict()["people"][0]
+    other = Box(center=[9, 0, 0], size=[1, 1, 2])
+    assert read_boxes([other]).up == read_boxes(Boxes([other])).up == "z" and other.up is None
+    with pytest.raises(InputError, match=r"boxes of scans with one up axis, got -y, z: give those of one scan"):
+        read_boxes([*found, other])
+
+
+def test_who_is_mounted_is_true_false_or_unknown():
+    box = Box(center=[0, 0, 0], size=[1, 1, 1], mounted=np.bool_(True))
+    assert box.mounted is True and json.loads(Boxes([box]).to_json())["people"][0]["mounted"] is True
+    entry = {"center": [0, 0, 0], "size": [1, 1, 1]}
+    assert [read_boxes([entry | {"mounted": m}])[0].mounted for m in (np.bool_(False), "yes", 1)] == [False, None, None]
+    with pytest.raises(InputError, match=r"Box.mounted must be true, false or None, got 'yes'"):
+        Box(center=[0, 0, 0], size=[1, 1, 1], mounted="yes")
+
+
+def test_tensors_of_any_precision_are_boxes_and_open_files_are_left_alone(tmp_path):
+    rows = torch.tensor([[5.0, 0, 0, 1, 1, 2, 0]], dtype=torch.bfloat16, requires_grad=True)
+    assert read_boxes(rows)[0].center.tolist() == [5, 0, 0]
+    (tmp_path / "b.json").write_text("[]")
+    with open(tmp_path / "b.json") as file:
+        with pytest.raises(InputError, match="expected the path of a file of boxes"):
+            read_boxes(file)
+        assert file.read() == "[]"

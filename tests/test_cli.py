@@ -636,3 +636,10 @@ def test_a_wrong_word_names_the_help_that_says_more(words, problem, capsys):
     with pytest.raises(SystemExit) as ended:
         main(words.split())
     assert ended.value.code == 2 and problem in capsys.readouterr().err
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_stray_point_does_not_round_the_others(crop, points, tmp_path, out, capsys):
+    np.save(tmp_path / "stray.npy", np.concatenate([points, [[5e6, 0, 0]]]).astype(np.float32))
+    assert run("predict", tmp_path / "stray.npy", "--crop", "--out", out) == 0
+    assert "rounded" not in capsys.readouterr().err

@@ -247,3 +247,13 @@ def test_a_file_system_without_locks_does_without(tmp_path, monkeypatch, error, 
     else:
         with pytest.raises(InputError, match=message), locked(tmp_path / "out", "a", busy=""):
             pass
+
+
+@pytest.mark.skipif(os.name != "posix", reason="modes are POSIX's")
+@pytest.mark.parametrize("mode", [0o600, 0o440])
+def test_a_replaced_file_keeps_its_mode(tmp_path, mode):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    path.chmod(mode)
+    write_atomic(path, "new")
+    assert path.read_text() == "new" and stat.S_IMODE(path.stat().st_mode) == mode

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -367,3 +368,27 @@ def test_the_docs_name_what_is_there_and_their_example_runs():
     named = set(re.findall(r"(?:`|metrics\.)(\w+)\(", text)) | set(re.findall(r"`(\w+_\w+)`", text))
     known = {*metrics.__all__, "dapt_compat", "turned_round"}
     assert len(named) > 12 and named <= known, named - known
+
+
+def test_what_is_masked_does_not_count():
+    true = np.zeros((6, 15, 3))
+    pred, mask = true + 0.01, np.zeros(true.shape, bool)
+    pred[:, 0] += 5
+    mask[:, 0] = True
+    visible = np.ma.array(np.ones((6, 15)), mask=mask[..., 0])
+    for arguments in ((np.ma.array(true, mask=mask),), (true, visible)):
+        assert metrics.mpjpe(pred, *arguments) == pytest.approx(17.32, abs=0.01)
+    with_gradient = torch.tensor(pred[:, 1:], requires_grad=True)
+    assert metrics.mpjpe(with_gradient, true[:, 1:]) == pytest.approx(17.32, abs=0.01)
+
+
+@pytest.mark.parametrize("options", [{"repeats": 1.5}, {"repeats": True}, {"level": "x"}, {"level": 1.0}])
+def test_intervals_of_nonsense_are_refused(options):
+    with pytest.raises(InputError, match=next(iter(options))):
+        metrics.interval(np.ones(9), np.random.default_rng(0), **options)
+
+
+def test_labels_of_clusters_may_be_missing():
+    table, rng = np.arange(6.0), np.random.default_rng(0)
+    some = metrics.interval(table, rng, clusters=["a", None, "b", "b", "a", None])
+    assert some.units == 3

@@ -17,7 +17,7 @@ MODULES = sorted(SOURCE.rglob("*.py"))
 
 # from the ground up: a package imports its own layer and those below
 LAYERS = (
-    {"skeleton", "geometry", "sample", "errors", "_version", "_renamed", "progress"},
+    {"skeleton", "geometry", "sample", "arrays", "errors", "_version", "_renamed", "progress"},
     {"io"},
     {"body", "lidar"},
     {"data"},

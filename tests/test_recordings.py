@@ -1,5 +1,6 @@
 """Folders and recordings: people of every frame, their tracks, and files that grow and go on after a kill."""
 
+import errno
 import json
 import os
 from dataclasses import replace
@@ -590,3 +591,61 @@ def test_wrong_commands_are_one_line(words, problem, drive, tmp_path, monkeypatc
     error = capsys.readouterr().err
     assert problem in error and error.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def damaged_states(path, state_path):
+    """What a power cut or a bad disk may leave of a part and of its state."""
+    lines, state = path.read_bytes(), json.loads(state_path.read_text())
+    yield lines[:-300] + bytes(300), state
+    yield lines[:300] + bytes(300) + lines[600:], state
+    for key, value in (("last", None), ("last", [1]), ("bytes", -4), ("bytes", "7"), ("frames", 9), ("state", [])):
+        yield lines, state | {key: value}
+
+
+def test_a_damaged_part_is_begun_anew(drive, stopped, tmp_path):
+    out, fresh = tmp_path / "a.jsonl", tmp_path / "fresh.jsonl"
+    words = stopped("--end", 0.2, "--out", out)
+    path, state_path = tmp_path / "a.jsonl.part", tmp_path / "a.jsonl.part.json"
+    for lines, state in list(damaged_states(path, state_path)):
+        path.write_bytes(lines)
+        state_path.write_text(json.dumps(state))
+        with output.PartFile(out, state["command"]) as part:
+            assert part.frames == 0 and not path.read_bytes()
+    path.write_bytes(lines[:-300] + bytes(300))
+    assert run(drive, *words) == run(drive, "--end", 0.2, "--out", fresh)
+
+
+def test_a_full_disk_is_an_error_of_the_file(tmp_path, monkeypatch):
+    steps = FramePredictor(crop=True, model=lidarpose.load("tiny", tta=1))
+    frame = Frame(points=np.ones((9, 3)), index=0, id="a", time=0.0)
+    with output.PartFile(tmp_path / "a.jsonl", {}) as part:
+        poses = steps.predict(frame)
+
+        def full(*_):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        monkeypatch.setattr(output.os, "replace", full)
+        with pytest.raises(InputError, match=r"a.jsonl.part: cannot write .*No space left"):
+            part.append(poses, steps.state())
+    assert not list(tmp_path.glob("*.new"))
+
+
+def test_a_pose_of_the_sensor_that_cannot_be_costs_its_frame(clouds, model):
+    boxes = {k: [[*place, 0, 1, 1, 2, 0] for place in PLACES] for k in range(3)}
+    places = [np.eye(4) for _ in range(3)]
+    places[1][0, 3] = 1e12
+    recording = IndexedRecording(
+        name="made",
+        ids=list("abc"),
+        times=None,
+        read=lambda i: Sweep(points=clouds[i], T_world_sensor=places[i]),
+    )
+    frames = list(lidarpose.predict_recording(FrameSource(recording), boxes=boxes, track=True, model=model))
+    assert [frame.error is None for frame in frames] == [True, False, True]
+    assert "Box.center" in frames[1].error and len(frames[2].poses) == 2
+
+
+@pytest.mark.parametrize("source", [None, 5, np.zeros((9, 3)), [np.zeros((9, 3))]])
+def test_what_is_no_source_is_refused(source, model):
+    with pytest.raises(InputError, match="expected (a path|paths)"):
+        lidarpose.predict_recording(source, model=model)

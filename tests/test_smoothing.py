@@ -236,6 +236,21 @@ def test_a_clip_says_of_each_frame_whether_a_person_is_there(clouds, live):
 
 def test_times_that_are_none():
     assert clip_times(None, 3).tolist() == [0, 0.1, 0.2] and clip_times((0, 0.5, 7), 3).tolist() == [0, 0.5, 7]
-    for times in ([0, 1], [0, 1, 1], [0, 1, np.nan], "abc"):
+    dates = [np.arange(3).astype(kind) for kind in ("M8[ms]", "m8[s]")]
+    for times in ([0, 1], [0, 1, 1], [0, 1, np.nan], "abc", *dates):
         with pytest.raises(InputError, match="3 finite numbers"):
             clip_times(times, 3)
+
+
+def test_a_gap_of_days_parts_what_is_made_steady(walker):
+    _, track = walker(frames=24)
+    later = replace(track, times=track.times + np.where(np.arange(24) < 12, 0, 86_400.0))
+    halves = [
+        smooth(replace(track, **{n: v[rows] for n, v in vars(track).items() if isinstance(v, np.ndarray)}))
+        for rows in (slice(12), slice(12, 24))
+    ]
+    apart = np.concatenate([half.joints for half in halves])
+    # bones are measured in all frames
+    assert np.abs(smooth(later).joints - apart).max() < 0.06
+    minute = replace(track, times=track.times + np.where(np.arange(24) < 12, 0, 60.0))
+    np.testing.assert_allclose(smooth(later).joints, smooth(minute).joints, atol=1e-3)

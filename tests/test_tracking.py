@@ -239,3 +239,15 @@ def test_a_doubtful_box_moves_its_person_less():
         tracker.update(0.3, [person(0.3, score=score)])
         moved.append(tracker.predicted(0.3)[0].center[0])
     assert 0.15 < moved[0] < 0.3 and moved[1] < 0.5 * moved[0]
+
+
+def test_what_are_no_boxes_is_refused_and_changes_nothing():
+    tracker, other = Tracker(), Tracker()
+    for each in (tracker, other):
+        assert each.update(0.0, [person(0)]) == [0]
+    for boxes in (np.zeros((2, 7)), None, 5, [[1, 2, 3]]):
+        with pytest.raises(InputError, match="expected a list of Box, got"):
+            tracker.update(1.9, boxes)
+    assert tracker.state() == other.state()
+    # whatever holds boxes will do
+    assert tracker.update(0.1, (person(0.05) for _ in range(1))) == [0]

@@ -126,7 +126,7 @@ class Box:
     """A person's box: center (3,) m, size (length, width, height) m, yaw rad about z. It may only crop.
 
     score: the probability that it is a person, None where nobody says; mounted: whether the person rides, or sits in a
-    wheelchair, None where nobody says.
+    wheelchair, None where nobody says; up: what is up in the scan, see `rotation_from_up`, None for z.
     """
 
     center: np.ndarray
@@ -135,6 +135,7 @@ class Box:
     id: str | int | None = None
     score: float | None = None
     mounted: bool | None = None
+    up: str | None = None
 
     def __post_init__(self):
         for name in ("center", "size"):
@@ -158,6 +159,10 @@ class Box:
                 raise InputError(f"Box.score must be a probability from 0 to 1, got {self.score!r}")
             # numpy's numbers are none for JSON
             object.__setattr__(self, "score", float(self.score))
+        if self.mounted is not None:
+            if not isinstance(self.mounted, bool | np.bool_):
+                raise InputError(f"Box.mounted must be true, false or None, got {self.mounted!r}")
+            object.__setattr__(self, "mounted", bool(self.mounted))
 
     def to_dict(self) -> dict[str, Any]:
         """center, size and yaw, as JSON holds them."""

@@ -193,5 +193,5 @@ def read_poses(path: str | Path) -> dict[str, Predictions]:
             rows = [{key: value for key, value in row.items() if value is not None} for row in records]
             predictions[name] = stack(Skeleton(name=entry["skeleton"], joints=joints, parents=parents), rows)
         return predictions
-    except (pa.ArrowException, KeyError, TypeError, ValueError, AttributeError) as error:
+    except (pa.ArrowException, OSError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise file_error(path, f"is no poses.parquet of an evaluation ({error}); evaluate again") from None

@@ -177,9 +177,12 @@ def _result(content: dict[str, Any]) -> Result:
     for field in fields(Setting):
         if field.type is str and not isinstance(setting[field.name], str):
             raise TypeError(f"{field.name} is no text")
+    counts = dict(content["counts"])
+    for name in ("people", "without a pose"):
+        counts[name] = int(counts[name])
     return Result(
         setting=Setting(**setting),
-        counts=dict(content["counts"]),
+        counts=counts,
         skipped=dict(content["skipped"]),
         notes=tuple(content["notes"]),
         lines=tuple(MetricRow(**row) for row in content["lines"]),

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 _LARGEST_IN_CENTIMETERS, _SMALLEST_IN_OTHER_UNITS, _LARGEST_IN_KILOMETERS = 500, 20, 0.02
 # a person with the ground around is at most so many times as wide as tall
 _WIDEST = 4
-# people are not recognized in coordinates that are rounded to more, m
-_COARSE = 0.1
 # no LiDAR sees a person from farther away, m
 FARTHEST_PERSON = 500.0
 # boxes so much less tall than wide have their sizes in another order
@@ -63,18 +61,6 @@ _LONGEST_SCAN, _SPARSEST, _LONG_IN_MILLIMETERS, _SMALLEST_SCAN = 500.0, 0.1, 10_
 # a sensor is not so far from the nearest point, m, along the ground and in space, as a drone's is; of the points so
 # near, m, some percents lie lower than it by more
 _FAR_OUT, _FAR_AWAY, _BELOW_SENSOR, _LOWEST, _LEAST_HEIGHT = 25.0, 60.0, 15.0, 5, 0.2
-
-
-def rounding_warning(points: np.ndarray) -> str | None:
-    """Map coordinates (n, 3) m lost what makes a person where they were stored in 32 bits."""
-    # without a copy of a large map
-    step = float(np.spacing(np.float32(max(points.max(initial=0), -points.min(initial=0)))))
-    if step < _COARSE or not np.array_equal(points.astype(np.float32), points):
-        return None
-    return (
-        f"coordinates are rounded to {step:g} m, as 32-bit numbers of their size are: subtract an offset before they "
-        "are saved"
-    )
 
 
 # ---- one person

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarpose.arrays import from_tensor
 from lidarpose.errors import InputError
 from lidarpose.geometry import vector_of
 from lidarpose.io.files import FormatError, one_line
@@ -18,6 +19,10 @@ from lidarpose.sample import CLIP_FRAMES, FARTHEST, MIN_POINTS, center_of, clip_
 CLIP_RATE = 10.0
 # a person of more points is thinned: no sensor sees so many, and no voxel needs them
 MAX_POINTS = 50_000
+
+# people are not recognized in coordinates that are rounded to more, m; points of a large scan that say how large its
+# coordinates are
+_COARSE, _LOOKED_AT = 0.1, 100_000
 
 # a crop wider than this may hold more than a person, so people are looked for in it, m
 _TIGHT = 2.0
@@ -115,11 +120,8 @@ def as_points(points: Any, what: str = "points") -> np.ndarray:
     if isinstance(points, np.ma.MaskedArray):
         # masked is no point
         points = np.ma.filled(points.astype(np.float64), np.nan)
-    if hasattr(points, "detach"):
-        # a torch tensor that may sit on a device, in a graph, or in bfloat16, which numpy lacks
-        points = points.detach().cpu().double()
     try:
-        array = np.asarray(points)
+        array = np.asarray(from_tensor(points))
     except (ValueError, TypeError) as error:
         raise InputError(f"{what} must be an (n, 3) array of numbers, got rows of unequal length ({error})") from None
     if array.shape == (0,):
@@ -157,7 +159,9 @@ def clip_times(times: Any, count: int) -> np.ndarray:
     if times is None:
         return np.arange(count) / CLIP_RATE
     try:
-        seconds = np.asarray(times, float)
+        # dates and their differences would be taken for seconds, whatever their unit
+        is_date = np.asarray(times).dtype.kind in "mM"
+        seconds = np.full(0, np.nan) if is_date else np.asarray(times, float)
     except (TypeError, ValueError):
         seconds = np.full(0, np.nan)
     if seconds.shape != (count,) or not (np.isfinite(seconds).all() and (np.diff(seconds) > 0).all()):
@@ -179,8 +183,8 @@ def as_origin(value: object) -> np.ndarray | None:
 
 
 def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """points (n, 3) as of `only_returns`, at most `MAX_POINTS` of them, and a note for each thing done."""
-    points, notes = only_returns(points)
+    """points (n, 3) m as of `only_returns`, at most `MAX_POINTS` of them, and a note for each thing done."""
+    points, notes = _usable(points)
     if len(points) > MAX_POINTS:
         notes.append(
             f"thinned from {len(points)} to {MAX_POINTS} points: crop closer to the person if there are others"
@@ -189,8 +193,27 @@ def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     return points, notes
 
 
+def rounding_warning(points: np.ndarray) -> str | None:
+    """Map coordinates (n, 3) m lost what makes a person where they were stored in 32 bits."""
+    # of most points, whatever a stray one says; some are enough of a large map
+    some = np.abs(points[:: max(len(points) // _LOOKED_AT, 1)])
+    step = float(np.spacing(np.float32(np.quantile(some, 0.9)))) if len(points) else 0.0
+    if step < _COARSE or not np.array_equal(points.astype(np.float32), points):
+        return None
+    return (
+        f"coordinates are rounded to {step:g} m, as 32-bit numbers of their size are: subtract an offset before they "
+        "are saved"
+    )
+
+
 def only_returns(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """points (n, 3) m without rows that arithmetic would choke on or that are no returns, and a note for each kind."""
+    """points (n, 3) m without rows that arithmetic would choke on or that are no returns, and a note for each kind, and
+    of rounded coordinates."""
+    points, notes = _usable(points)
+    return points, [*notes, *filter(None, [rounding_warning(points)])]
+
+
+def _usable(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     notes = []
     is_usable = within_reach(points)
     if num_dropped := int((~is_usable).sum()):

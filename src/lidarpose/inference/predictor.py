@@ -29,6 +29,7 @@ from lidarpose.inference.inputs import (
     clip_times,
     is_few,
     only_returns,
+    rounding_warning,
 )
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.inference.scan import Scan, pose_scan
@@ -39,7 +40,7 @@ from lidarpose.models import BUNDLED, DEFAULT, weights_path
 from lidarpose.models.checkpoint import read_header
 from lidarpose.models.decode import decoder
 from lidarpose.models.voxelize import WINDOW
-from lidarpose.sample import MIN_POINTS, PER_PERSON, Box, Pose
+from lidarpose.sample import MIN_POINTS, PER_PERSON, Box, Pose, within_reach
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 from lidarpose.tracking.clip import TrackPoses
@@ -229,11 +230,15 @@ class Predictor(PoseEstimator):
                 scan = search_alone(scan, Search())
             return pose_scan(scan, self, skeleton=skeleton, progress=progress)
         origin = as_origin(sensor_origin)
-        if not _is_many(points):
-            return self._people([as_points(points)], origin, target_skeleton, False)[0]
-        clouds = [as_points(cloud, f"points[{i}]") for i, cloud in enumerate(points)]
+        is_one = not _is_many(points)
+        clouds = [as_points(points)] if is_one else [as_points(cloud, f"points[{i}]") for i, cloud in enumerate(points)]
         clips = None if clips is None else clips.checked(len(clouds))
         people = self._people(clouds, origin, target_skeleton, progress, clips)
+        for i, cloud in enumerate(clouds):
+            if warning := rounding_warning(cloud[within_reach(cloud)]):
+                people[i] = replace(people[i], warnings=(warning, *people[i].warnings))
+        if is_one:
+            return people[0]
         return Poses(people=tuple(people), skeleton=target_skeleton, model=self.model)
 
     def predict_clip(

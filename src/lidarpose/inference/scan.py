@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidarpose.geometry import rotation_from_up, rotation_of_boxes, upright_axis
-from lidarpose.inference.checks import check_scan, origin_warning, rounding_warning, rows_inside, unit_warning
+from lidarpose.inference.checks import check_scan, origin_warning, rows_inside, unit_warning
 from lidarpose.inference.inputs import as_points, only_returns
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.io.files import file_error
@@ -103,10 +103,7 @@ def read_scan(scan: Scan, points: str | os.PathLike | ArrayLike, columns: int | 
     if source is not None and not len(returns):
         problem = f"none within {FARTHEST:g} m" if cloud.points.any() else "only 0,0,0, which are no returns"
         raise file_error(source, f"expected points in meters, got {problem}: export it again")
-    warnings = [*cloud.warnings, *notes]
-    if warning := rounding_warning(returns):
-        warnings.append(warning)
-    return replace(scan, points=returns, warnings=tuple(warnings), source=source)
+    return replace(scan, points=returns, warnings=(*cloud.warnings, *notes), source=source)
 
 
 def pose_scan(scan: Scan, predictor: Predictor, *, skeleton: str | None = None, progress: bool = False) -> Poses:

@@ -10,11 +10,13 @@ import math
 import os
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, SupportsIndex, overload
 
 import numpy as np
 
+from lidarpose.arrays import from_tensor
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, rotation_from_up
 from lidarpose.io.files import FormatError, file_error, read_bytes, shorten, write_atomic
@@ -49,7 +51,8 @@ class Boxes(list[Box]):
         detector: str = "",
         up: str = "z",
     ):
-        super().__init__(boxes)
+        # a box that is picked out of these says too what was up
+        super().__init__(box if up == "z" or box.up == up else replace(box, up=up) for box in boxes)
         self.source, self.warnings, self.detector, self.up = source, tuple(warnings), detector, up
 
     @overload
@@ -119,9 +122,7 @@ def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike
         InputError: one line that names the file, the entry (counted from 0, as in JSON paths) and the key. Two entries
             of one id are an error, since results are told apart by it.
     """
-    if hasattr(source, "detach"):
-        # a torch tensor, perhaps on a device
-        source = source.detach().cpu().numpy()
+    source = from_tensor(source)
     try:
         content = source if isinstance(source, _Content) else _load_file(source, calib)
         boxes = [_box(entry, f"people[{i}]") for i, entry in enumerate(_entries(content))]
@@ -140,8 +141,17 @@ def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike
 
 
 def _up(content: object) -> str:
-    """What is up by a document of ours; z where it does not say."""
-    up: object = content.up if isinstance(content, Boxes) else "z"
+    """What is up by a document of ours, or by boxes of one; z where nothing is said."""
+    up: object = "z"
+    if isinstance(content, Boxes):
+        up = content.up
+    elif isinstance(content, list | tuple):
+        directions = {entry.up or "z" for entry in content if isinstance(entry, Box)}
+        if len(directions) > 1:
+            raise FormatError(
+                "boxes of scans with one up axis", ", ".join(sorted(directions)), "give those of one scan"
+            )
+        up = directions.pop() if directions else "z"
     if isinstance(content, dict) and str(content.get("schema")).startswith("lidarpose."):
         up = content.get("up", "z")
     with suppress(InputError):
@@ -293,7 +303,7 @@ def _box(entry: object, where: str) -> Box:
         yaw=yaw,
         id=id,
         score=score if score is not None and 0 <= score <= 1 else None,
-        mounted=mounted if isinstance(mounted, bool) else None,
+        mounted=bool(mounted) if isinstance(mounted, bool | np.bool_) else None,
     )
 
 

@@ -202,6 +202,7 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
         target = Path(os.path.realpath(path))
     except (OSError, TypeError, ValueError) as error:
         raise file_error(repr(path), f"expected the path of a file to write ({error})") from None
+    mode = None
     with suppress(OSError):
         mode = target.stat().st_mode
         if stat.S_ISDIR(mode):
@@ -224,16 +225,20 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
     except OSError as error:
         _remove(temporary, new_folders)
-        raise _write_error(path, target.parent, error) from None
+        raise write_error(path, target.parent, error) from None
     try:
         yield temporary
         with open(temporary, "r+b") as file:
             os.fsync(file.fileno())
+        if mode is not None:
+            # whoever may not read the old content may not read the new
+            with suppress(OSError):
+                os.chmod(temporary, stat.S_IMODE(mode))
         os.replace(temporary, target)
     except BaseException as error:
         _remove(temporary, new_folders)
         if isinstance(error, OSError) and _is_about(error, temporary):
-            raise _write_error(path, target.parent, error) from None
+            raise write_error(path, target.parent, error) from None
         raise
     _sync_folder(target.parent)
 
@@ -341,7 +346,7 @@ def _acquired(lock: Any, wait: float) -> bool:
         return False
     except OSError as error:
         path = Path(lock.lock_file)
-        raise _write_error(path, path.parent, error) from None
+        raise write_error(path, path.parent, error) from None
     return True
 
 
@@ -357,7 +362,8 @@ def _is_about(error: OSError, temporary: Path) -> bool:
     return str(temporary) in names or error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 
 
-def _write_error(path: object, folder: Path, error: OSError) -> InputError:
+def write_error(path: object, folder: Path, error: OSError) -> InputError:
+    """The error of a file that cannot be written into a folder, with what to do."""
     remedy = _REMEDIES.get(error.errno or 0, "choose another folder")
     return file_error(path, f"cannot write into the folder {folder} ({error.strerror or error}); {remedy}")
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, check_int
 from lidarpose.io.files import file_error, one_line, read_bytes
 from lidarpose.models.checkpoint import DAMAGED, DIGEST, ENTRY, Header, parse_header, warn_without_digest
 from lidarpose.models.config import NetworkConfig
@@ -29,6 +29,8 @@ _EXTERNAL = b"\n\x08location\x12"
 OUTPUTS = ("vote", "heatmap", "part", "confidence", "log_spread", "visible")
 # a network this small only waits for more threads than that
 _MOST_THREADS = 8
+# more are a mistake
+_THREADS_LIMIT = 1024
 
 
 def voxelize_people(clouds: list[np.ndarray], view: np.ndarray | None, config: NetworkConfig) -> VoxelPyramid:
@@ -103,6 +105,8 @@ def open_network(path: str | os.PathLike, *, threads: int | None = None) -> tupl
     Warns of a file without a digest. Raises InputError, one line, for a file that is damaged, cut off, something else,
     another program's ONNX, or one that keeps its weights elsewhere.
     """
+    if threads is not None:
+        threads = check_int("threads", threads, least=0, most=_THREADS_LIMIT)
     content = read_bytes(path, expected="an ONNX file (.onnx)")
     if _EXTERNAL in content:
         # they would be looked up in the current folder, whatever lies there

@@ -11,6 +11,7 @@ from lidarpose.errors import InputError
 from lidarpose.io.boxes import Boxes, read_boxes
 from lidarpose.io.files import file_error, read_bytes, shorten
 from lidarpose.io.sources import DamagedFrame, Frame
+from lidarpose.io.sources.folders import list_folder
 
 _FORM = '{"frame": 0, "people": [{"center": [x, y, z], "size": [l, w, h]}]}'
 _SUFFIXES = (".json", ".npy", ".txt")
@@ -41,7 +42,7 @@ class FrameBoxes:
             kind = type(given).__name__
             raise InputError(f"boxes of a recording: expected a folder, a file or a dict by frame, got {kind}")
         elif os.path.isdir(given):
-            for path in sorted(Path(given).iterdir()):
+            for path in sorted(list_folder(Path(given))):
                 if path.suffix.lower() in _SUFFIXES:
                     self._by_frame[path.stem.removesuffix(".boxes")] = path
         else:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from lidarpose.errors import InputError, counted
-from lidarpose.io.files import check_writable, file_error
+from lidarpose.io.files import check_writable, file_error, write_error
 from lidarpose.io.sources import Source
 from lidarpose.progress import Progress
 from lidarpose.recording.coordinates import in_world
@@ -53,7 +53,7 @@ class PartFile:
         self._new_folders = [folder for folder in (parent, *parent.parents) if not folder.exists()]
         parent.mkdir(parents=True, exist_ok=True)
         # neither emptied nor read before it is this process's own
-        self._file = os.fdopen(os.open(self.path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0)), "r+b")
+        self._file = os.fdopen(os.open(self.path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666), "r+b")
         if not _is_locked(self._file):
             self._file.close()
             raise file_error(self.path, "another lidarpose writes it: wait for its end, or choose another --out")
@@ -65,16 +65,19 @@ class PartFile:
         """How many bytes of the part hold finished lines of this command."""
         try:
             content = json.loads(self.state_path.read_bytes())
-            command, size = content["command"], content["bytes"]
-            if self.path.stat().st_size < size:
+            command, size, frames, state = (content[name] for name in ("command", "bytes", "frames", "state"))
+            index, id = content["last"]
+            # a power cut may leave the state of lines that are not there
+            lines = list(map(json.loads, self.path.read_bytes()[:size].splitlines()))
+            if (len(lines), lines[-1]["frame"], lines[-1]["id"]) != (frames, index, id) or not isinstance(state, dict):
                 return 0
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, LookupError, TypeError):
             return 0
         if command != self.command:
             names = [*self.command, *command]
             self.other = sorted({name for name in names if command.get(name) != self.command.get(name)})
             return 0
-        self.frames, self.last, self.state = content["frames"], tuple(content["last"]), content["state"]
+        self.frames, self.last, self.state = frames, (index, id), state
         return size
 
     def __enter__(self) -> "PartFile":
@@ -85,19 +88,24 @@ class PartFile:
 
     def append(self, frame: FramePoses, state: dict[str, Any]) -> None:
         """One more finished frame. A kill in between costs this frame: lines without their state are cut off."""
-        self._file.write(json.dumps(frame.to_dict()).encode() + b"\n")
-        self._file.flush()
         self.frames, self.last, self.state = self.frames + 1, (frame.index, frame.id), state
-        content = {
-            "command": self.command,
-            "bytes": self._file.tell(),
-            "frames": self.frames,
-            "last": self.last,
-            "state": state,
-        }
         temporary = self.state_path.with_name(self.state_path.name + ".new")
-        temporary.write_text(json.dumps(content))
-        os.replace(temporary, self.state_path)
+        try:
+            self._file.write(json.dumps(frame.to_dict()).encode() + b"\n")
+            self._file.flush()
+            content = {
+                "command": self.command,
+                "bytes": self._file.tell(),
+                "frames": self.frames,
+                "last": self.last,
+                "state": state,
+            }
+            temporary.write_text(json.dumps(content))
+            os.replace(temporary, self.state_path)
+        except OSError as error:
+            with suppress(OSError):
+                temporary.unlink()
+            raise write_error(self.path, self.path.parent, error) from None
 
     def lines(self) -> Iterator[dict[str, Any]]:
         """The finished lines."""

@@ -25,6 +25,8 @@ _PATH, _COMMON = 2.5, 0.8
 LEAST_FRAMES = 3
 # longer gaps, and what is before and after a track, are filled in next to seen frames only, s
 MAX_GAP, _MAX_BEYOND = 2.0, 0.5
+# after so long, s, nothing is known of the motion before; variances of longer steps are beyond what floats resolve
+_LONGEST_STEP = 60.0
 
 
 def smooth(track: TrackPoses) -> TrackPoses:
@@ -37,7 +39,8 @@ def smooth(track: TrackPoses) -> TrackPoses:
     if not is_seen.any():
         return track
     track = settled(track)
-    times, usual_strength = track.times, strengths(track.skeleton)
+    steps = np.diff(track.times, prepend=track.times[:1])
+    times, usual_strength = np.cumsum(np.minimum(steps, _LONGEST_STEP)), strengths(track.skeleton)
     spread = known_spread(track.spread, is_seen, len(usual_strength))
     precision = precisions(spread)
     # numbers stay small about the first place

@@ -6,7 +6,8 @@ the assignment that is best for all together. The heading is smoothed apart, sin
 Letters: N tracks, B boxes.
 """
 
-from collections.abc import Sequence
+import reprlib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -125,10 +126,11 @@ class Tracker:
             again. Then the ids of `weak_boxes`, -1 where they are nobody's.
 
         Raises:
-            InputError: time is no finite number.
+            InputError: time is no finite number, or what is given are no boxes; the tracks stay as they were.
         """
-        tracks = self._elapsed(time)
+        boxes, weak_boxes = (_checked(own) for own in (boxes, weak_boxes))
         detections = _of_boxes([*boxes, *weak_boxes])
+        tracks = self._elapsed(time)
         is_weak = np.arange(len(detections)) >= len(boxes)
         ids = np.full(len(detections), -1)
         kept_rows = np.flatnonzero(~_repeats(detections, is_weak))
@@ -205,6 +207,13 @@ class Tracker:
         # whoever was in the frame before may be seen again
         gap = np.where(tracks.is_expected, self.max_gap, min(self.max_gap, max(_UNSURE_GAP, seconds)))
         return tracks.take(tracks.age <= gap)
+
+
+def _checked(boxes: Iterable[Box]) -> list[Box]:
+    box_list = list(boxes) if isinstance(boxes, Iterable) else None
+    if box_list is None or not all(isinstance(box, Box) for box in box_list):
+        raise InputError(f"expected a list of Box, got {reprlib.repr(boxes)}: make them of it by lidarpose.read_boxes")
+    return box_list
 
 
 def _of_boxes(boxes: Sequence[Box]) -> _Tracks:

@@ -16,6 +16,7 @@ from numbers import Real
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lidarpose.arrays import from_tensor
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.skeleton import Skeleton, skeleton
 
@@ -44,16 +45,20 @@ _BLOCK = 1 << 21
 
 
 def as_numbers(name: str, value: ArrayLike) -> np.ndarray:
-    """An array of floats; raises InputError where it holds something else, or lists of unequal length."""
+    """An array of floats, NaN where it is masked; raises InputError where it holds something else, or lists of unequal
+    length."""
     try:
-        return np.asarray(value, float)
+        if isinstance(value, np.ma.MaskedArray):
+            return np.ma.filled(value.astype(float), np.nan)
+        return np.asarray(from_tensor(value), float)
     except (TypeError, ValueError):
         raise InputError(f"{name} must hold numbers, in lists of equal length") from None
 
 
 def as_flags(name: str, value: ArrayLike, shape: tuple[int, ...], *, of: str = "joint") -> np.ndarray:
-    """bool of a shape, one a joint or another thing, from bool or 0 and 1; raises InputError otherwise."""
-    flags = as_numbers(name, value)
+    """bool of a shape, one a joint or another thing, from bool or 0 and 1, False where it is masked; raises InputError
+    otherwise."""
+    flags = as_numbers(name, np.ma.filled(value, 0) if isinstance(value, np.ma.MaskedArray) else value)
     if flags.shape != shape:
         raise InputError(f"{name} must be {shape}, one a {of}, got {flags.shape}")
     if not ((flags == 0) | (flags == 1)).all():
@@ -85,7 +90,8 @@ def check_positive(name: str, value: float) -> None:
 def _cluster_labels(clusters: ArrayLike | None, count: int) -> np.ndarray | None:
     if clusters is not None and np.shape(clusters) != (count,):
         raise InputError(f"clusters must be ({count},), one label a person, got {np.shape(clusters)}")
-    return None if clusters is None else np.asarray(clusters)
+    # labels of several kinds, such as text and None where it is missing, have no order
+    return None if clusters is None else np.array([repr(label) for label in np.asarray(clusters).tolist()])
 
 
 # ---- means
@@ -173,10 +179,10 @@ def interval(
     """
     if not isinstance(rng, np.random.Generator):
         raise InputError(f"rng must be a numpy.random.Generator, such as default_rng(0), got {type(rng).__name__}")
-    if not 0 < level < 1:
+    check_positive("level", level)
+    if not level < 1:
         raise InputError(f"level must lie between 0 and 1, got {level}")
-    if repeats < 1:
-        raise InputError(f"repeats must be 1 or more, got {repeats}")
+    repeats = check_int("repeats", repeats, least=1)
     check_name("average", average, AVERAGES)
     table = as_table(table)
     draws, units = bootstrap_means(table, rng, average, clusters=_cluster_labels(clusters, len(table)), repeats=repeats)

@@ -150,8 +150,7 @@ def acceleration_errors(pred: ArrayLike, true: ArrayLike, rate: float, visible: 
     pred, true, is_labeled = checked_poses(pred, true, visible, trailing=("frames", "joints", "3"))
     if pred.shape[1] < 3:
         raise InputError(f"acceleration needs sequences of 3 frames or more, got {pred.shape[1]}")
-    if not (np.isfinite(rate) and rate > 0):
-        raise InputError(f"rate must be a positive number of frames a second, got {rate}")
+    check_positive("rate", rate)
     offset = np.where(is_labeled[..., None], pred - true, 0.0)
     has_acceleration = is_labeled[:, :-2] & is_labeled[:, 1:-1] & is_labeled[:, 2:]
     error = np.linalg.norm(offset[:, :-2] - 2 * offset[:, 1:-1] + offset[:, 2:], axis=-1) * rate**2 * 1e3

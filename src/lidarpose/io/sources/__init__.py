@@ -13,7 +13,7 @@ from pathlib import Path
 from lidarpose.errors import InputError, check_int
 from lidarpose.io.files import file_error, listed
 from lidarpose.io.point_cloud import RECORDINGS
-from lidarpose.io.sources.folders import natural_key, open_files, scan_files
+from lidarpose.io.sources.folders import list_folder, natural_key, open_files, scan_files
 from lidarpose.io.sources.frame import (
     ChainedRecording,
     DamagedFrame,
@@ -92,6 +92,8 @@ def is_single_scan(paths: str | os.PathLike | Sequence[str | os.PathLike]) -> bo
 
 def _matches(path: str | os.PathLike) -> list[Path]:
     """The paths that a path or pattern names, in natural order."""
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f"expected paths, got {type(path).__name__} among them: name files or folders")
     if os.path.exists(path):
         return [Path(path)]
     pattern = os.fspath(path)
@@ -121,7 +123,7 @@ def _open_all(name: str, paths: Sequence[Path], options: ReadingOptions) -> Reco
 
 def _open_folder(folder: Path, options: ReadingOptions) -> Recording:
     # what rosbag2 writes
-    if (folder / "metadata.yaml").exists():
+    if any(path.name == "metadata.yaml" for path in list_folder(folder)):
         return _open_recording(folder, options, "rosbag")
     dataset = open_kitti(folder) or open_nuscenes(folder, options)
     if dataset is not None:

@@ -1,0 +1,13 @@
+"""What other libraries hand over, as numpy arrays."""
+
+from typing import Any
+
+
+def from_tensor(value: Any) -> Any:
+    """A torch tensor as a numpy array, wherever it lies and whether or not in a graph; anything else as it is."""
+    # open files have a detach of their own
+    if not (hasattr(value, "detach") and hasattr(value, "cpu")):
+        return value
+    tensor = value.detach().cpu()
+    # numpy has no bfloat16
+    return (tensor.float() if str(tensor.dtype) == "torch.bfloat16" else tensor).numpy()
