@@ -68,12 +68,29 @@ def test_a_scene_s_name_and_numpy_s_numbers_do():
         replace(SCENES["wild"], sensors=())
 
 
+@pytest.mark.parametrize(
+    "changes, told",
+    [
+        ({"distance": (12, 4)}, r"SceneConfig.distance must be \(low, high\), got \(12, 4\)"),
+        ({"distance": (np.nan, 3)}, "SceneConfig.distance must be two numbers of at least 0"),
+        ({"distance": 5}, "SceneConfig.distance must be two numbers of at least 0, got 5"),
+        ({"carry": "a"}, "SceneConfig.carry must be a number of at least 0, got 'a'"),
+        ({"company": 2}, "SceneConfig.company must be a number from 0 to 1, got 2"),
+    ],
+)
+def test_scenes_of_nonsense_are_refused(changes, told):
+    with pytest.raises(InputError, match=told):
+        replace(SCENES["wild"], **changes)
+    with pytest.raises(InputError, match="NoiseConfig.mask_keep must be two numbers from 0 to 1"):
+        replace(SCENES["wild"].noise, mask_keep=(0.5, 1.5))
+
+
 def test_difficulty_asked_for_leaves_the_others_alone():
     maker = Generator(scene=SCENES["wild"])
     assert maker.person(SEED, 5, hard=0.0).facts.distance > 0
     for hard in (None, 1.0):
         assert_same(maker.person(SEED, 5, hard=hard).sample, people("wild")[5].sample)
-    with pytest.raises(InputError, match="between 0"):
+    with pytest.raises(InputError, match="hard must be a number from 0 to 1, got 1.5"):
         maker.person(SEED, 5, hard=1.5)
     # other seeds and other indices are other people
     points = {maker.person(seed, index).sample.points.tobytes() for seed in (1, 2, 3) for index in (0, 1, BLOCK)}

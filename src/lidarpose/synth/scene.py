@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from math import inf
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,30 @@ class RandomStream(IntEnum):
     OBJECT_ACQUISITION = 16
 
 
+# fields that are between 0 and 1
+_SHARES = frozenset(
+    "clutter occluder company unusual tempo merged double_rate accumulated inverted integration sparse crowded "
+    "recorded hard mask ground_window mask_keep missing_part intensity_dropout beam_divergence dapt_compat loose "
+    "cut".split()
+)
+
+
+def _check_fields(config: Any) -> None:
+    """Raises InputError for numbers and pairs of numbers that are negative, infinite, or above 1 and a share."""
+    for field in fields(config):
+        value, is_pair = getattr(config, field.name), field.type == tuple[float, float]
+        if not is_pair and field.type not in (float, int):
+            continue
+        numbers = value if is_pair else (value,)
+        most = 1 if field.name in _SHARES else inf
+        is_valid = isinstance(numbers, tuple) and len(numbers) == 1 + is_pair
+        if not (is_valid and all(isinstance(n, Real) and 0 <= n <= most and n < inf for n in numbers)):
+            expected = f"{'two numbers' if is_pair else 'a number'} {'from 0 to 1' if most == 1 else 'of at least 0'}"
+            raise InputError(f"{type(config).__name__}.{field.name} must be {expected}, got {value!r}")
+        if numbers[0] > numbers[-1]:
+            raise InputError(f"{type(config).__name__}.{field.name} must be (low, high), got {value!r}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class NoiseConfig:
     """What goes wrong with returns. Probabilities unless a unit is named; each is off by default.
@@ -67,6 +92,9 @@ class NoiseConfig:
     ring_bias: tuple[float, float] = (0.0, 0.0)
     dapt_compat: bool = False
 
+    def __post_init__(self):
+        _check_fields(self)
+
 
 @dataclass(frozen=True, kw_only=True)
 class CropErrors:
@@ -76,6 +104,9 @@ class CropErrors:
     jitter: float = 0.0
     loose: float = 0.0
     cut: float = 0.0
+
+    def __post_init__(self):
+        _check_fields(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,8 +178,7 @@ class SceneConfig:
     hard: float = 1.0
 
     def __post_init__(self):
-        if not 0 <= self.hard <= 1:
-            raise InputError(f"SceneConfig.hard must be between 0 (easy) and 1 (full), got {self.hard}")
+        _check_fields(self)
         if not self.sensors:
             raise InputError("SceneConfig.sensors must name at least one sensor, got none")
 
@@ -176,14 +206,6 @@ class SceneConfig:
         for setting in settings:
             scene = _changed(scene, *setting.partition("=")[::2])
         return scene
-
-
-# fields that are between 0 and 1
-_SHARES = frozenset(
-    "clutter occluder company unusual tempo merged double_rate accumulated inverted integration sparse crowded "
-    "recorded hard mask ground_window mask_keep missing_part intensity_dropout beam_divergence dapt_compat loose "
-    "cut".split()
-)
 
 
 def _changed(scene: SceneConfig, name: str, text: str) -> SceneConfig:
