@@ -19,7 +19,7 @@ from lidarpose.train.data_loader import SyntheticSource
 from lidarpose.train.networks import PRETRAINED
 from lidarpose.train.objectives.objective import total
 from lidarpose.train.optim import optimizers
-from lidarpose.train.recipes import MODELS, Pretrain, recipe, recipe_of_model
+from lidarpose.train.recipes import MODELS, Pretrain, model_of_size, recipe, recipe_of_model
 from lidarpose.train.setup import objective_of
 
 ROUNDS = 2
@@ -38,7 +38,7 @@ def main() -> None:
     people = people[2 * options.people : 3 * options.people]
     print(f"{np.mean([len(example.points) for example in people]):.0f} points a person")
     for name in options.models:
-        model = next((model for model, sizes in MODELS.items() if name in sizes), name)
+        model = model_of_size(name) or name
         size = "" if model == name else name
         recipe_name = recipe_of_model(Pretrain, model)
         settings = recipe(Pretrain, recipe_name, model=model, size=size)

@@ -7,6 +7,7 @@ import json
 import os
 import re
 import tomllib
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from lidarpose.cli.command_line import make_parser
 from lidarpose.cli.predicting import _FILES
 from lidarpose.io.point_cloud import SUFFIXES
 from lidarpose.models.detector.detector import open_detector
+from lidarpose.synth.scene import SCENES
 
 ROOT = Path(__file__).parents[1]
 SOURCE = Path(lidarpose.__file__).parent
@@ -210,3 +212,10 @@ def test_python_blocks_of_pages_and_the_public_names_pass_type_checking(tmp_path
     config = ["--config-file", str(ROOT / "pyproject.toml"), "--follow-imports", "silent", "--cache-dir", os.devnull]
     out, errors, code = api.run([*config, *map(str, files)])
     assert code == 0, out + errors
+
+
+def test_every_setting_of_a_scene_is_in_the_docs():
+    scene, page = SCENES["wide"], (DOCS / "synthesis.md").read_text()
+    names = {field.name for config in (scene, scene.noise, scene.crop) for field in fields(config)}
+    names = names - {"name", "noise", "crop"} | {"noise.clutter", "keep"}
+    assert not {name for name in names if f"`{name}`" not in page and f"`{name}=" not in page}

@@ -76,6 +76,7 @@ def test_a_scene_s_name_and_numpy_s_numbers_do():
         ({"distance": 5}, "SceneConfig.distance must be two numbers of at least 0, got 5"),
         ({"carry": "a"}, "SceneConfig.carry must be a number of at least 0, got 'a'"),
         ({"company": 2}, "SceneConfig.company must be a number from 0 to 1, got 2"),
+        ({"slope": 5.0}, "SceneConfig.slope must be a number from 0 to 0.785 rad, got 5.0"),
     ],
 )
 def test_scenes_of_nonsense_are_refused(changes, told):

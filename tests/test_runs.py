@@ -575,3 +575,21 @@ def test_another_seed_begins_with_other_weights(tmp_path, monkeypatch):
 
     a, b = begun(1), begun(2)
     assert max((a[name] - b[name]).abs().max() for name in a) > 0.01
+
+
+@pytest.mark.parametrize(
+    "command, words, name, optimizer",
+    [
+        ("pretrain", ["--size", "prn-small"], "prn", "adam"),
+        ("pretrain", ["--size", "lpformer-tiny"], "lpformer", "adamw"),
+        ("pretrain", ["--size", "paper-small"], "dapt", "adamw"),
+        ("pretrain", ["--size", "base"], "ours", "adamw"),
+        ("finetune", ["some", "--init", "random", "--size", "prn-small"], "prn", "adam"),
+    ],
+)
+def test_a_size_alone_chooses_its_network_s_recipe(command, words, name, optimizer, monkeypatch):
+    recipes = []
+    monkeypatch.setattr("lidarpose.train.loop.train", lambda recipe, *_, **__: recipes.append(recipe) or "x")
+    assert main([command, *words]) == 0 and main([command, *words, "--model", name]) == 0
+    by_size, by_model = recipes
+    assert by_size.optimizer == optimizer and replace(by_size, model=name) == by_model

@@ -13,9 +13,9 @@ from lidarpose.errors import InputError
 from lidarpose.train.recipes import TYPES, Finetune, PoseRecipe, Pretrain, Recipe, TrainDetector, TrainVerifier
 
 _RUN = """
- The run's folder holds config.json, log.jsonl, model.safetensors, best.safetensors, pictures, and state.safetensors to
- resume from. After an interruption, --resume continues with the same losses. Several processes: `torchrun
- --nproc_per_node N -m lidarpose COMMAND ...`, with the run's folder named."""
+ The run's folder holds config.json, log.jsonl, model.safetensors, best.safetensors, pictures of people where poses are
+ learned, and state.safetensors to resume from. After an interruption, --resume continues with the same losses. Several
+ processes: `torchrun --nproc_per_node N -m lidarpose COMMAND ...`, with the run's folder named."""
 _PRETRAIN = f"""
 train a network on synthesized people
 Trains on people synthesized during training, or on shards.{_RUN.replace("COMMAND", "pretrain")}
@@ -81,7 +81,7 @@ def _add(parser, kind: type[Recipe]) -> None:
 {folder_option}  a new folder for the run (default runs/{kind.kind}-001, -002, ...); with --resume that of the run
 --resume  continue an interrupted run (default: the latest)
 --recipe NAME  {"default" if kind in (TrainDetector, TrainVerifier) else recipe_help}
---device NAME  cpu (default: a GPU if there is one)
+--device NAME  only cpu may be named (default: a GPU if there is one)
 --tracker NAME  also log to tensorboard or wandb, if installed
 """
     add_options(parser, options)
@@ -104,7 +104,7 @@ def _add(parser, kind: type[Recipe]) -> None:
 
 def _train(options: argparse.Namespace) -> None:
     from lidarpose.train.loop import train
-    from lidarpose.train.recipes import recipe, recipe_of_model
+    from lidarpose.train.recipes import model_of_size, recipe, recipe_of_model
     from lidarpose.train.run_dir import latest, read_config
     from lidarpose.train.validation import draw_examples
 
@@ -141,7 +141,8 @@ def _train(options: argparse.Namespace) -> None:
         run_recipe = kind(**(read_config(Path(folder), kind)[0].to_dict() | changes))
     else:
         # as published, unless a recipe is named
-        recipe_name = options.recipe or recipe_of_model(kind, changes.get("model", ""))
+        model = changes.get("model") or model_of_size(changes.get("size", ""))
+        recipe_name = options.recipe or recipe_of_model(kind, model)
         run_recipe = recipe(kind, recipe_name, **changes)
     words = [f"--{key.replace('_', '-')} {_as_typed(value)}" for key, value in changes.items() if key != "data"]
     words += [f"--recipe {options.recipe}"] * (options.recipe not in (None, "default"))

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
-from math import inf
+from math import inf, pi
 from numbers import Real
 from typing import Any
 
@@ -40,6 +40,8 @@ class RandomStream(IntEnum):
     OBJECT_ACQUISITION = 16
 
 
+# the most that a ground's tilt may vary by, rad; more are degrees
+_STEEPEST = pi / 4
 # fields that are between 0 and 1
 _SHARES = frozenset(
     "clutter occluder company unusual tempo merged double_rate accumulated inverted integration sparse crowded "
@@ -55,10 +57,11 @@ def _check_fields(config: Any) -> None:
         if not is_pair and field.type not in (float, int):
             continue
         numbers = value if is_pair else (value,)
-        most = 1 if field.name in _SHARES else inf
+        most = 1 if field.name in _SHARES else _STEEPEST if field.name == "slope" else inf
         is_valid = isinstance(numbers, tuple) and len(numbers) == 1 + is_pair
-        if not (is_valid and all(isinstance(n, Real) and 0 <= n <= most and n < inf for n in numbers)):
-            expected = f"{'two numbers' if is_pair else 'a number'} {'from 0 to 1' if most == 1 else 'of at least 0'}"
+        if not (is_valid and all(isinstance(n, Real) and 0 <= float(n) <= most and n != inf for n in numbers)):
+            bounds = "of at least 0" if most == inf else f"from 0 to {most:.3g}"
+            expected = f"{'two numbers' if is_pair else 'a number'} {bounds}{' rad' if most == _STEEPEST else ''}"
             raise InputError(f"{type(config).__name__}.{field.name} must be {expected}, got {value!r}")
         if numbers[0] > numbers[-1]:
             raise InputError(f"{type(config).__name__}.{field.name} must be (low, high), got {value!r}")

@@ -161,7 +161,9 @@ class Pretrain(PoseRecipe):
     head: str = _setting(
         "coordinates", "of the paper's network: coordinates (and parts), or heatmaps alone, in one stage"
     )
-    drop_path: float | None = _setting(None, "of the paper's network: share of the last block's branches dropped")
+    drop_path: float | None = _setting(
+        None, "of the paper's network: how often training skips a residual branch, of the last block; earlier ones less"
+    )
     init: str = _setting("", "weights to begin with, of this size or smaller: bundled, or a checkpoint", "NAME|FILE")
     scene: str = _setting("wild", "wild, wide, paper or reference")
     set: tuple[str, ...] = _setting(
@@ -169,7 +171,7 @@ class Pretrain(PoseRecipe):
     )
     people: int = _setting(300_000, "seen in all")
     easy: float = _setting(
-        0.05, "share of the run in which the largest difficulty rises to full; that of shards is what it is", "SHARE"
+        0.05, "share of the run in which the largest difficulty rises to full; stored people keep theirs", "SHARE"
     )
     captured: float = _setting(0.5, "share of poses from captured motion, where clips are given", "SHARE")
     motion: str | None = _setting(None, "captured motion to take poses from: a file or a folder")
@@ -223,7 +225,9 @@ class Finetune(PoseRecipe):
         0.1, "share of sequences kept for validation where the dataset has no split val", "SHARE"
     )
     shift_windows: bool = _setting(False, "of clips: windows begin 0 to 15 frames later, drawn anew each epoch")
-    keep_anchors: bool = _setting(True, "of the paper's network: go on with pre-trained anchors and heads")
+    keep_anchors: bool = _setting(
+        True, "of the paper's network: keep pre-trained anchors and heads, joint by joint of the same name"
+    )
     head: str = _setting("heatmaps", "of the paper's network: heatmaps or coordinates")
 
     def __post_init__(self):
@@ -337,6 +341,11 @@ RECIPES: dict[type[Recipe], dict[str, dict[str, Any]]] = {
 # of a network named by --model whose recipe has another name
 _RECIPE_OF_MODEL = {"dapt": PAPER}
 AnyRecipe = TypeVar("AnyRecipe", bound=Recipe)
+
+
+def model_of_size(size: str) -> str:
+    """The network of `MODELS` that has a size of this name, "" for none."""
+    return next((model for model, sizes in MODELS.items() if size in sizes), "")
 
 
 def recipe_of_model(kind: type[Recipe], model: str) -> str:
