@@ -178,3 +178,18 @@ def test_grass_stands_on_its_disc(seed, blades, radius, height):
     assert len(mesh.faces) == blades
     assert np.hypot(*mesh.vertices[:, :2].T).max() < radius + 0.12
     assert 0 <= mesh.vertices[:, 2].min() and mesh.vertices[:, 2].max() <= height + 1e-6
+
+
+def test_where_vertices_are_at_the_frame_s_end_moves_along():
+    vertices = np.random.default_rng(0).normal(size=(3, 3)).astype(np.float32)
+    faces = np.array([[0, 1, 2]], np.int32)
+    mesh, later = Mesh(vertices, faces, None, vertices + 1), Mesh(vertices + 1, faces)
+    turn = [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]
+    for change in (
+        lambda m: m.moved((1, 2, 3), 0.3),
+        lambda m: m.moved((1, 2, 3)),
+        lambda m: m.scaled((1, 2, 3)),
+        lambda m: m.placed(turn, (4, 5, 6)),
+    ):
+        np.testing.assert_allclose(change(mesh).later, change(later).vertices, atol=1e-6)
+        assert change(later).later is None

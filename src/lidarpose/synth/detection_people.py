@@ -29,7 +29,7 @@ _LOW = ("bend", "crouch", "kneel", "sit")
 _APART, _MORE = 0.42, 0.4
 
 
-@dataclass(kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class PlacedPerson:
     """Row `row` of `bodies` at a place, with props; mounted: on what rolls."""
 

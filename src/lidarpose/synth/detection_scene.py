@@ -120,16 +120,17 @@ def detection_scene(seed: int, index: int, *, family: str = "train") -> Detectio
     if is_training and len(feet):
         scatter(site, _AMONG_PEOPLE, int(rng.integers(0, 5)), feet, rng)
     add_screens(site, feet, rng)
-    _lift(site, people, Relief.draw(layout.indoors, rng), mount.height + layout.sensor[2])
+    people, items = _on_relief(people, site.items, Relief.draw(layout.indoors, rng), mount.height + layout.sensor[2])
     meshes = [(number, *item) for number, person in enumerate(people) for item in person.meshes(duration)]
-    meshes += [(-1, *item) for item in site.items]
+    meshes += [(-1, *item) for item in items]
     # a person's body and clothes are no thing, things are nobody
     owners = [number if name is None else -1 for number, name, _ in meshes]
     kinds = [-1 if name is None else KINDS.index(name) for _, name, _ in meshes]
     counts = [len(mesh.faces) for _, _, mesh in meshes]
     turn = rotation_about("z", mount.turn).T
     scene = union([mesh for _, _, mesh in meshes])
-    points, face = scan_scene(device, _turned(scene, turn.astype(np.float32)), mount.R_sensor_level, rng)
+    turned_scene = scene.mapped(lambda vertices: vertices @ turn.astype(np.float32))
+    points, face = scan_scene(device, turned_scene, mount.R_sensor_level, rng)
     person_of, thing_of = (np.repeat(np.array(values, np.int16), counts)[face] for values in (owners, kinds))
     if scene.part is not None:
         points = scatter_leaves(points, scene.part[face] == LEAVES, rng)
@@ -158,16 +159,19 @@ def detection_scene(seed: int, index: int, *, family: str = "train") -> Detectio
     )
 
 
-def _lift(site: Site, people: list[PlacedPerson], relief: Relief, height: float) -> None:
-    """Sets all on the ground's slope and waves, the sensor to z = 0, so high above its flat ground."""
+def _on_relief(
+    people: list[PlacedPerson], items: list[tuple[str, Mesh]], relief: Relief, height: float
+) -> tuple[list[PlacedPerson], list[tuple[str, Mesh]]]:
+    """People and things on the ground's slope and waves, the sensor at z = 0, so high above its flat ground."""
     offset = np.array([0, 0, -height])
-    for person in people:
-        person.place = replace(person.place, feet=person.place.feet + [0, 0, relief.at(person.place.feet)] + offset)
-    for row, (name, mesh) in enumerate(site.items):
-        vertices = mesh.vertices.copy()
+
+    def lifted(vertices: np.ndarray) -> np.ndarray:
+        vertices = vertices.copy()
         vertices[:, 2] += relief.at(vertices.T)
-        site.items[row] = name, Mesh((vertices + offset).astype(np.float32), mesh.faces, mesh.part)
+        return (vertices + offset).astype(np.float32)
 
-
-def _turned(mesh: Mesh, turn: np.ndarray) -> Mesh:
-    return Mesh(mesh.vertices @ turn, mesh.faces, mesh.part, None if mesh.later is None else mesh.later @ turn)
+    lifted_people = []
+    for person in people:
+        feet = person.place.feet + [0, 0, relief.at(person.place.feet)] + offset
+        lifted_people.append(replace(person, place=replace(person.place, feet=feet)))
+    return lifted_people, [(name, mesh.mapped(lifted)) for name, mesh in items]

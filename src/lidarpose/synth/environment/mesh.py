@@ -5,7 +5,7 @@ length along y where they have one; sizes in meters. What is called with an rng 
 function of its sizes. A mesh of a kind is built once with unit size and then scaled: every person draws some.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib import resources
@@ -34,19 +34,23 @@ class Mesh:
 
     def moved(self, translation: Vector, yaw: float = 0.0) -> "Mesh":
         """Turned by `yaw` rad about z, then moved by `translation` (3,) m."""
-        vertices = self.vertices
-        if yaw:
-            c, s = cos(yaw), sin(yaw)
-            vertices = vertices @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32)
-        return Mesh(vertices + np.asarray(translation, np.float32), self.faces, self.part)
+        c, s = cos(yaw), sin(yaw)
+        R, t = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32), np.asarray(translation, np.float32)
+        return self.mapped(lambda vertices: (vertices @ R if yaw else vertices) + t)
 
     def scaled(self, size: Vector) -> "Mesh":
         """Stretched along x, y and z."""
-        return Mesh(self.vertices * np.asarray(size, np.float32), self.faces, self.part)
+        return self.mapped(lambda vertices: vertices * np.asarray(size, np.float32))
 
     def placed(self, rows: Sequence, origin: Sequence) -> "Mesh":
         """In another frame: rows (3, 3) say where x, y and z go, then `origin` (3,) m is added."""
-        return Mesh(self.vertices @ np.array(rows, np.float32) + np.array(origin, np.float32), self.faces, self.part)
+        R, t = np.array(rows, np.float32), np.array(origin, np.float32)
+        return self.mapped(lambda vertices: vertices @ R + t)
+
+    def mapped(self, function: Callable[[np.ndarray], np.ndarray]) -> "Mesh":
+        """With all vertices (V, 3) m, those of the frame's end too, where a function puts them."""
+        later = None if self.later is None else function(self.later)
+        return Mesh(function(self.vertices), self.faces, self.part, later)
 
 
 def union(meshes: list[Mesh]) -> Mesh:
