@@ -19,8 +19,9 @@ from lidarpose.models import decode
 from lidarpose.models.dapt.dapt_config import CONFIGS, WAYMO_JOINTS, DaptConfig, named_config
 from lidarpose.models.dapt.dapt_net import DaptNet, to_tensors
 from lidarpose.models.dapt.import_weights import import_dapt
-from lidarpose.models.dapt.point_transformer_v3 import DropPath, PatchAttention, RowNorm, Stage, SubmanifoldConvolution
+from lidarpose.models.dapt.point_transformer_v3 import PatchAttention, RowNorm, Stage, SubmanifoldConvolution
 from lidarpose.models.dapt.voxel_tables import LAYOUTS, build_tables
+from lidarpose.models.layers import DropPath
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
 
 PARITY = Path(__file__).parent / "parity"

@@ -67,7 +67,7 @@ def _paper(commands, execute: Callable[[list[str]], int], options: argparse.Name
             return
         begin_out(out)
         motion = paper_options.motion[0] if paper_options.motion else None
-        print(figures.draw_one_body(out, seed=0, motion=motion))
+        print(figures.draw_one_body(out, motion=motion))
         return
     table, row_keys = TABLES[options.name], names(options.rows or "")
     selected_cells = cells(table, paper_options, row_keys)

@@ -165,7 +165,7 @@ class PersonPose:
             description = self.skeleton.name
         else:
             description = f"{self.skeleton.name}, confidence {self.confidence.mean():.2f}"
-        return f"PersonPose({name}{description}, {self.num_points:,} points{_count(self.warnings, 'warning')})"
+        return f"PersonPose({name}{description}, {self.num_points:,} points{_warning_count(self.warnings)})"
 
     def _repr_png_(self) -> bytes:
         return bytes(self.picture())
@@ -212,9 +212,7 @@ class Poses(Sequence[PersonPose]):
     def __repr__(self) -> str:
         num_posed = sum(person.has_pose for person in self.people)
         source = "" if self.source is None else f", from {self.source!r}"
-        return (
-            f"Poses({num_posed} of {len(self)} people, {self.skeleton.name}{source}{_count(self.warnings, 'warning')})"
-        )
+        return f"Poses({num_posed} of {len(self)} people, {self.skeleton.name}{source}{_warning_count(self.warnings)})"
 
     def _repr_html_(self) -> str:
         rows = [("th", ("id", "points", "confidence", "warnings"))]
@@ -378,9 +376,9 @@ def _rounded(values: np.ndarray | None, digits: int) -> list:
     return [] if values is None else np.round(np.asarray(values, float), digits).tolist()
 
 
-def _count(items: Sequence[str], name: str) -> str:
+def _warning_count(warnings: Sequence[str]) -> str:
     """ ", 2 warnings", or nothing for none."""
-    return f", {counted(len(items), name)}" if items else ""
+    return f", {counted(len(warnings), 'warning')}" if warnings else ""
 
 
 def _mean(values: np.ndarray | None) -> str:

@@ -20,6 +20,22 @@ PLACE_FEATURES = 3 + 6 * len(WAVELENGTHS)
 REACH = {"window": 0.36, "full": 1.2}
 
 
+class DropPath(nn.Module):
+    """Stochastic depth: in training drops the branch (B, ...) of some of B with a probability, and scales the others up
+    to keep the mean."""
+
+    def __init__(self, probability: float):
+        super().__init__()
+        self.probability = probability
+
+    def forward(self, branch: Tensor) -> Tensor:
+        if not self.training or self.probability == 0:
+            return branch
+        keep_probability = 1 - self.probability
+        one_each = branch.flatten(1)[:, :1].view(-1, *(1,) * (branch.dim() - 1))
+        return branch * (torch.rand_like(one_each) < keep_probability) / keep_probability
+
+
 class RotaryEmbedding:
     """Where rows (B, N, 3) m stand, as sines and cosines that position features and rotary attention share."""
 

@@ -20,6 +20,7 @@ from lidarpose.models.baselines.lidarcap import (
     forward_kinematics,
     rest_offsets,
 )
+from lidarpose.models.layers import DropPath
 from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import SMPL24
 
@@ -89,6 +90,7 @@ class Exchange(nn.Module):
         )
         self.attention = nn.ModuleList(nn.MultiheadAttention(width, 8, batch_first=True) for _ in range(3))
         self.norm = nn.LayerNorm(3 * width, eps=1e-6)
+        self.drop_path = DropPath(0.2)
         self.mlp = nn.Sequential(
             nn.Linear(3 * width, hidden), nn.GELU(), nn.Dropout(0.1), nn.Linear(hidden, 3 * width), nn.Dropout(0.1)
         )
@@ -98,20 +100,12 @@ class Exchange(nn.Module):
         neighbors = neighbors + self._attend(1, person, background, neighbors)
         background = background + self._attend(2, person, neighbors, background)
         x = torch.cat([person, neighbors, background], -1)
-        return x + drop_path(self.mlp(self.norm(x)), 0.2, self.training)
+        return x + self.drop_path(self.mlp(self.norm(x)))
 
     def _attend(self, number: int, query: Tensor, key: Tensor, value: Tensor) -> Tensor:
         query, key, value = (norm(x) for norm, x in zip(self.norms[number], (query, key, value), strict=True))
         output = self.attention[number](query, key, value, need_weights=False)[0]
-        return drop_path(F.dropout(output, 0.1, self.training), 0.2, self.training)
-
-
-def drop_path(branch: Tensor, rate: float, training: bool) -> Tensor:
-    """A residual branch (B, ...), left out for some of B in training."""
-    if not training:
-        return branch
-    keep_mask = torch.rand(len(branch), *(1,) * (branch.dim() - 1), device=branch.device) >= rate
-    return branch * keep_mask / (1 - rate)
+        return self.drop_path(F.dropout(output, 0.1, self.training))
 
 
 def _heights() -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lidarpose.models.dapt.voxel_tables import Level, Neighbors
-from lidarpose.models.layers import attend
+from lidarpose.models.layers import DropPath, attend
 
 # of the released code's batch norms
 _EPS, _MOMENTUM = 1e-3, 0.01
@@ -27,20 +27,6 @@ class RowNorm(nn.BatchNorm1d):
         if self.training and rows.shape[0] > 1:
             return super().forward(rows)
         return F.batch_norm(rows, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps)
-
-
-class DropPath(nn.Module):
-    """In training drops a branch of each row with a probability, and scales the others up to keep the mean."""
-
-    def __init__(self, probability: float):
-        super().__init__()
-        self.probability = probability
-
-    def forward(self, rows: Tensor) -> Tensor:
-        if not self.training or self.probability == 0:
-            return rows
-        keep_probability = 1 - self.probability
-        return rows * (torch.rand_like(rows[:, :1]) < keep_probability) / keep_probability
 
 
 class SubmanifoldConvolution(nn.Module):

@@ -32,8 +32,8 @@ _SEED = 2**31 - 11
 FALSE_PER_SCAN = 1.0
 # who is less likely is not posed to learn what scores mean
 _LEAST_SCORE = 0.01
-# of the logistic, on standardized features; of the piecewise linear curve, its knots at most
-_RIDGE, _KNOTS = 1e-3, 16
+# of the logistic, on standardized features: its ridge, steps of Newton's method; knots of the curve at most
+_RIDGE, _NEWTON_STEPS, _KNOTS = 1e-3, 30, 16
 
 
 def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = None) -> Path:
@@ -130,13 +130,13 @@ def passing_score(false: np.ndarray, scans: int) -> float:
     return float(false[last - 1 : last + 1].mean()) if last > 0 else 0.5
 
 
-def logistic(features: np.ndarray, labels: np.ndarray, *, iterations: int = 30) -> tuple[float, np.ndarray]:
+def logistic(features: np.ndarray, labels: np.ndarray) -> tuple[float, np.ndarray]:
     """The bias and weights (F,) of a logistic regression of labels (D,), by Newton's method, slightly shrunk."""
     mean, scale = features.mean(0), features.std(0) + 1e-6
     x = np.column_stack([np.ones(len(features)), (features - mean) / scale])
     weights = np.zeros(x.shape[1])
     shrink = _RIDGE * len(x) * np.eye(len(weights))
-    for _ in range(iterations):
+    for _ in range(_NEWTON_STEPS):
         probability = 1 / (1 + np.exp(-x @ weights))
         gradient = x.T @ (probability - labels) + shrink @ weights
         hessian = (x * (probability * (1 - probability))[:, None]).T @ x + shrink
