@@ -16,10 +16,10 @@ from lidarpose.models.baselines.lidarcap import (
     tree_partition,
 )
 from lidarpose.models.baselines.lpformer import V2V, Lpformer
-from lidarpose.models.baselines.ne import Exchange, Ne
+from lidarpose.models.baselines.ne import CloudExchange, Ne
 from lidarpose.models.baselines.point_ops import ball_query, farthest_points, nearest_neighbors
 from lidarpose.models.baselines.point_transformer_v2 import Rows
-from lidarpose.models.baselines.prn import Prn, PrnNeck, VoteHead
+from lidarpose.models.baselines.prn import OffsetHead, Prn, PrnNeck
 from lidarpose.models.checkpoint import build
 from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import SMPL24, WAYMO14
@@ -148,7 +148,7 @@ def test_layers_stand_in_the_published_order():
         first, *others = build(replace(config[name], width_divisor=8)).rotations.layers
         assert kinds(first.time)[-1] == "Dropout 0.0" and first.residual is None
         assert all(kinds(layer.time)[-1] == "Dropout 0.5" and layer.residual for layer in others)
-    exchange = Exchange(16, 8)
+    exchange = CloudExchange(16, 8)
     assert kinds(exchange.mlp) == ["Linear", "GELU", "Dropout 0.1", "Linear", "Dropout 0.1"]
     assert all(attention.dropout == 0 for attention in exchange.attention)
     # what is dropped of attention's output, besides whole clips
@@ -225,7 +225,7 @@ def test_order_and_padding_change_nothing(name):
 @torch.no_grad()
 def test_points_that_are_sure_vote():
     torch.manual_seed(0)
-    head = VoteHead(6, 3, background=3).eval()
+    head = OffsetHead(6, 3, background=3).eval()
     head.parts[-1].weight.mul_(100)
     xyz, features, person = torch.randn(40, 3), torch.randn(40, 6), torch.arange(40) // 30
     voted, parts, offsets = head(features, Rows(xyz=xyz, person=person, count=torch.tensor([30, 10])))

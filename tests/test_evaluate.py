@@ -35,7 +35,7 @@ from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.models import DEFAULT
 from lidarpose.sample import Box, Pose, center_of
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14, Skeleton
-from lidarpose.synth.shard_job import Job, write_dataset
+from lidarpose.synth.shard_job import SynthesisJob, write_dataset
 
 
 class Fake:
@@ -633,7 +633,7 @@ def test_the_figures_of_the_docs_are_those_of_the_bundled_weights_on_the_bench()
 def made(tmp_path_factory):
     """Synthesized people of seed 0."""
     folder = tmp_path_factory.mktemp("made") / "people"
-    write_dataset(Job(what="people", count=3, hard=0.0, sensors=("os1-128",)), folder)
+    write_dataset(SynthesisJob(what="people", count=3, hard=0.0, sensors=("os1-128",)), folder)
     return folder
 
 

@@ -26,7 +26,7 @@ from lidarpose.sample import Box, center_of
 from lidarpose.skeleton import HUMAN15
 from lidarpose.synth.generator import LEAST_POINTS
 from lidarpose.synth.noise import noise_cluster, noise_clusters
-from lidarpose.synth.shard_job import Job, write_dataset
+from lidarpose.synth.shard_job import SynthesisJob, write_dataset
 
 seeds = st.integers(0, 999)
 often = settings(max_examples=40)
@@ -174,7 +174,7 @@ def test_end_joints_are_of_the_worst_people():
 @pytest.fixture(scope="module")
 def synthetic(tmp_path_factory):
     folder = tmp_path_factory.mktemp("synth") / "people"
-    write_dataset(Job(what="people", count=12, hard=0.0, sensors=("os1-128",)), folder)
+    write_dataset(SynthesisJob(what="people", count=12, hard=0.0, sensors=("os1-128",)), folder)
     return folder
 
 

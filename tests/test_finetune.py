@@ -26,7 +26,7 @@ from lidarpose.models.checkpoint import load_checkpoint, read_header
 from lidarpose.sample import SEEN, UNLABELED, Box, LabeledSample, Pose, center_of
 from lidarpose.skeleton import BODY26, HUMAN15, skeleton
 from lidarpose.synth.generator import Generator
-from lidarpose.synth.shard_job import Job, write_dataset
+from lidarpose.synth.shard_job import SynthesisJob, write_dataset
 from lidarpose.train import loop, run_dir
 from lidarpose.train.augment import (
     AUGMENTATIONS,
@@ -75,7 +75,7 @@ def datasets(tmp_path_factory):
 @pytest.fixture(scope="module")
 def synthetic(tmp_path_factory):
     folder = tmp_path_factory.mktemp("synthetic") / "people"
-    write_dataset(Job(what="people", count=6, scene="paper", seed=3), folder)
+    write_dataset(SynthesisJob(what="people", count=6, scene="paper", seed=3), folder)
     return folder
 
 

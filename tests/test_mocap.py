@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from lidarpose.body.mocap import digest, joint_tree, load_motion, retarget, skeleton_files
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES
-from lidarpose.synth.shard_job import Job
+from lidarpose.synth.shard_job import SynthesisJob
 
 J, MAIN = files.J, files.MAIN
 ROTATIONS, WAY = files.a_clip(20)
@@ -461,10 +461,10 @@ def test_a_recording_is_told_from_another_by_what_it_holds(tmp_path):
     (second / "notes.txt").write_text("no motion")
     was = digest(first)
     assert digest(second) == was and digest(first / "02" / "a_poses.npz") not in (was, digest(first / "02"))
-    card = Job(what="people", count=3, motion=str(first)).card()
-    assert card == Job(what="people", count=3, motion=str(second)).card()
+    card = SynthesisJob(what="people", count=3, motion=str(first)).card()
+    assert card == SynthesisJob(what="people", count=3, motion=str(second)).card()
     files.write_amass(first / "02" / "b_poses.npz", *files.a_clip(4))
-    assert digest(first) != was and card != Job(what="people", count=3, motion=str(first)).card()
+    assert digest(first) != was and card != SynthesisJob(what="people", count=3, motion=str(first)).card()
     with pytest.raises(InputError, match="none.npz: no such file"):
         digest(tmp_path / "none.npz")
 

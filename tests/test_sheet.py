@@ -16,7 +16,7 @@ from lidarpose.errors import InputError
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import shard_job
-from lidarpose.synth.shard_job import Job, write_dataset
+from lidarpose.synth.shard_job import SynthesisJob, write_dataset
 from lidarpose.synth.street import street
 from lidarpose.viz import contact_sheet
 from lidarpose.viz.bird_eye import (
@@ -38,7 +38,7 @@ def written(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sheet")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(shard_job, "PER_SHARD", {"people": 8, "clips": 1, "streets": 1})
-        write_dataset(Job(what="people", count=20, sensors=("os1-64",)), folder / "streetlife")
+        write_dataset(SynthesisJob(what="people", count=20, sensors=("os1-64",)), folder / "streetlife")
     return folder
 
 
@@ -100,7 +100,7 @@ def test_an_unfinished_dataset_is_drawn_as_far_as_it_is(dataset, capsys):
 
 
 def test_one_person_is_not_people(tmp_path):
-    write_dataset(Job(what="people", count=1, sensors=("os1-64",)), tmp_path / "alone")
+    write_dataset(SynthesisJob(what="people", count=1, sensors=("os1-64",)), tmp_path / "alone")
     page = draw_dataset(tmp_path / "alone", html=True, out=tmp_path / "page.html").read_text()
     assert "alone: 1 person, scene wild" in page
 
@@ -195,7 +195,7 @@ def test_a_scan_is_as_wide_as_the_cards_below_it():
 def test_view_of_streets_shows_them_from_above(tmp_path, monkeypatch):
     monkeypatch.setattr(shard_job, "STREET_FRAMES", 2)
     monkeypatch.setattr(shard_job, "PER_SHARD", {"streets": 2})
-    write_dataset(Job(what="streets", count=3, seed=4, sensors=("vlp-16",)), tmp_path / "s")
+    write_dataset(SynthesisJob(what="streets", count=3, seed=4, sensors=("vlp-16",)), tmp_path / "s")
     panels = []
     draw = contact_sheet.draw_scans
     monkeypatch.setattr(contact_sheet, "draw_scans", lambda p, path, **more: panels.extend(p) or draw(p, path, **more))

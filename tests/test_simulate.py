@@ -18,7 +18,7 @@ from lidarpose.synth.generator import Generator
 from lidarpose.synth.place import Place
 from lidarpose.synth.props.attachments import rigid_prop
 from lidarpose.synth.scene import SCENES, scene_config
-from lidarpose.synth.simulate import Scan, ScanConditions, Scene, count_alone, draw_conditions, simulate_scan
+from lidarpose.synth.simulate import ScanConditions, Scene, SimulatedScan, count_alone, draw_conditions, simulate_scan
 
 SEED = 11
 PAPER = SCENES["paper"]
@@ -239,7 +239,7 @@ def test_pose_box_and_body_of_a_frame_are_in_one_place(props):
     actor, where = goer(), scene(config=tight, props=props)
     for frame, heading in enumerate(HEADINGS):
         person = where.meshes(actor, frame)[0].vertices
-        seen = Scan(points=person, ring=np.zeros(8, np.int32), part=np.ones(8, np.uint8))
+        seen = SimulatedScan(points=person, ring=np.zeros(8, np.int32), part=np.ones(8, np.uint8))
         for seed in range(4):
             sample = generator._crop(where, actor, frame, seen, np.random.default_rng(seed))
             assert abs((sample.box.yaw - where.place.yaw - heading + np.pi) % (2 * np.pi) - np.pi) < 1e-6

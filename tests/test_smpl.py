@@ -15,7 +15,7 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth.bodies import smpl_rig
-from lidarpose.synth.shard_job import Job
+from lidarpose.synth.shard_job import SynthesisJob
 
 J = BODY26.index
 R_LEVEL_SMPL = UP_AXES["y"]
@@ -291,7 +291,7 @@ def test_people_are_synthesized_of_a_file_of_the_user_with_the_shapes_of_the_mot
         (poses / f"{k:06d}.json").write_text(json.dumps(frame))
     np.testing.assert_array_equal(load_betas(tmp_path / "pose"), np.unique(shapes, axis=0))
     made, shipped = (
-        Job(what="people", count=4, scene="paper", motion=str(poses), captured=1.0, body=body).generator()
+        SynthesisJob(what="people", count=4, scene="paper", motion=str(poses), captured=1.0, body=body).generator()
         for body in (str(tmp_path / "body.npz"), None)
     )
     np.testing.assert_allclose(np.unique(made.rig.coefficients, axis=0), np.unique(shapes, axis=0), atol=1e-6)
@@ -308,4 +308,4 @@ def test_motion_without_shapes_leaves_them_to_chance(tmp_path):
     rig = smpl_rig(tmp_path / "body.npz", tmp_path / "motion.npz")
     assert rig.coefficients.shape == (256, 10) and 0.7 < rig.coefficients.std() < 1.1
     with pytest.raises(InputError, match="expected a body of the SMPL family, .npz or .pkl"):
-        Job(what="people", count=4, body=str(tmp_path / "body.txt")).generator()
+        SynthesisJob(what="people", count=4, body=str(tmp_path / "body.txt")).generator()

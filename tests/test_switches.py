@@ -21,7 +21,7 @@ from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
-from lidarpose.synth.shard_job import Job, write_dataset
+from lidarpose.synth.shard_job import SynthesisJob, write_dataset
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.setup import make_setup
 
@@ -122,7 +122,7 @@ def test_recorded_places_need_motion_and_single_people(tmp_path):
     with pytest.raises(InputError, match="--motion"):
         Generator(scene=scene)
     with pytest.raises(InputError, match="--clips"):
-        Job(what="clips", count=1, motion="m.npz", set=("recorded=1",))
+        SynthesisJob(what="clips", count=1, motion="m.npz", set=("recorded=1",))
     bank, _ = _bank(np.zeros(3))
     with pytest.raises(InputError, match="clips have no recorded places: set recorded=0"):
         Generator(scene=scene, bank=bank, captured=1.0).clip(1, 0)
@@ -137,7 +137,7 @@ def test_recorded_places_need_motion_and_single_people(tmp_path):
 @pytest.fixture(scope="module")
 def people(tmp_path_factory):
     folder = tmp_path_factory.mktemp("synthetic") / "people"
-    write_dataset(Job(what="people", count=6, scene="paper", seed=3), folder)
+    write_dataset(SynthesisJob(what="people", count=6, scene="paper", seed=3), folder)
     return folder
 
 

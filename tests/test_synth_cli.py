@@ -21,7 +21,7 @@ from lidarpose.lidar.presets import listing
 from lidarpose.synth import shard_job, street
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
-from lidarpose.synth.shard_job import Job, Maker, write_dataset
+from lidarpose.synth.shard_job import Maker, SynthesisJob, write_dataset
 from lidarpose.synth.street import Street
 from lidarpose.train.torch_dataset import SyntheticPeople
 
@@ -125,7 +125,9 @@ def test_a_shard_of_too_few_people_is_made_again(dataset, tmp_path):
 
 def job(**settings):
     """That of `WORDS`."""
-    return Job(what="people", count=COUNT, per_shard=PER_SHARD, sensors=("os1-64", "vlp-16"), seed=5, **settings)
+    return SynthesisJob(
+        what="people", count=COUNT, per_shard=PER_SHARD, sensors=("os1-64", "vlp-16"), seed=5, **settings
+    )
 
 
 def test_other_settings_are_refused_by_name(dataset, capsys):
@@ -298,7 +300,7 @@ def test_difficulty_asked_for_is_the_people_s(tmp_path):
     (sample,) = SyntheticPeople(scene=scene, seed=2, start=1, stop=2, hard=0.0)
     wanted = Generator(scene=scene, measure=False).person(2, 1, hard=0.0).sample
     np.testing.assert_array_equal(sample.points, wanted.points)
-    write_dataset(Job(what="people", count=3, hard=0.0, seed=2, sensors=("os1-64",)), tmp_path / "d")
+    write_dataset(SynthesisJob(what="people", count=3, hard=0.0, seed=2, sensors=("os1-64",)), tmp_path / "d")
     np.testing.assert_array_equal(list(open_dataset(tmp_path / "d"))[1].points, wanted.points)
 
 
@@ -310,7 +312,7 @@ def test_streets_take_turns_with_the_sensors(monkeypatch, tmp_path):
         return Street(frames=(), sensor=sensor, height=1.7)
 
     monkeypatch.setattr(street, "street", made)
-    job = Job(what="streets", count=5, sensors=("os1-64", "vlp-16"))
+    job = SynthesisJob(what="streets", count=5, sensors=("os1-64", "vlp-16"))
     maker = Maker(job=job, card=job.card(), folder=tmp_path, generator=job.generator())
     for index in range(5):
         maker._street_rows(index)
@@ -321,7 +323,7 @@ def test_a_job_s_scene_and_share_are_the_generator_s(tmp_path):
     rotations, way = a_clip(40)
     path = write_amass(tmp_path / "walk_01.npz", rotations, way, fps=10.0)
     for settings, share in ((dict(), 0.0), (dict(motion=str(path)), 0.5), (dict(motion=str(path), captured=0.2), 0.2)):
-        job = Job(what="people", count=1, scene="paper", **settings)
+        job = SynthesisJob(what="people", count=1, scene="paper", **settings)
         generator = job.generator()
         assert generator.scene == scene_config("paper") and generator.captured == share
         assert (generator.bank is None) == (not settings)

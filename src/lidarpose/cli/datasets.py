@@ -86,12 +86,12 @@ def _demo(options: argparse.Namespace) -> None:
 
 def _synth(options: argparse.Namespace) -> None:
     from lidarpose.data.dataset_card import content_count
-    from lidarpose.synth.shard_job import Job, write_dataset
+    from lidarpose.synth.shard_job import SynthesisJob, write_dataset
 
     if options.clips and options.scenes:
         raise InputError("--clips and --scenes are different datasets: name one of them")
     fields = ("count", "scene", "seed", "hard", "motion", "captured", "body", "per_shard")
-    job = Job(
+    job = SynthesisJob(
         what="clips" if options.clips else "streets" if options.scenes else "people",
         sensors=None if options.sensor is None else names(options.sensor),
         subjects=None if options.subjects is None else names(options.subjects),

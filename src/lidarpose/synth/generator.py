@@ -30,8 +30,8 @@ from lidarpose.synth.place import Place, draw_place, recorded_place
 from lidarpose.synth.props import draw_props
 from lidarpose.synth.scene import RandomStream, SceneConfig, scene_config
 from lidarpose.synth.simulate import (
-    Scan,
     Scene,
+    SimulatedScan,
     count_alone,
     draw_conditions,
     scan_background,
@@ -299,7 +299,7 @@ def _smpl_pose(place: Place, bodies: Bodies, row: int) -> np.ndarray:
     return axis_angles[0].astype(np.float32)
 
 
-def _crop(scene: Scene, bodies: Bodies, row: int, scan: Scan, rng: np.random.Generator) -> Sample:
+def _crop(scene: Scene, bodies: Bodies, row: int, scan: SimulatedScan, rng: np.random.Generator) -> Sample:
     """The points in a box as a detector draws it."""
     config, place, acquisition = scene.config, scene.body_place, scene.acquisition
     box = noise.draw_box(config.crop, config.hard, _extent(scene, bodies, row, rng), place, rng, bodies.heading[row])

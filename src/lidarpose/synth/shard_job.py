@@ -35,7 +35,7 @@ _MOST_SHARDS = 100_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Job:
+class SynthesisJob:
     """What to make. what: people, clips or streets; count of them; scene: a preset's name; sensors: names or files of
     tables, None: the scene's; hard in [0, 1]; motion: a file of captured clips whose poses make up a share `captured`
     of all (None: half), subjects: which of them; body: the user's SMPL file instead of the shipped body; set: changes
@@ -137,7 +137,7 @@ class Job:
 
 
 def write_dataset(
-    job: Job, folder: str | Path, *, workers: int = 1, progress: Callable[[int, int], None] | None = None
+    job: SynthesisJob, folder: str | Path, *, workers: int = 1, progress: Callable[[int, int], None] | None = None
 ) -> int:
     """Makes what is missing of a dataset; returns how many persons, clips or streets were made now.
 
@@ -175,7 +175,7 @@ class Maker:
     """Makes the shards of a job and writes them: called with a shard's number, yields counts of persons, clips or
     streets as they are done. Written when the last one was yielded. May be pickled."""
 
-    job: Job
+    job: SynthesisJob
     card: DatasetCard
     folder: Path
     generator: "Generator"

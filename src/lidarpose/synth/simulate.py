@@ -140,7 +140,7 @@ class View:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scan:
+class SimulatedScan:
     """Points (n, 3) float32 m in the level frame, with noise; ring (n,); part (n,) uint8, 0: not the person."""
 
     points: np.ndarray
@@ -175,12 +175,12 @@ def _between(ends: tuple[float, float], share: float) -> float:
     return ends[0] + share * (ends[1] - ends[0])
 
 
-def simulate(scene: Scene, bodies: Bodies, row: int, rng: np.random.Generator, *, frame: int = 0) -> Scan:
+def simulate(scene: Scene, bodies: Bodies, row: int, rng: np.random.Generator, *, frame: int = 0) -> SimulatedScan:
     """The cloud of body `row`: what the scene's sensor returns, and all that is added to it."""
     return _added_up(scene.scans(bodies, row, frame), rng)
 
 
-def simulate_still(scene: Scene, thing: Mesh, rng: np.random.Generator) -> Scan:
+def simulate_still(scene: Scene, thing: Mesh, rng: np.random.Generator) -> SimulatedScan:
     """The same of a thing that does not move."""
     view_scans = ((view.scene, thing.moved(-view.at), -view.earlier, view.at) for view in scene.views)
     scans = [(scene, thing, 0, np.zeros(3)), *view_scans]
@@ -190,19 +190,21 @@ def simulate_still(scene: Scene, thing: Mesh, rng: np.random.Generator) -> Scan:
     )
 
 
-def _added_up(view_scans: Iterable[tuple[Scene, list[Mesh], int, np.ndarray]], rng: np.random.Generator) -> Scan:
+def _added_up(
+    view_scans: Iterable[tuple[Scene, list[Mesh], int, np.ndarray]], rng: np.random.Generator
+) -> SimulatedScan:
     """Scans as in `Scene.scans` in the frame of the first one."""
-    scans: list[Scan] = []
+    scans: list[SimulatedScan] = []
     for view_scene, meshes, frame, position in view_scans:
         scan = simulate_scan(view_scene, meshes, rng, frame=frame)
         scans.append(replace(scan, points=scan.points + position.astype(np.float32)) if scans else scan)
     if len(scans) == 1:
         return scans[0]
     arrays = {name: np.concatenate([getattr(scan, name) for scan in scans]) for name in ("points", "ring", "part")}
-    return Scan(**arrays)
+    return SimulatedScan(**arrays)
 
 
-def simulate_scan(scene: Scene, meshes: list[Mesh], rng: np.random.Generator, *, frame: int = 0) -> Scan:
+def simulate_scan(scene: Scene, meshes: list[Mesh], rng: np.random.Generator, *, frame: int = 0) -> SimulatedScan:
     """What the scene's sensor returns.
 
     Args:
@@ -218,7 +220,7 @@ def simulate_scan(scene: Scene, meshes: list[Mesh], rng: np.random.Generator, *,
     if scene.config.noise.dapt_compat and isinstance(sensor, Sensor):
         seam_rows = np.flatnonzero((hits.column[returned] + hits.column0) % sensor.columns == 0)
         points, ring, part = (np.concatenate([a, a[seam_rows]]) for a in (points, ring, part))
-    return Scan(points=scene.place.to_level(points), ring=ring, part=part)
+    return SimulatedScan(points=scene.place.to_level(points), ring=ring, part=part)
 
 
 def count_alone(scene: Scene, body: Mesh, frame: int) -> int:

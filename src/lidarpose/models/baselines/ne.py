@@ -42,7 +42,7 @@ class Ne(nn.Module):
         self.encoders = nn.ModuleDict({name: PointNet2(width, divisor, as_published=as_published) for name in CLOUDS})
         stock_initialization = config.stock_initialization
         self.neighbors = _transformer(width, hidden, stock_initialization=stock_initialization)
-        self.exchange = Exchange(width, hidden)
+        self.exchange = CloudExchange(width, hidden)
         self.norm = nn.LayerNorm(3 * width, eps=1e-6)
         self.clip = _transformer(3 * width, hidden, stock_initialization=stock_initialization)
         self.joints = nn.Linear(3 * width, 3 * len(SMPL24))
@@ -79,7 +79,7 @@ class Ne(nn.Module):
         return ClipOutputs(joints=joints, rotations=self.rotations(joints, self.widen(hidden)))
 
 
-class Exchange(nn.Module):
+class CloudExchange(nn.Module):
     """Person, background and neighbors (B, T, C) -> (B, T, 3 C): each asks with one, by the keys of another."""
 
     def __init__(self, width: int, hidden: int):

@@ -43,7 +43,7 @@ class Prn(nn.Module):
         self.unused = nn.Sequential(
             nn.Linear(channels, channels), nn.BatchNorm1d(channels), nn.ReLU(), nn.Linear(channels, joints + 1)
         ).requires_grad_(False)
-        self.vote = VoteHead(channels, joints, background=joints)
+        self.vote = OffsetHead(channels, joints, background=joints)
         width = channels + 3
         self.joint = nn.Embedding(joints, 32)
         self.embed = nn.Linear(32 + 3, channels)
@@ -70,7 +70,7 @@ class Prn(nn.Module):
         return PrnOutputs(joints=self.output(tokens), voted=voted, parts=parts, offsets=offsets)
 
 
-class VoteHead(nn.Module):
+class OffsetHead(nn.Module):
     """Parts and offsets of points, from their features beside the maximum and mean of the person's; and the joints that
     they vote for. background: which of the parts that is."""
 
@@ -127,7 +127,7 @@ class PrnNeck(nn.Module):
 
     def __init__(self, channels: int, joints: int, heads: int = 4, dropout: float = 0.1):
         super().__init__()
-        self.vote = VoteHead(channels, joints, background=0)
+        self.vote = OffsetHead(channels, joints, background=0)
         self.joint = nn.Parameter(torch.zeros(joints, channels))
         self.embed = nn.Linear(channels + 3, channels)
         self.token = nn.Linear(channels + 3, channels)

@@ -31,7 +31,7 @@ from lidarpose.models.layers import mean_bin
 FINEST_LAYERS = 4
 
 
-class Exchange(nn.Module):
+class MultiDensityExchange(nn.Module):
     """Multi-density exchange: anchors (B, J, A) look at each other, then at the voxels of one level.
 
     Paper: A_{m-1} = MDE_m(A_m, f_m). A stock post-norm decoder layer, anchors as its targets, voxels as its memory;
@@ -218,7 +218,9 @@ class _Backbone(nn.Module):
             stages.append(Stage(up_widths[s], config.decoder_heads[s], config.mlp_ratio, drops[::-1], coarser=coarser))
             anchor_in, anchor_out = config.anchor_channels[s + 1], config.anchor_channels[s]
             if self.neck == "mde":
-                necks[s] = Exchange(anchor_in, up_widths[s], anchor_out, config.anchor_heads, config.anchor_dropout)
+                necks[s] = MultiDensityExchange(
+                    anchor_in, up_widths[s], anchor_out, config.anchor_heads, config.anchor_dropout
+                )
             elif self.neck == "finest" and s == 0:
                 necks[s] = FinestNeck(up_widths[0], config.anchor_heads, config.anchor_dropout)
         self.dec = nn.Module()
