@@ -296,8 +296,15 @@ def test_boxes_picked_from_found_ones_say_what_is_up():
         assert read_boxes(some).up == "-y" and "up" not in read_boxes(some).to_dict()["people"][0]
     other = Box(center=[9, 0, 0], size=[1, 1, 2])
     assert read_boxes([other]).up == read_boxes(Boxes([other])).up == "z" and other.up is None
-    with pytest.raises(InputError, match=r"boxes of scans with one up axis, got -y, z: give those of one scan"):
-        read_boxes([*found, other])
+    for some in (found[0], {"people": [found[0]]}, np.array([found[0]], object), [*found, other], Boxes(list(found))):
+        assert read_boxes(some).up == "-y"
+    with pytest.raises(InputError, match=r"boxes of scans with one up axis, got -y, x: give those of one scan"):
+        read_boxes([*found, Box(center=[9, 0, 0], size=[1, 1, 2], up="x")])
+    with pytest.raises(InputError, match="boxes of scans with one up axis"):
+        Boxes([*found, Box(center=[9, 0, 0], size=[1, 1, 2], up="x")])
+    assert Box(center=[9, 0, 0], size=[1, 1, 2], up=[0, 1, 0]).up == "0.0,1.0,0.0"
+    with pytest.raises(InputError, match="up: expected z"):
+        Box(center=[9, 0, 0], size=[1, 1, 2], up="upwards")
 
 
 def test_who_is_mounted_is_true_false_or_unknown():

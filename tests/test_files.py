@@ -255,5 +255,9 @@ def test_a_replaced_file_keeps_its_mode(tmp_path, mode):
     path = tmp_path / "a.txt"
     path.write_text("old")
     path.chmod(mode)
+    with atomic_path(path) as temporary:
+        # nobody else reads it meanwhile
+        assert not stat.S_IMODE(temporary.stat().st_mode) & 0o077
+        temporary.write_text("half")
     write_atomic(path, "new")
     assert path.read_text() == "new" and stat.S_IMODE(path.stat().st_mode) == mode

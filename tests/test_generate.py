@@ -82,6 +82,9 @@ def test_a_scene_s_name_and_numpy_s_numbers_do():
 def test_scenes_of_nonsense_are_refused(changes, told):
     with pytest.raises(InputError, match=told):
         replace(SCENES["wild"], **changes)
+    assert replace(SCENES["wild"], distance=[4, 12]).distance == (4, 12)
+    with pytest.raises(InputError, match="noise must be a NoiseConfig"):
+        replace(SCENES["wild"], noise=None)
     with pytest.raises(InputError, match="NoiseConfig.mask_keep must be two numbers from 0 to 1"):
         replace(SCENES["wild"].noise, mask_keep=(0.5, 1.5))
 

@@ -376,7 +376,8 @@ def test_what_is_masked_does_not_count():
     pred[:, 0] += 5
     mask[:, 0] = True
     visible = np.ma.array(np.ones((6, 15)), mask=mask[..., 0])
-    for arguments in ((np.ma.array(true, mask=mask),), (true, visible)):
+    masked = np.ma.array(true, mask=mask)
+    for arguments in ((masked,), (list(masked),), (true, visible)):
         assert metrics.mpjpe(pred, *arguments) == pytest.approx(17.32, abs=0.01)
     with_gradient = torch.tensor(pred[:, 1:], requires_grad=True)
     assert metrics.mpjpe(with_gradient, true[:, 1:]) == pytest.approx(17.32, abs=0.01)
@@ -392,3 +393,9 @@ def test_labels_of_clusters_may_be_missing():
     table, rng = np.arange(6.0), np.random.default_rng(0)
     some = metrics.interval(table, rng, clusters=["a", None, "b", "b", "a", None])
     assert some.units == 3
+    # numbers are drawn in the order of numbers
+    units = np.repeat(np.arange(12), 2)
+    intervals = [
+        metrics.interval(np.arange(24.0) ** 2, np.random.default_rng(0), clusters=c) for c in (units, units + 100)
+    ]
+    assert intervals[0] == intervals[1]

@@ -598,19 +598,27 @@ def damaged_states(path, state_path):
     lines, state = path.read_bytes(), json.loads(state_path.read_text())
     yield lines[:-300] + bytes(300), state
     yield lines[:300] + bytes(300) + lines[600:], state
-    for key, value in (("last", None), ("last", [1]), ("bytes", -4), ("bytes", "7"), ("frames", 9), ("state", [])):
-        yield lines, state | {key: value}
+    yield lines[:-1], state
+    damaged = {"last": (None, [1]), "bytes": (-4, -1, 0, "7"), "frames": (9,), "state": ([],), "command": (["c"], None)}
+    for key, values in damaged.items():
+        for value in values:
+            yield lines, state | {key: value}
 
 
 def test_a_damaged_part_is_begun_anew(drive, stopped, tmp_path):
     out, fresh = tmp_path / "a.jsonl", tmp_path / "fresh.jsonl"
     words = stopped("--end", 0.2, "--out", out)
     path, state_path = tmp_path / "a.jsonl.part", tmp_path / "a.jsonl.part.json"
-    for lines, state in list(damaged_states(path, state_path)):
-        path.write_bytes(lines)
-        state_path.write_text(json.dumps(state))
+    lines, state = path.read_bytes(), json.loads(state_path.read_text())
+    for damaged_lines, damaged_state in list(damaged_states(path, state_path)):
+        path.write_bytes(damaged_lines)
+        state_path.write_text(json.dumps(damaged_state))
         with output.PartFile(out, state["command"]) as part:
             assert part.frames == 0 and not path.read_bytes()
+    path.write_bytes(lines)
+    state_path.write_text(json.dumps(state))
+    with output.PartFile(out, state["command"]) as part:
+        assert part.frames == 1
     path.write_bytes(lines[:-300] + bytes(300))
     assert run(drive, *words) == run(drive, "--end", 0.2, "--out", fresh)
 

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pandas
 import pytest
 
 from lidarpose.errors import InputError
@@ -237,6 +238,7 @@ def test_a_clip_says_of_each_frame_whether_a_person_is_there(clouds, live):
 def test_times_that_are_none():
     assert clip_times(None, 3).tolist() == [0, 0.1, 0.2] and clip_times((0, 0.5, 7), 3).tolist() == [0, 0.5, 7]
     dates = [np.arange(3).astype(kind) for kind in ("M8[ms]", "m8[s]")]
+    dates.append(pandas.Series(pandas.date_range("2024", periods=3, tz="UTC")))
     for times in ([0, 1], [0, 1, 1], [0, 1, np.nan], "abc", *dates):
         with pytest.raises(InputError, match="3 finite numbers"):
             clip_times(times, 3)

@@ -9,5 +9,8 @@ def from_tensor(value: Any) -> Any:
     if not (hasattr(value, "detach") and hasattr(value, "cpu")):
         return value
     tensor = value.detach().cpu()
-    # numpy has no bfloat16
-    return (tensor.float() if str(tensor.dtype) == "torch.bfloat16" else tensor).numpy()
+    try:
+        return tensor.numpy()
+    except TypeError:
+        # numpy has no bfloat16 and nothing shorter
+        return tensor.float().numpy()

@@ -154,6 +154,11 @@ def rotation_from_up(up: str | Sequence[float]) -> np.ndarray:
     return rotation_between(direction / np.abs(direction).max(), np.array([0.0, 0.0, 1.0]))
 
 
+def up_text(up: str | Sequence[float]) -> str:
+    """An up axis or direction as text, which `rotation_from_up` reads."""
+    return up if isinstance(up, str) else ",".join(repr(float(value)) for value in up)
+
+
 def upright_axis(up: str | Sequence[float]) -> str:
     """The axis, a key of `UP_AXES`, that is nearest to what is up, as of `rotation_from_up`."""
     direction = rotation_from_up(up)[2]

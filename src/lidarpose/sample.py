@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.errors import InputError
+from lidarpose.geometry import rotation_from_up, up_text
 from lidarpose.skeleton import SMPL24, Skeleton
 
 # no coordinate on Earth is larger, m; arithmetic on what is would overflow
@@ -163,6 +164,9 @@ class Box:
             if not isinstance(self.mounted, bool | np.bool_):
                 raise InputError(f"Box.mounted must be true, false or None, got {self.mounted!r}")
             object.__setattr__(self, "mounted", bool(self.mounted))
+        if self.up is not None:
+            rotation_from_up(self.up)
+            object.__setattr__(self, "up", up_text(self.up))
 
     def to_dict(self) -> dict[str, Any]:
         """center, size and yaw, as JSON holds them."""

@@ -179,7 +179,8 @@ def _result(content: dict[str, Any]) -> Result:
             raise TypeError(f"{field.name} is no text")
     counts = dict(content["counts"])
     for name in ("people", "without a pose"):
-        counts[name] = int(counts[name])
+        if type(counts[name]) is not int:
+            raise TypeError(f"{name} is no whole number")
     return Result(
         setting=Setting(**setting),
         counts=counts,

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lidarpose.errors import InputError, check_int, counted
-from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
+from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up, up_text
 from lidarpose.inference.background import is_static, read_background
 from lidarpose.inference.checks import flat_along_another_axis, flat_axis, scan_unit_warning, unlikely_origin
 from lidarpose.inference.inputs import as_origin
 from lidarpose.inference.known_places import KnownPlaces
-from lidarpose.inference.scan import Scan, read_scan, up_text
+from lidarpose.inference.scan import Scan, read_scan
 from lidarpose.inference.verification import rounded, verified
 from lidarpose.io.boxes import Boxes
 from lidarpose.models.detector.detector import MAX_RANGE, Detections, Detector

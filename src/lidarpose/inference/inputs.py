@@ -4,6 +4,7 @@ import os
 import reprlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -159,9 +160,10 @@ def clip_times(times: Any, count: int) -> np.ndarray:
     if times is None:
         return np.arange(count) / CLIP_RATE
     try:
+        seconds = np.asarray(times)
         # dates and their differences would be taken for seconds, whatever their unit
-        is_date = np.asarray(times).dtype.kind in "mM"
-        seconds = np.full(0, np.nan) if is_date else np.asarray(times, float)
+        is_date = seconds.dtype.kind in "mM" or not all(isinstance(time, Real) for time in seconds.ravel().tolist())
+        seconds = np.full(0, np.nan) if is_date else seconds.astype(float)
     except (TypeError, ValueError):
         seconds = np.full(0, np.nan)
     if seconds.shape != (count,) or not (np.isfinite(seconds).all() and (np.diff(seconds) > 0).all()):

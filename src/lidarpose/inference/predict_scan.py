@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.geometry import UP_AXES, rotation_from_up
+from lidarpose.geometry import UP_AXES, rotation_from_up, up_text
 from lidarpose.inference.detection import DetectedScan, Search, search_alone, search_options, verify_people
 from lidarpose.inference.inputs import as_origin
 from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.inference.results import Poses
-from lidarpose.inference.scan import Scan, pose_scan, read_scan, up_text
+from lidarpose.inference.scan import Scan, pose_scan, read_scan
 from lidarpose.io.boxes import read_boxes
 from lidarpose.models import DEFAULT
 from lidarpose.sample import Box

@@ -233,10 +233,7 @@ class Predictor(PoseEstimator):
         is_one = not _is_many(points)
         clouds = [as_points(points)] if is_one else [as_points(cloud, f"points[{i}]") for i, cloud in enumerate(points)]
         clips = None if clips is None else clips.checked(len(clouds))
-        people = self._people(clouds, origin, target_skeleton, progress, clips)
-        for i, cloud in enumerate(clouds):
-            if warning := rounding_warning(cloud[within_reach(cloud)]):
-                people[i] = replace(people[i], warnings=(warning, *people[i].warnings))
+        people = self._people_of_clouds(clouds, origin, target_skeleton, progress, clips)
         if is_one:
             return people[0]
         return Poses(people=tuple(people), skeleton=target_skeleton, model=self.model)
@@ -269,7 +266,7 @@ class Predictor(PoseEstimator):
         seconds = clip_times(times, len(clouds))
         clips = Clips.of_run(len(clouds)) if len(clouds) and getattr(self.backend, "frames", 1) > 1 else None
         frame_clouds = [as_points(cloud, f"clouds[{i}]") for i, cloud in enumerate(clouds)]
-        people = self._people(frame_clouds, as_origin(sensor_origin), target_skeleton, progress, clips)
+        people = self._people_of_clouds(frame_clouds, as_origin(sensor_origin), target_skeleton, progress, clips)
         track = TrackPoses.of_poses(seconds, [person.pose for person in people], target_skeleton)
         steady_poses = follow(track) if live else smooth(track).poses()
         frames = [
@@ -300,6 +297,14 @@ class Predictor(PoseEstimator):
             list(clouds), origin, target_skeleton, progress, centers=pelvises, box_centers=box_centers
         )
         return Poses(people=tuple(people), skeleton=target_skeleton, model=self.model)
+
+    def _people_of_clouds(self, clouds, origin, target_skeleton, progress, clips) -> list[PersonPose]:
+        """Of clouds as they were given: of scans' people the scan says how their coordinates are rounded."""
+        people = self._people(clouds, origin, target_skeleton, progress, clips)
+        for i, cloud in enumerate(clouds):
+            if warning := rounding_warning(cloud[within_reach(cloud)]):
+                people[i] = replace(people[i], warnings=(warning, *people[i].warnings))
+        return people
 
     def _people(
         self, clouds, origin, target_skeleton, progress, clips=None, centers=None, box_centers=None

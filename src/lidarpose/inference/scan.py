@@ -84,11 +84,6 @@ class Scan:
         return [_turned(cloud, self.R_level_input) for cloud in clouds]
 
 
-def up_text(up: str | Sequence[float]) -> str:
-    """An up axis or direction as `Scan.up` holds it."""
-    return up if isinstance(up, str) else ",".join(repr(float(value)) for value in up)
-
-
 def _turned(points: np.ndarray, R: np.ndarray) -> np.ndarray:
     """points (n, 3) turned by R; themselves where nothing is turned, which of a whole scan saves much time."""
     return points if np.array_equal(R, np.eye(3)) else points @ R.T

@@ -8,7 +8,7 @@ import difflib
 import json
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -40,7 +40,8 @@ SCHEMA = "lidarpose.boxes/1"
 
 class Boxes(list[Box]):
     """People's boxes in a scan, found ones surest first: a list of `Box`. source: the file; warnings: lines about the
-    scan; detector: the version of what found them; up: the scan's up axis or direction, see `rotation_from_up`."""
+    scan; detector: the version of what found them; up: the scan's up axis or direction, see `rotation_from_up`, by
+    default that of the boxes, z where none says it."""
 
     def __init__(
         self,
@@ -49,10 +50,15 @@ class Boxes(list[Box]):
         source: str | None = None,
         warnings: Iterable[str] = (),
         detector: str = "",
-        up: str = "z",
+        up: str | None = None,
     ):
+        boxes = list(boxes)
+        try:
+            up = _common_up(boxes) if up is None else up
+        except FormatError as problem:
+            raise InputError(f"boxes: {problem}") from None
         # a box that is picked out of these says too what was up
-        super().__init__(box if up == "z" or box.up == up else replace(box, up=up) for box in boxes)
+        super().__init__(box if (box.up or "z") == up else replace(box, up=up) for box in boxes)
         self.source, self.warnings, self.detector, self.up = source, tuple(warnings), detector, up
 
     @overload
@@ -142,23 +148,26 @@ def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike
 
 def _up(content: object) -> str:
     """What is up by a document of ours, or by boxes of one; z where nothing is said."""
-    up: object = "z"
+    up: object
     if isinstance(content, Boxes):
         up = content.up
-    elif isinstance(content, list | tuple):
-        directions = {entry.up or "z" for entry in content if isinstance(entry, Box)}
-        if len(directions) > 1:
-            raise FormatError(
-                "boxes of scans with one up axis", ", ".join(sorted(directions)), "give those of one scan"
-            )
-        up = directions.pop() if directions else "z"
-    if isinstance(content, dict) and str(content.get("schema")).startswith("lidarpose."):
+    elif isinstance(content, dict) and str(content.get("schema")).startswith("lidarpose."):
         up = content.get("up", "z")
+    else:
+        up = _common_up([entry for entry in _entries(content) if isinstance(entry, Box)])
     with suppress(InputError):
         if isinstance(up, str):
             rotation_from_up(up)
             return up
     raise FormatError(f'up: expected {", ".join(UP_AXES)} or a direction "x,y,z", got {_show(up)}')
+
+
+def _common_up(boxes: Sequence[Box]) -> str:
+    """What is up by those of the boxes that say it, z where none does. Raises FormatError where they differ."""
+    directions = sorted({box.up for box in boxes if box.up is not None})
+    if len(directions) > 1:
+        raise FormatError("boxes of scans with one up axis", ", ".join(directions), "give those of one scan")
+    return directions[0] if directions else "z"
 
 
 def _entries(content: object) -> list | tuple:

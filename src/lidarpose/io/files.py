@@ -222,7 +222,7 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
                 folder.mkdir(exist_ok=True)
                 new_folders.append(folder)
         # made at once, so that a folder without write access is known before hours of work go into the block
-        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666 if mode is None else 0o600))
     except OSError as error:
         _remove(temporary, new_folders)
         raise write_error(path, target.parent, error) from None

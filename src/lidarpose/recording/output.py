@@ -68,10 +68,10 @@ class PartFile:
             command, size, frames, state = (content[name] for name in ("command", "bytes", "frames", "state"))
             index, id = content["last"]
             # a power cut may leave the state of lines that are not there
-            lines = list(map(json.loads, self.path.read_bytes()[:size].splitlines()))
-            if (len(lines), lines[-1]["frame"], lines[-1]["id"]) != (frames, index, id) or not isinstance(state, dict):
+            is_whole = self._last_line(size) == (frames, index, id)
+            if not (is_whole and isinstance(command, dict) and isinstance(state, dict)):
                 return 0
-        except (OSError, ValueError, LookupError, TypeError):
+        except (OSError, ValueError, LookupError, TypeError, RecursionError):
             return 0
         if command != self.command:
             names = [*self.command, *command]
@@ -79,6 +79,18 @@ class PartFile:
             return 0
         self.frames, self.last, self.state = frames, (index, id), state
         return size
+
+    def _last_line(self, size: int) -> tuple[int, int, str]:
+        """How many lines so many bytes are, and the last one's frame and id. Raises ValueError where they are not whole
+        lines of JSON."""
+        count, length, text = 0, 0, b""
+        with open(self.path, "rb") as file:
+            while length < size and (text := file.readline()):
+                line = json.loads(text)
+                count, length = count + 1, length + len(text)
+        if not count or length != size or not text.endswith(b"\n"):
+            raise ValueError
+        return count, line["frame"], line["id"]
 
     def __enter__(self) -> "PartFile":
         return self

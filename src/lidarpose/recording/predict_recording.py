@@ -10,13 +10,13 @@ from typing import Any, TypedDict, Unpack
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.geometry import rotation_from_up
+from lidarpose.geometry import rotation_from_up, up_text
 from lidarpose.inference.detection import DetectedScan, detect_places, least_score, other_up_axis, search_options
 from lidarpose.inference.inputs import as_origin, only_returns
 from lidarpose.inference.predict_scan import check_choice, is_wide, predict_scan, predictor_of
 from lidarpose.inference.predictor import Predictor
 from lidarpose.inference.results import Poses
-from lidarpose.inference.scan import Scan, up_text
+from lidarpose.inference.scan import Scan
 from lidarpose.io.sources import DamagedFrame, Frame, Source, open_source
 from lidarpose.io.sources.frame import DEFAULT_RATE
 from lidarpose.models import DEFAULT

@@ -51,9 +51,13 @@ _SHARES = frozenset(
 
 
 def _check_fields(config: Any) -> None:
-    """Raises InputError for numbers and pairs of numbers that are negative, infinite, or above 1 and a share."""
+    """Raises InputError for numbers and pairs of numbers that are negative, infinite, or above 1 and a share; makes
+    tuples of pairs."""
     for field in fields(config):
         value, is_pair = getattr(config, field.name), field.type == tuple[float, float]
+        if is_pair and isinstance(value, list | np.ndarray):
+            value = tuple(value)
+            object.__setattr__(config, field.name, value)
         if not is_pair and field.type not in (float, int):
             continue
         numbers = value if is_pair else (value,)
@@ -182,6 +186,8 @@ class SceneConfig:
 
     def __post_init__(self):
         _check_fields(self)
+        if not (isinstance(self.noise, NoiseConfig) and isinstance(self.crop, CropErrors)):
+            raise InputError("SceneConfig.noise must be a NoiseConfig and SceneConfig.crop CropErrors")
         if not self.sensors:
             raise InputError("SceneConfig.sensors must name at least one sensor, got none")
 

@@ -48,6 +48,10 @@ def as_numbers(name: str, value: ArrayLike) -> np.ndarray:
     """An array of floats, NaN where it is masked; raises InputError where it holds something else, or lists of unequal
     length."""
     try:
+        if isinstance(value, list | tuple):
+            value = [from_tensor(entry) for entry in value]
+            if any(isinstance(entry, np.ma.MaskedArray) for entry in value):
+                value = np.ma.stack(value)
         if isinstance(value, np.ma.MaskedArray):
             return np.ma.filled(value.astype(float), np.nan)
         return np.asarray(from_tensor(value), float)
@@ -90,8 +94,15 @@ def check_positive(name: str, value: float) -> None:
 def _cluster_labels(clusters: ArrayLike | None, count: int) -> np.ndarray | None:
     if clusters is not None and np.shape(clusters) != (count,):
         raise InputError(f"clusters must be ({count},), one label a person, got {np.shape(clusters)}")
-    # labels of several kinds, such as text and None where it is missing, have no order
-    return None if clusters is None else np.array([repr(label) for label in np.asarray(clusters).tolist()])
+    if clusters is None:
+        return None
+    labels = np.asarray(clusters)
+    try:
+        np.unique(labels)
+    except TypeError:
+        # of several kinds, such as text and None where it is missing, which have no order
+        return np.array([repr(label) for label in labels.tolist()])
+    return labels
 
 
 # ---- means
