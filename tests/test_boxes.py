@@ -291,17 +291,28 @@ def test_bad_paths(tmp_path):
 
 
 def test_boxes_picked_from_found_ones_say_what_is_up():
-    found = Boxes([Box(center=[5, 0, 0], size=[1, 1, 2], id=id) for id in "ab"], up="-y")
-    for some in ([box for box in found if box.id == "a"], found.copy(), found + [], sorted(found, key=lambda b: b.id)):
+    tilted = Boxes([Box(center=[5, 0, 0], size=[1, 1, 2], id=id) for id in "ab"], up="-y")
+    for some in (
+        [box for box in tilted if box.id == "a"],
+        tilted.copy(),
+        tilted + [],
+        sorted(tilted, key=lambda b: b.id),
+    ):
         assert read_boxes(some).up == "-y" and "up" not in read_boxes(some).to_dict()["people"][0]
     other = Box(center=[9, 0, 0], size=[1, 1, 2])
     assert read_boxes([other]).up == read_boxes(Boxes([other])).up == "z" and other.up is None
-    for some in (found[0], {"people": [found[0]]}, np.array([found[0]], object), [*found, other], Boxes(list(found))):
+    for some in (
+        tilted[0],
+        {"people": [tilted[0]]},
+        np.array([tilted[0]], object),
+        [*tilted, other],
+        Boxes(list(tilted)),
+    ):
         assert read_boxes(some).up == "-y"
     with pytest.raises(InputError, match=r"boxes of scans with one up axis, got -y, x: give those of one scan"):
-        read_boxes([*found, Box(center=[9, 0, 0], size=[1, 1, 2], up="x")])
+        read_boxes([*tilted, Box(center=[9, 0, 0], size=[1, 1, 2], up="x")])
     with pytest.raises(InputError, match="boxes of scans with one up axis"):
-        Boxes([*found, Box(center=[9, 0, 0], size=[1, 1, 2], up="x")])
+        Boxes([*tilted, Box(center=[9, 0, 0], size=[1, 1, 2], up="x")])
     assert Box(center=[9, 0, 0], size=[1, 1, 2], up=[0, 1, 0]).up == "0.0,1.0,0.0"
     with pytest.raises(InputError, match="up: expected z"):
         Box(center=[9, 0, 0], size=[1, 1, 2], up="upwards")

@@ -2,9 +2,14 @@
 
 from typing import Any
 
+import numpy as np
 
-def from_tensor(value: Any) -> Any:
-    """A torch tensor as a numpy array, wherever it lies and whether or not in a graph; anything else as it is."""
+
+def to_numpy(value: Any) -> Any:
+    """A torch tensor as a numpy array, wherever it lies and whether or not in a graph; a masked array as floats, NaN
+    where it is masked; anything else as it is."""
+    if isinstance(value, np.ma.MaskedArray):
+        return np.ma.filled(value.astype(float), np.nan)
     # open files have a detach of their own
     if not (hasattr(value, "detach") and hasattr(value, "cpu")):
         return value

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.arrays import from_tensor
+from lidarpose.arrays import to_numpy
 from lidarpose.errors import InputError
 from lidarpose.geometry import vector_of
 from lidarpose.io.files import FormatError, one_line
@@ -118,11 +118,9 @@ def as_points(points: Any, what: str = "points") -> np.ndarray:
     if isinstance(points, str | os.PathLike):
         raise InputError(f"{what} must be an (n, 3) array, got a path: use lidarpose.predict({str(points)!r})")
     points = _by_name(points, what)
-    if isinstance(points, np.ma.MaskedArray):
-        # masked is no point
-        points = np.ma.filled(points.astype(np.float64), np.nan)
     try:
-        array = np.asarray(from_tensor(points))
+        # masked is no point
+        array = np.asarray(to_numpy(points))
     except (ValueError, TypeError) as error:
         raise InputError(f"{what} must be an (n, 3) array of numbers, got rows of unequal length ({error})") from None
     if array.shape == (0,):

@@ -16,7 +16,7 @@ from typing import Any, SupportsIndex, overload
 
 import numpy as np
 
-from lidarpose.arrays import from_tensor
+from lidarpose.arrays import to_numpy
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, rotation_from_up
 from lidarpose.io.files import FormatError, file_error, read_bytes, shorten, write_atomic
@@ -53,10 +53,7 @@ class Boxes(list[Box]):
         up: str | None = None,
     ):
         boxes = list(boxes)
-        try:
-            up = _common_up(boxes) if up is None else up
-        except FormatError as problem:
-            raise InputError(f"boxes: {problem}") from None
+        up = _common_up(boxes) if up is None else up
         # a box that is picked out of these says too what was up
         super().__init__(box if (box.up or "z") == up else replace(box, up=up) for box in boxes)
         self.source, self.warnings, self.detector, self.up = source, tuple(warnings), detector, up
@@ -128,7 +125,7 @@ def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike
         InputError: one line that names the file, the entry (counted from 0, as in JSON paths) and the key. Two entries
             of one id are an error, since results are told apart by it.
     """
-    source = from_tensor(source)
+    source = to_numpy(source)
     try:
         content = source if isinstance(source, _Content) else _load_file(source, calib)
         boxes = [_box(entry, f"people[{i}]") for i, entry in enumerate(_entries(content))]
@@ -146,15 +143,15 @@ def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike
     return Boxes(boxes, up=up)
 
 
-def _up(content: object) -> str:
-    """What is up by a document of ours, or by boxes of one; z where nothing is said."""
+def _up(content: object) -> str | None:
+    """What is up by a document of ours, None by anything else."""
     up: object
     if isinstance(content, Boxes):
         up = content.up
     elif isinstance(content, dict) and str(content.get("schema")).startswith("lidarpose."):
         up = content.get("up", "z")
     else:
-        up = _common_up([entry for entry in _entries(content) if isinstance(entry, Box)])
+        return None
     with suppress(InputError):
         if isinstance(up, str):
             rotation_from_up(up)
@@ -163,10 +160,11 @@ def _up(content: object) -> str:
 
 
 def _common_up(boxes: Sequence[Box]) -> str:
-    """What is up by those of the boxes that say it, z where none does. Raises FormatError where they differ."""
+    """What is up by those of the boxes that say it, z where none does. Raises InputError where they differ."""
     directions = sorted({box.up for box in boxes if box.up is not None})
     if len(directions) > 1:
-        raise FormatError("boxes of scans with one up axis", ", ".join(directions), "give those of one scan")
+        names = ", ".join(directions)
+        raise file_error("boxes", f"expected boxes of scans with one up axis, got {names}: give those of one scan")
     return directions[0] if directions else "z"
 
 

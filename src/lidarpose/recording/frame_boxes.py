@@ -42,7 +42,7 @@ class FrameBoxes:
             kind = type(given).__name__
             raise InputError(f"boxes of a recording: expected a folder, a file or a dict by frame, got {kind}")
         elif os.path.isdir(given):
-            for path in sorted(list_folder(Path(given))):
+            for path in list_folder(Path(given)):
                 if path.suffix.lower() in _SUFFIXES:
                     self._by_frame[path.stem.removesuffix(".boxes")] = path
         else:

@@ -231,14 +231,14 @@ class FramePredictor:
             scan, poses = predict_scan(
                 prepared_scan, lambda: self.predictor, search=search, known=known_places, skeleton=self.skeleton
             )
-            tracked_poses = poses if people is None else people.update(time, scan, poses, T_fixed_sensor)
+            if isinstance(prepared_scan, DetectedScan) and not self._was_searched:
+                self._was_searched = True
+                if not len(poses) and (hint := other_up_axis(prepared_scan, self._search)):
+                    poses = replace(poses, warnings=(*poses.warnings, hint))
+            if people is not None:
+                poses = people.update(time, scan, poses, T_fixed_sensor)
         except InputError as error:
             return frame_poses(poses=no_poses, error=str(error))
-        poses = tracked_poses
-        if isinstance(prepared_scan, DetectedScan) and not self._was_searched:
-            self._was_searched = True
-            if not len(poses) and (hint := other_up_axis(prepared_scan, self._search)):
-                poses = replace(poses, warnings=(*poses.warnings, hint))
         return frame_poses(poses=replace(poses, source=self.name))
 
     def _scan(self, frame: Frame) -> Scan:

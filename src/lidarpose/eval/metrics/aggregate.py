@@ -16,7 +16,7 @@ from numbers import Real
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidarpose.arrays import from_tensor
+from lidarpose.arrays import to_numpy
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.skeleton import Skeleton, skeleton
 
@@ -48,13 +48,8 @@ def as_numbers(name: str, value: ArrayLike) -> np.ndarray:
     """An array of floats, NaN where it is masked; raises InputError where it holds something else, or lists of unequal
     length."""
     try:
-        if isinstance(value, list | tuple):
-            value = [from_tensor(entry) for entry in value]
-            if any(isinstance(entry, np.ma.MaskedArray) for entry in value):
-                value = np.ma.stack(value)
-        if isinstance(value, np.ma.MaskedArray):
-            return np.ma.filled(value.astype(float), np.nan)
-        return np.asarray(from_tensor(value), float)
+        value = list(map(to_numpy, value)) if isinstance(value, list | tuple) else to_numpy(value)
+        return np.asarray(value, float)
     except (TypeError, ValueError):
         raise InputError(f"{name} must hold numbers, in lists of equal length") from None
 
