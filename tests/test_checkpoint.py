@@ -301,6 +301,23 @@ def test_the_papers_network_there_and_back(tmp_path, half):
         assert torch.equal(loaded.state_dict()[name], value.half().to(value.dtype) if half else value)
 
 
+@pytest.mark.parametrize("faulty", [False, True])
+def test_a_file_of_before_the_faults_had_names_of_their_own(tmp_path, faulty):
+    faults = {"stale_convolution": faulty, "grid_from_minimum": faulty}
+    network = DaptNet(DaptConfig(name="mine", joints=HUMAN15.joints, coordinates=True, **faults, **SMALL))
+    path = tmp_path / "dapt.safetensors"
+    save_checkpoint(path, network, card=CARD)
+    with safe_open(path, "pt") as file:
+        metadata = file.metadata()
+    header = json.loads(metadata["lidarpose"])
+    for name in ("stale_convolution", "grid_from_minimum", "zero_anchors"):
+        del header["config"][name]
+    header["config"]["legacy"] = faulty
+    save_file(load_file(path), path, {"lidarpose": json.dumps(header)})
+    with pytest.warns(UserWarning, match="no digest"):
+        assert load_checkpoint(path)[1].config == network.config
+
+
 def test_every_kind_of_network_is_one_entry_of_a_table():
     for kind, entry in NETWORKS.items():
         config, network = entry.part("config"), entry.part("network")

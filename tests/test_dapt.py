@@ -16,7 +16,7 @@ from torch.nn import functional as F
 
 from lidarpose.errors import InputError
 from lidarpose.models import decode
-from lidarpose.models.dapt.dapt_config import CONFIGS, WAYMO_JOINTS, DaptConfig, named_config
+from lidarpose.models.dapt.dapt_config import CONFIGS, FAULTS, WAYMO_JOINTS, DaptConfig, named_config
 from lidarpose.models.dapt.dapt_net import DaptNet, to_tensors
 from lidarpose.models.dapt.import_weights import import_dapt
 from lidarpose.models.dapt.point_transformer_v3 import PatchAttention, RowNorm, Stage, SubmanifoldConvolution
@@ -115,7 +115,7 @@ def test_the_accelerators_layout_equals_the_authors_code(released):
 
 
 def test_the_released_flow_is_needed_for_released_weights(released):
-    corrected = DaptNet(replace(released.config, legacy=False)).eval()
+    corrected = DaptNet(replace(released.config, stale_convolution=False)).eval()
     corrected.load_state_dict(released.state_dict())
     # the same voxels for both, so that nothing but the flow differs
     batch = released.batch(CLOUDS)
@@ -135,8 +135,8 @@ def test_the_corrected_flow_is_blocks_one_after_the_other():
         middle, branch = stage.block0(rows, rows, level)
         corrected = stage.block1(middle, middle, level)[0]
         stale = stage.block1(middle, branch, level)[0]
-        torch.testing.assert_close(stage.blocks(rows, rows, level, legacy=False), corrected)
-        torch.testing.assert_close(stage.blocks(rows, rows, level, legacy=True), stale)
+        torch.testing.assert_close(stage.blocks(rows, rows, level, stale_convolution=False), corrected)
+        torch.testing.assert_close(stage.blocks(rows, rows, level, stale_convolution=True), stale)
     assert (corrected - stale).abs().max() > 1e-2
 
 
@@ -145,7 +145,7 @@ def test_the_corrected_flow_is_blocks_one_after_the_other():
 
 NECKS = {
     "corrected": TINY,
-    "legacy": replace(TINY, legacy=True),
+    "faults": replace(TINY, **dict.fromkeys(FAULTS, True)),
     "finest": replace(TINY, neck="finest"),
     "prn": replace(TINY, neck="prn", bins=(), ranges=(), parts=0),
 }
@@ -293,12 +293,12 @@ def test_norms_are_the_authors_and_one_row_alone_is_normed_by_what_was_learnt():
 
 def cells_of(cloud, config):
     cells = np.floor(np.asarray(cloud, np.float32) / config.grid).astype(int)
-    return cells - cells.min(0) if config.legacy else cells
+    return cells - cells.min(0) if config.grid_from_minimum else cells
 
 
-@pytest.mark.parametrize("legacy", [False, True])
-def test_tables_against_dictionaries(legacy):
-    config = replace(TINY, legacy=legacy)
+@pytest.mark.parametrize("from_minimum", [False, True])
+def test_tables_against_dictionaries(from_minimum):
+    config = replace(TINY, grid_from_minimum=from_minimum)
     clouds = [person(150, size=0.1), person(1, 1), person(80, 2, 0.04)]
     tables = build_tables(clouds, config)
     points = np.concatenate(clouds)
@@ -372,12 +372,12 @@ def test_cells_at_the_edge_of_what_can_be_counted_meet_nobody():
 
 def test_a_stray_point_moves_no_voxel_but_in_the_released_code():
     near, stray = np.float32([[0.001, 0, 0], [0.021, 0, 0]]), np.float32([[-0.339, 0, 0]])
-    for legacy, shared in ((False, True), (True, False)):
-        tables = build_tables([np.concatenate([near, stray])], replace(TINY, legacy=legacy))
+    for from_minimum, shared in ((False, True), (True, False)):
+        tables = build_tables([np.concatenate([near, stray])], replace(TINY, grid_from_minimum=from_minimum))
         # the released grid begins at the stray point: what shared a parent without it may no longer
         parent = tables.levels[0].parent[tables.point_voxel]
         assert (parent[0] == parent[1]) == shared and tables.levels[0].lengths.tolist() == [3]
-        assert build_tables([near], replace(TINY, legacy=legacy)).levels[1].lengths.tolist() == [1]
+        assert build_tables([near], replace(TINY, grid_from_minimum=from_minimum)).levels[1].lengths.tolist() == [1]
 
 
 def test_bad_clouds():
@@ -431,9 +431,9 @@ def test_convolution_equals_a_dense_one(kernel, layout):
 # ---- patches
 
 
-@pytest.mark.parametrize("legacy", [False, True])
-def test_a_large_cloud_is_cut_into_patches(legacy):
-    config, cloud = replace(TINY, legacy=legacy), person(3400, size=0.3)
+@pytest.mark.parametrize("from_minimum", [False, True])
+def test_a_large_cloud_is_cut_into_patches(from_minimum):
+    config, cloud = replace(TINY, grid_from_minimum=from_minimum), person(3400, size=0.3)
     tables = build_tables([cloud, person(40, 1)], config)
     level = tables.levels[0]
     assert level.lengths[0] > 3000 and level.sequence.shape[0] == 4
@@ -602,7 +602,7 @@ def test_joints_of_the_released_networks_by_name():
         ({"parts": 10**19}, "parts must be a whole number from 0 to 16384"),
         ({"bins": (10**19, 1, 1)}, "bins must be 3"),
         ({"patch": 10**6}, "patch must be a whole number from 1 to 16384"),
-        ({"legacy": 1}, "legacy must be true or false"),
+        ({"zero_anchors": 1}, "zero_anchors must be true or false"),
         ({"neck": "giraffe"}, "unknown neck 'giraffe'"),
         ({"neck": "prn"}, "the neck prn has joints and parts of its own: leave bins, ranges and parts empty"),
     ],
@@ -634,16 +634,23 @@ def header():
         return json.loads(file.metadata()["config"])
 
 
+def faults_of(net):
+    return [getattr(net.config, name) for name in FAULTS]
+
+
 def test_import_by_header_by_dict_and_by_configuration(released, tmp_path):
     want = released.outputs(CLOUDS[1:2])
-    assert not released.training and released.config.legacy and released.config.joints == WAYMO_JOINTS
+    assert (
+        not released.training and faults_of(released) == [True, True, False] and released.config.joints == WAYMO_JOINTS
+    )
     assert_outputs(want, import_dapt(str(WEIGHTS), header()).outputs(CLOUDS[1:2]), atol=0)
     assert_outputs(want, import_dapt(WEIGHTS, released.config).outputs(CLOUDS[1:2]), atol=0)
     own = released.config.to_dict()
     prefixed = {f"module.{name}": value.clone() for name, value in load_file(WEIGHTS).items()}
     save_file(prefixed, tmp_path / "wrapped.safetensors", {"config": json.dumps(own)})
     assert_outputs(want, import_dapt(tmp_path / "wrapped.safetensors").outputs(CLOUDS[1:2]), atol=0)
-    assert not import_dapt(WEIGHTS, own | {"legacy": False}).config.legacy
+    assert faults_of(import_dapt(WEIGHTS, header() | {"legacy": False})) == [False] * 3
+    assert faults_of(import_dapt(WEIGHTS, own | {"stale_convolution": False})) == [False, True, False]
 
 
 def test_import_by_name(tmp_path, monkeypatch):

@@ -16,19 +16,20 @@ from safetensors.torch import load_file
 from training_runs import refused
 
 from lidarpose.errors import InputError
-from lidarpose.models.dapt.dapt_config import named_config
+from lidarpose.models.dapt.dapt_config import FAULTS, named_config
 from lidarpose.models.dapt.dapt_net import DaptNet, DaptOutputs, to_tensors
 from lidarpose.models.dapt.voxel_tables import LAYOUTS
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
 from lidarpose.train import loop, run_dir
 from lidarpose.train.augment import Example
 from lidarpose.train.data_loader import Chunks
+from lidarpose.train.networks import finetuned_network, pretraining_network
 from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, log_gaussian, pretraining, prn
 from lidarpose.train.objectives.dapt_objective import DaptObjective, finetuning_config, pretraining_config, small
 from lidarpose.train.objectives.dapt_transfer import transferred
 from lidarpose.train.objectives.objective import alone, total
 from lidarpose.train.optim import optimizers, rate_factor, set_rates
-from lidarpose.train.recipes import Pretrain
+from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.setup import TrainSetup
 from lidarpose.train.validation import update_batch_norms, validate
 
@@ -520,7 +521,8 @@ def test_the_neck_goes_on_too():
         ({"anchor_channels": (16, 24, 24)}, "tensor backbone.dec.dec_ke1.fc_in.0.bias does not fit"),
         ({"grid": 0.02}, "grid does not fit: pretrain was pre-trained with 0.04, waymo has 0.02: fine-tune with"),
         ({"strides": (2, 4)}, "strides does not fit"),
-        ({"legacy": True}, "legacy does not fit"),
+        ({"stale_convolution": True}, "stale_convolution does not fit"),
+        ({"grid_from_minimum": True}, "grid_from_minimum does not fit"),
         ({"encoder_heads": (2, 1, 2)}, "encoder_heads does not fit"),
         ({"anchor_heads": 2}, "anchor_heads does not fit"),
     ],
@@ -535,14 +537,35 @@ def test_a_backbone_that_does_not_fit(change, message, keep):
 
 
 def test_configurations():
-    assert pretraining_config().joints == HUMAN15.joints and not pretraining_config().legacy
+    assert pretraining_config().joints == HUMAN15.joints
+    assert not any(getattr(pretraining_config(), fault) for fault in FAULTS)
     for dataset in ("waymo", "humanm3", "lidarhuman26m", "sloper4d"):
         config = finetuning_config(dataset)
-        assert not config.legacy and not config.auxiliary and config.bins == named_config(dataset).bins
+        assert not any(getattr(config, fault) for fault in FAULTS) and not config.auxiliary
+        assert config.bins == named_config(dataset).bins
         DaptObjective(config=small(config), stage="finetune")
     DaptObjective(config=small(pretraining_config()), stage="pretrain")
     weights = [sum(v.numel() for v in DaptNet(c).parameters()) for c in (small(pretraining_config()), PRETRAIN.config)]
     assert 50e6 / 45 < weights[0] < 50e6 / 35 and weights[1] < weights[0]
+
+
+def test_the_released_faults_are_options():
+    options = tuple(f"{fault}=true" for fault in FAULTS)
+    for head in ("coordinates", "heatmaps"):
+        config, _ = pretraining_network(Pretrain(size="paper-tiny", head=head, options=options))
+        assert all(getattr(config, fault) for fault in FAULTS) and bool(config.bins) == (head == "heatmaps")
+        mended, _ = pretraining_network(Pretrain(size="paper-tiny", head=head))
+        assert replace(config, **dict.fromkeys(FAULTS, False)) == mended
+    assert not DaptNet(config).backbone.keypoint_embedding.any() and DaptNet(mended).backbone.keypoint_embedding.all()
+    recipe = Finetune(data=("a",), init="random", size="paper-tiny", options=options[:1])
+    tuned, build = finetuned_network(recipe, None, HUMAN15, "humanm3")
+    assert tuned.stale_convolution and not tuned.grid_from_minimum and build().config == tuned
+    with pytest.raises(InputError, match="trained without these options"):
+        finetuned_network(recipe, trained(mended), HUMAN15, "humanm3")
+    with pytest.raises(InputError, match="unknown option of .* 'grid': "):
+        pretraining_network(Pretrain(size="paper-tiny", options=("grid=0.02",)))
+    with pytest.raises(InputError, match="small has none: leave --options away"):
+        pretraining_network(Pretrain(size="small", options=options))
 
 
 @pytest.mark.parametrize(

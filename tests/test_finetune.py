@@ -432,7 +432,7 @@ def test_the_paper_s_two_stages(datasets, tmp_path, capsys, monkeypatch):
     (pretrained, first), (_, second) = (load_checkpoint(f"{name}/model.safetensors") for name in ("first", "second"))
     assert first.config.coordinates and not first.config.bins and first.config.parts == 25
     assert second.config.bins == (140, 140, 220) and not (second.config.coordinates or second.config.parts)
-    assert second.config.joints == HUMAN15.joints and not second.config.legacy
+    assert second.config.joints == HUMAN15.joints and not second.config.stale_convolution
     recipe, anchors = run_dir.read_config(tmp_path / "second", Finetune)[0], "backbone.keypoint_embedding"
     assert recipe.keep_anchors
     for keep in (True, False):

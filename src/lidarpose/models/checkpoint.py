@@ -315,6 +315,7 @@ def parse_header(path: str | os.PathLike, entry: str | None) -> Header:
         for name, value in (("config", entries), ("card", card)):
             if not isinstance(value, dict):
                 raise TypeError(f"{name} is a {type(value).__name__}")
+        entries = config_class.renamed(entries)
         if unknown_settings := sorted(set(entries) - {field.name for field in fields(config_class)}):
             raise InputError(f"unknown setting {unknown_settings[0]}: update lidarpose, a newer version wrote it")
         return Header(version=str(header["version"]), config=config_class(**entries), card=card)

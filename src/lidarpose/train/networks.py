@@ -22,7 +22,7 @@ from lidarpose.models.baselines.baseline_config import (
 )
 from lidarpose.models.checkpoint import build, load_checkpoint
 from lidarpose.models.config import SIZES, NetworkConfig
-from lidarpose.models.dapt.dapt_config import CONFIGS, DaptConfig
+from lidarpose.models.dapt.dapt_config import CONFIGS, FAULTS, DaptConfig
 from lidarpose.models.posenet import PoseNet, expand_weights
 from lidarpose.skeleton import HUMAN15, SMPL24, Skeleton
 from lidarpose.train.objectives.baseline_objective import with_joints
@@ -71,7 +71,6 @@ def pretraining_network(recipe: Pretrain) -> tuple[Any, Skeleton]:
     """The configuration of a network to pre-train, and the skeleton in which its people are drawn."""
     check_name("network size", recipe.size, PRETRAINED)
     config, joints = PRETRAINED[recipe.size]
-    config = _with_options(config, recipe.options)
     if recipe.objects:
         if not isinstance(config, NetworkConfig):
             raise InputError(
@@ -87,7 +86,7 @@ def pretraining_network(recipe: Pretrain) -> tuple[Any, Skeleton]:
         )
     if (recipe.neck, recipe.head, recipe.drop_path) != ("mde", "coordinates", None):
         config = _with_neck_and_head(recipe, config)
-    return config, joints
+    return _with_options(config, recipe.options), joints
 
 
 def expanded_network(init: str, config: Config) -> tuple[Callable[[], nn.Module], dict]:
@@ -141,6 +140,8 @@ def finetuned_network(
             )
         return config, partial(build, config) if trained is None else partial(with_joints, trained, config)
     base_config = _with_options(base_config, recipe.options)
+    if trained is not None and base_config != trained.config:
+        raise InputError("--init has weights that were trained without these options: leave --options away")
     if isinstance(base_config, NetworkConfig):
         if not recipe.keep_anchors and trained is not None:
             raise InputError(
@@ -172,13 +173,14 @@ def finetuned_network(
 
 
 def _with_options(config: Any, options: tuple[str, ...]) -> Any:
-    """A configuration with options NAME=VALUE (JSON or text), or NAME for true, of a baseline. Raises InputError for
-    unknown ones."""
+    """A configuration with options NAME=VALUE (JSON or text), or NAME for true: of a baseline, or the paper's network
+    with faults of the released code. Raises InputError for unknown ones."""
     if not options:
         return config
-    if not isinstance(config, BaselineConfig):
-        raise InputError(f"options are of the baselines' networks, {config.name} has none: leave --options away")
-    option_names = [field.name for field in fields(config) if field.name != "joints"]
+    if isinstance(config, NetworkConfig):
+        raise InputError(f"options are of the paper's networks, {config.name} has none: leave --options away")
+    is_baseline = isinstance(config, BaselineConfig)
+    option_names = [field.name for field in fields(config) if field.name != "joints"] if is_baseline else list(FAULTS)
     changes: dict[str, Any] = {}
     for option in options:
         name, _, value = option.partition("=")

@@ -34,7 +34,7 @@ FREE = ("workers", "validate", "pictures", "precision")
 # shares of a whole that cannot be all of it
 _BELOW_ONE = ("ema", "mix", "hold_out", "objects", "whole_scans")
 _MODEL = "ours, dapt, prn, lpformer, lidarcap or ne"
-_OPTIONS = "options of a baseline's network: resample_with_replacement=true, grid=32, ... (docs/train.md)"
+_OPTIONS = "of a baseline's or the paper's network: grid=32, stale_convolution=true, ... (docs/train.md)"
 _LEAST = {"batch": 1, "people": 1, "scenes": 1, "uses": 1}
 
 

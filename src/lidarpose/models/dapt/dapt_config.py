@@ -28,6 +28,10 @@ CELL_BITS = 16
 
 Range = tuple[float, float]
 
+# settings that bring a fault of the released code back, and those that its weights were trained with
+FAULTS = ("stale_convolution", "grid_from_minimum", "zero_anchors")
+RELEASED_FAULTS: dict[str, Any] = {"stale_convolution": True, "grid_from_minimum": True}
+
 
 @dataclass(frozen=True, kw_only=True)
 class DaptConfig(Config):
@@ -42,8 +46,10 @@ class DaptConfig(Config):
     voxels within which attention is full; grid: edge of a voxel of level 0, meters; strides: how many times wider the
     next level's voxels are; orders: curves for people of more than `patch` voxels; drop_path: the last block's; parts:
     classes of the part head, 0 for no such head; coordinates: a head that reads x, y, z off each anchor (the paper's
-    pre-training); auxiliary: a head that reads all joints off the bottleneck (the released fine-tuning); legacy: True
-    for the released weights, which need the data flow that they were trained with (see `dapt_net`).
+    pre-training); auxiliary: a head that reads all joints off the bottleneck (the released fine-tuning). `FAULTS`, what
+    the released code does otherwise, each False for mended; its weights need the first two: stale_convolution: later
+    blocks' convolutions read rows of before the last sum (see `dapt_net`); grid_from_minimum: cells count from the
+    cloud's own minimum, so that one outlier moves them all; zero_anchors: new anchors begin at zero, all equal.
     """
 
     kind: ClassVar[str] = "dapt"
@@ -71,7 +77,9 @@ class DaptConfig(Config):
     parts: int = at_least(0, 0)
     coordinates: bool = False
     auxiliary: bool = False
-    legacy: bool = False
+    stale_convolution: bool = False
+    grid_from_minimum: bool = False
+    zero_anchors: bool = False
 
     def __post_init__(self):
         super().__post_init__()
@@ -138,8 +146,10 @@ class DaptConfig(Config):
         The latter are known by their `enc_depths`; `grid`, their heatmap arguments, with "size" and "range", means a
         fine-tuned network (heatmaps and auxiliary head), no `grid` a pre-trained one (coordinates and parts). Joints
         follow from `num_keypoints`: 14 Waymo's, 15 HumanM3's, 24 SMPL's, unless `joints` names them; name, parts,
-        coordinates, auxiliary and legacy may be added. Raises InputError for what does not fit.
+        coordinates, auxiliary and `FAULTS` may be added, or legacy for both of `RELEASED_FAULTS`. Raises InputError for
+        what does not fit.
         """
+        entries = cls.renamed(entries)
         if "enc_depths" in entries:
             entries = _from_reference(entries)
         setting_names = [field.name for field in fields(cls)]
@@ -149,6 +159,15 @@ class DaptConfig(Config):
             if entry not in entries:
                 raise InputError(f"a configuration needs the entry {entry!r}, got only {', '.join(entries) or 'none'}")
         return cls(**entries)
+
+    @staticmethod
+    def renamed(entries: dict[str, Any]) -> dict[str, Any]:
+        """`legacy`, one word for both faults of the released weights, as these two."""
+        if "legacy" not in entries:
+            return entries
+        return {name: value for name, value in entries.items() if name != "legacy"} | dict.fromkeys(
+            RELEASED_FAULTS, entries["legacy"]
+        )
 
 
 def _is_range(value: object) -> bool:
@@ -182,7 +201,7 @@ def _from_reference(entries: dict) -> dict:
     joints = entries.get("joints", next((names for names in _JOINTS if len(names) == count), None))
     if not isinstance(count, int) or joints is None:
         raise InputError(f"num_keypoints must be 14, 15 or 24 where no joints are named, got {count!r}: add 'joints'")
-    settings |= {"joints": joints, "patch": patches.pop(), "legacy": True}
+    settings |= {"joints": joints, "patch": patches.pop(), **RELEASED_FAULTS}
     heatmaps = entries.get("grid")
     if heatmaps is None:
         settings |= {"name": "pretrain", "coordinates": True, "parts": PARTS}
@@ -192,15 +211,15 @@ def _from_reference(entries: dict) -> dict:
         except (KeyError, TypeError):
             raise InputError(f"grid must be {{'size': ..., 'range': ...}} of the heatmaps, got {heatmaps!r}") from None
     # what their arguments do not say
-    extra_names = ("name", "parts", "coordinates", "auxiliary", "legacy")
+    extra_names = ("name", "parts", "coordinates", "auxiliary", *FAULTS)
     return settings | {name: entries[name] for name in extra_names if name in entries}
 
 
 def _released(name: str, joints: tuple[str, ...], bins: tuple[int, int], half_widths: Range) -> DaptConfig:
     """bins and half widths in meters of (x and y, z)."""
     xy_range, z_range = ((-r, r) for r in half_widths)
-    ranges = (xy_range, xy_range, z_range)
-    return DaptConfig(name=name, joints=joints, bins=(bins[0], *bins), ranges=ranges, auxiliary=True, legacy=True)
+    heads: dict[str, Any] = {"bins": (bins[0], *bins), "ranges": (xy_range, xy_range, z_range), "auxiliary": True}
+    return DaptConfig(name=name, joints=joints, **heads, **RELEASED_FAULTS)
 
 
 _ALL_HEADS: dict[str, Any] = {"parts": PARTS, "coordinates": True, "auxiliary": True}
@@ -212,7 +231,7 @@ CONFIGS = {
     "humanm3": _released("humanm3", HUMAN15.joints, (140, 220), (0.7, 1.1)),
     "lidarhuman26m": _released("lidarhuman26m", SMPL24.joints, (220, 220), (1.1, 1.1)),
     "sloper4d": _released("sloper4d", SMPL24.joints, (100, 100), (1.0, 1.0)),
-    "pretrain": DaptConfig(name="pretrain", joints=HUMAN15.joints, parts=PARTS, coordinates=True, legacy=True),
+    "pretrain": DaptConfig(name="pretrain", joints=HUMAN15.joints, parts=PARTS, coordinates=True, **RELEASED_FAULTS),
 }
 
 

@@ -5,9 +5,9 @@ channels, A anchor channels, W heatmap bins, P parts.
 
 Modules bear the names of the released weights, so that these load by name.
 
-The legacy switch. In the released code a sparse tensor is not brought up to date after each block and each unpooling:
+Stale convolutions. In the released code a sparse tensor is not brought up to date after each block and each unpooling:
 the convolution of every later block reads the block's last branch instead of the sum, and the first one of a decoder
-stage reads the skip alone. Weights trained with that flow need it (`config.legacy`); new ones are trained without.
+stage reads the skip alone. Weights trained so need it (`config.stale_convolution`); new ones are trained without.
 """
 
 from collections import OrderedDict
@@ -197,7 +197,7 @@ class _Backbone(nn.Module):
 
     def __init__(self, config: DaptConfig):
         super().__init__()
-        self.legacy, self.neck = config.legacy, config.neck
+        self.stale_convolution, self.neck = config.stale_convolution, config.neck
         widths = config.encoder_channels
         self.embedding = nn.Module()
         stem = OrderedDict(conv=SubmanifoldConvolution(3, widths[0], 5, bias=False), norm=RowNorm(widths[0]))
@@ -229,9 +229,9 @@ class _Backbone(nn.Module):
             if s in necks:
                 self.dec.add_module(f"dec_ke{s}", necks[s])
         if necks:
-            # small random numbers where the released code begins at zero
             width = config.anchor_channels[-1] if self.neck == "mde" else up_widths[0]
-            self.keypoint_embedding = nn.Parameter(torch.randn(len(config.joints), width) * 0.02)
+            scale = 0.0 if config.zero_anchors else 0.02
+            self.keypoint_embedding = nn.Parameter(torch.randn(len(config.joints), width) * scale)
 
     def forward(self, batch: Tables[Tensor]) -> tuple[Tensor | None, Tensor, Tensor]:
         """Anchors (B, J, A), None without; level 0's rows (M, C); the bottleneck's maximum over each person (B, C')."""
@@ -242,7 +242,7 @@ class _Backbone(nn.Module):
             stage = getattr(self.enc, f"enc{s}")
             if s:
                 rows = stage.down(rows, batch.levels[s - 1].children)
-            rows = stage.blocks(rows, rows, level, legacy=self.legacy)
+            rows = stage.blocks(rows, rows, level, stale_convolution=self.stale_convolution)
             skips.append(rows)
         # rows of a person are repeated in its empty slots, which a maximum does not notice
         bottleneck = rows[batch.levels[-1].slots].amax(1)
@@ -251,7 +251,7 @@ class _Backbone(nn.Module):
         for s in reversed(range(len(batch.levels) - 1)):
             level, stage = batch.levels[s], getattr(self.dec, f"dec{s}")
             rows, skip = stage.up(rows, skips[s], level.parent)
-            rows = stage.blocks(rows, skip, level, legacy=self.legacy)
+            rows = stage.blocks(rows, skip, level, stale_convolution=self.stale_convolution)
             if hasattr(self.dec, f"dec_ke{s}"):
                 anchors = getattr(self.dec, f"dec_ke{s}")(anchors, rows, level)
         return anchors, rows, bottleneck

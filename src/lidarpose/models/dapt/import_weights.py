@@ -13,7 +13,7 @@ import torch
 from lidarpose.errors import InputError
 from lidarpose.io.files import check_apart, check_suffix, file_error
 from lidarpose.models.checkpoint import Header, SafetensorsFile, save_checkpoint
-from lidarpose.models.dapt.dapt_config import CONFIGS, DaptConfig, named_config
+from lidarpose.models.dapt.dapt_config import CONFIGS, RELEASED_FAULTS, DaptConfig, named_config
 from lidarpose.models.dapt.dapt_net import DaptNet
 
 # what a wrapper for several GPUs puts before every name
@@ -28,7 +28,7 @@ def import_dapt(path: str | os.PathLike, config: DaptConfig | dict | str | None 
         path: the weights as .safetensors. Names of tensors may all begin with "module.".
         config: a `DaptConfig`, its entries or the authors' constructor arguments as a dict (`DaptConfig.from_dict`), or
             a name (waymo, humanm3, lidarhuman26m, sloper4d, pretrain); None reads the file's header, entry "config".
-            The legacy data flow is on unless a `DaptConfig` or a dict says otherwise.
+            `RELEASED_FAULTS` are on unless a `DaptConfig` or a dict says otherwise.
 
     Raises:
         InputError: one line that names the file and the tensor, for all that does not fit.
@@ -89,7 +89,7 @@ def _config(path: Path, metadata: dict[str, str], config: DaptConfig | dict | st
     if not isinstance(config, dict):
         raise file_error(path, f"{source} should be a dict, a name or a DaptConfig, got {type(config).__name__}")
     try:
-        return DaptConfig.from_dict({"legacy": True} | config)
+        return DaptConfig.from_dict(RELEASED_FAULTS | config)
     # TypeError: lists and dicts where numbers and names belong
     except (InputError, TypeError) as error:
         raise file_error(path, f"{source} does not fit: {error}") from None

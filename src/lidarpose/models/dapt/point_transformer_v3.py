@@ -1,7 +1,7 @@
 """Blocks of Point Transformer V3 as DAPT's released code has them: convolutions over voxels, patch attention, pooling.
 
 Legend: M voxels of all people at a level, one after the other, C channels, Q patches, K voxels a patch at most, H
-heads, D channels a head. Modules bear the names of the released weights. The legacy switch: see `dapt_net`.
+heads, D channels a head. Modules bear the names of the released weights. Stale convolutions: see `dapt_net`.
 """
 
 from typing import cast
@@ -119,8 +119,7 @@ class Perceptron(nn.Module):
 class Block(nn.Module):
     """Convolution as position encoding, attention and feed-forward, each a residual branch; pre-norm.
 
-    The released code loses the sum at a block's end: the next block's convolution reads the last branch alone. `legacy`
-    does the same.
+    The released code loses the sum at a block's end: the next block's convolution reads the last branch alone.
     """
 
     def __init__(self, channels: int, heads: int, mlp_ratio: int, drop_path: float, order: int):
@@ -173,11 +172,11 @@ class Stage(nn.Module):
         for k, block in enumerate(blocks):
             self.add_module(f"block{k}", block)
 
-    def blocks(self, rows: Tensor, stale: Tensor, level: Level, *, legacy: bool) -> Tensor:
-        """rows (M, C) -> (M, C); `stale` is what the first convolution reads in the legacy flow."""
+    def blocks(self, rows: Tensor, stale: Tensor, level: Level, *, stale_convolution: bool) -> Tensor:
+        """rows (M, C) -> (M, C); `stale` is what the first convolution reads where convolutions are stale."""
         for k in range(self.depth):
             block = getattr(self, f"block{k}")
-            rows, stale = block(rows, stale if legacy else rows, level)
+            rows, stale = block(rows, stale if stale_convolution else rows, level)
         return rows
 
 

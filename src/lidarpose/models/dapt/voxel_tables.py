@@ -95,8 +95,8 @@ def build_tables(
     layout: "ragged", pair lists and one patch after the other, for CPUs; "padded", gather tables and one block of
     patches, for accelerators: the same results. Of each voxel the point nearest its middle is kept. Curves go from
     block to block in the configuration's order, with `rng` in a random one, as in training. Cells are floor(p / grid);
-    with `config.legacy` the cloud's own minimum is subtracted, so that an outlier decides which voxels share a parent.
-    Raises InputError for clouds wider than the cells can count, and for more people than a batch can hold.
+    with `config.grid_from_minimum` the cloud's own minimum is subtracted, so that an outlier decides which voxels share
+    a parent. Raises InputError for clouds wider than the cells can count, and for more people than a batch can hold.
     """
     check_name("layout", layout, LAYOUTS)
     if not 1 <= len(clouds) < _MOST_PEOPLE:
@@ -144,14 +144,16 @@ def _cells(points: np.ndarray, lengths: np.ndarray, config: DaptConfig) -> np.nd
     if not np.isfinite(cells).all():
         raise InputError("points must be finite numbers of meters, got NaN or infinity: drop those points first")
     middle = 1 << (CELL_BITS - 1)
-    if config.legacy:
+    if config.grid_from_minimum:
         low = np.minimum.reduceat(cells, np.cumsum(lengths) - lengths)
         cells = cells - np.repeat(low, lengths, axis=0)
     else:
         cells = cells + middle
     if not (cells.min() >= 0 and cells.max() < 2 * middle):
         reach = middle * config.grid
-        limit = f"span {2 * reach:.0f} m at most" if config.legacy else f"lie within {reach:.0f} m of their person"
+        limit = f"lie within {reach:.0f} m of their person"
+        if config.grid_from_minimum:
+            limit = f"span {2 * reach:.0f} m at most"
         raise InputError(f"points must {limit}, got some beyond: crop to one person")
     return cells.astype(np.int64)
 

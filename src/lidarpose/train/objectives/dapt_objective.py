@@ -5,13 +5,14 @@ Legend: B people, J joints of the network, M voxels of level 0.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from lidarpose.errors import InputError, check_name
-from lidarpose.models.dapt.dapt_config import PARTS, DaptConfig, named_config
+from lidarpose.models.dapt.dapt_config import PARTS, RELEASED_FAULTS, DaptConfig, named_config
 from lidarpose.models.dapt.dapt_net import DaptNet, to_tensors
 from lidarpose.models.dapt.voxel_tables import LAYOUTS, Tables, build_tables
 from lidarpose.train.augment import UNKNOWN_PART, Example
@@ -121,15 +122,18 @@ class DaptObjective:
         return in_body26(joints, self.config.columns)
 
 
+_MENDED: dict[str, Any] = dict.fromkeys(RELEASED_FAULTS, False)
+
+
 def pretraining_config() -> DaptConfig:
-    """The paper's network before fine-tuning, with the corrected data flow."""
-    return replace(named_config("pretrain"), legacy=False)
+    """The paper's network before fine-tuning, with the released code's faults mended."""
+    return replace(named_config("pretrain"), **_MENDED)
 
 
 def finetuning_config(dataset: str) -> DaptConfig:
-    """The paper's network for a dataset, with the corrected data flow and no auxiliary head: waymo, humanm3,
-    lidarhuman26m or sloper4d. Raises InputError for another name."""
-    return replace(named_config(dataset), auxiliary=False, legacy=False)
+    """The paper's network for a dataset, with the faults of the released code mended and no auxiliary head: waymo,
+    humanm3, lidarhuman26m or sloper4d. Raises InputError for another name."""
+    return replace(named_config(dataset), auxiliary=False, **_MENDED)
 
 
 def small(config: DaptConfig) -> DaptConfig:

@@ -4,12 +4,12 @@ import torch
 from torch import Tensor
 
 from lidarpose.errors import InputError
-from lidarpose.models.dapt.dapt_config import DaptConfig
+from lidarpose.models.dapt.dapt_config import RELEASED_FAULTS, DaptConfig
 from lidarpose.models.dapt.dapt_net import DaptNet
 
 _ANCHORS = "keypoint_embedding"
 # settings that no tensor's shape betrays, but without which its numbers mean something else
-_MEANING = ("legacy", "grid", "strides", "encoder_heads", "decoder_heads", "anchor_heads", "neck")
+_MEANING = (*RELEASED_FAULTS, "grid", "strides", "encoder_heads", "decoder_heads", "anchor_heads", "neck")
 
 
 def transferred(source: DaptNet, config: DaptConfig, *, keep_anchors: bool = False) -> DaptNet:
