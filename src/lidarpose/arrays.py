@@ -1,4 +1,4 @@
-"""What other libraries hand over, as numpy arrays."""
+"""What other libraries hand over, as numpy arrays; indices at equal steps."""
 
 from typing import Any
 
@@ -19,3 +19,8 @@ def to_numpy(value: Any) -> Any:
     except TypeError:
         # numpy has no bfloat16 and nothing shorter
         return tensor.float().numpy()
+
+
+def evenly_spaced(count: int, limit: int) -> list[int]:
+    """Indices of at most `limit` of `count` things at equal steps, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(limit, count)).round().astype(int)).tolist()

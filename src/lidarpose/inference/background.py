@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lidarpose.arrays import evenly_spaced
 from lidarpose.errors import InputError
 from lidarpose.inference.inputs import as_points, only_returns
 from lidarpose.io.files import FormatError, file_error, listed
@@ -137,15 +138,11 @@ def _sources(scans: Any, columns: int | None) -> list:
     if not sources:
         raise InputError("background: expected a file of static points or scans of one recording, got none")
     if not any(isinstance(source, str | os.PathLike) and not is_single_scan(source) for source in sources):
-        return [sources[row] for row in _chosen(len(sources))]
+        return [sources[row] for row in evenly_spaced(len(sources), _MOST_SCANS)]
     recording = open_source(sources, columns=columns).recording
     count = sum(1 for _ in recording.lazy_frames()) if recording.count is None else recording.count
-    rows = set(_chosen(count))
+    rows = set(evenly_spaced(count, _MOST_SCANS))
     return [frame for row, frame in enumerate(recording.lazy_frames()) if row in rows]
-
-
-def _chosen(count: int) -> list[int]:
-    return np.unique(np.linspace(0, count - 1, _MOST_SCANS).round().astype(int)).tolist()
 
 
 def _points(source: Any, columns: int | None) -> np.ndarray:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarpose.arrays import evenly_spaced
 from lidarpose.errors import counted
 from lidarpose.geometry import transform_points
 from lidarpose.io.sources import Frame, Source
@@ -68,7 +69,7 @@ class RecordingPage:
     def render(self, source: Source, skeleton: Skeleton, *, title: str) -> bytes:
         """The HTML; the source is read again for the points of what is shown."""
         shown = {about["frame"]: k for k, (about, _, _) in enumerate(self._lines)}
-        is_surroundings = set(np.linspace(0, len(shown) - 1, _SURROUNDINGS).astype(int).tolist())
+        is_surroundings = set(evenly_spaced(len(shown), _SURROUNDINGS))
         panels: dict[int, ScanPanel] = {}
         surroundings: list[np.ndarray] = []
         for frame in source.frames(min(shown, default=0)):

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarpose.arrays import evenly_spaced
 from lidarpose.errors import counted
 from lidarpose.geometry import transform_points
 from lidarpose.io.sources import Frame, Source
@@ -110,9 +111,9 @@ class WaysPicture:
         """(n, 3) m of frames from the beginning to the end; of one where the sensor stays."""
         if not self._frames:
             return np.zeros((0, 3))
-        count = 1 if self._fixed.T_world_sensor is None else min(_FRAMES, len(self._frames))
+        is_static, count = self._fixed.T_world_sensor is None, len(self._frames)
         clouds = []
-        for row in np.linspace(len(self._frames) - 1, 0, count).astype(int).tolist():
+        for row in [count - 1] if is_static else evenly_spaced(count, _FRAMES):
             frame = next(source.frames(self._frames[row]), None)
             if isinstance(frame, Frame):
                 clouds.append(transform_points(self._to_fixed[row], frame.points))

@@ -29,6 +29,7 @@ import torch
 from threadpoolctl import threadpool_limits
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
+from lidarpose.arrays import evenly_spaced
 from lidarpose.errors import InputError
 from lidarpose.sample import CLIP_FRAMES, LabeledSample
 from lidarpose.synth.bodies import PoseBank, smpl_rig
@@ -194,8 +195,8 @@ class ClipSource(_OfDataset):
     def some(self, count: int) -> list[ClipExample]:
         """So many clips at most, evenly spread, to validate on: centered on their points."""
         rng = np.random.default_rng(self.seed)
-        clip_rows = np.unique(np.linspace(0, len(self.clips) - 1, min(count, len(self.clips))).astype(int))
-        clips = [[self.dataset.sample(row) for row in self.clips[clip, :CLIP_FRAMES]] for clip in clip_rows]
+        clip_rows = self.clips[evenly_spaced(len(self.clips), count), :CLIP_FRAMES]
+        clips = [[self.dataset.sample(row) for row in rows] for rows in clip_rows]
         return [clip_example(clip, rng, trans_center=self.trans_center, refined=0.0) for clip in clips]
 
 

@@ -25,6 +25,7 @@ import torch
 from accelerate import Accelerator
 from torch import Tensor, nn
 
+from lidarpose.arrays import evenly_spaced
 from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import write_atomic
 from lidarpose.models.checkpoint import save_checkpoint
@@ -363,7 +364,7 @@ class _Run:
         batch = self.recipe.batch // self.setup.frames
         self.error, joints = self.setup.validate(self.setup.objective, network, self._watched, batch)
         if pictures and self.draw is not None and joints is not None and self.setup.joints is not None:
-            rows = np.unique(np.linspace(0, len(joints) - 1, min(pictures, len(joints))).astype(int))
+            rows = evenly_spaced(len(joints), pictures)
             frames = [frame for example in self._watched for frame in example.frames]
             examples = [frames[k] for k in rows]
             picture = self.draw(examples, joints[rows], self.setup.joints, f"after {self.seen:,} people")

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from torch import nn
 
+from lidarpose.arrays import evenly_spaced
 from lidarpose.data.dataset_card import read_card
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error
@@ -285,7 +286,7 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
             return []
         # a box with a detector's errors where there is one, centered on the points
         cropping = Augmentation(released=kind.released, box=kind.box, refined=0.0)
-        rows = np.unique(np.linspace(0, len(held_out_dataset) - 1, min(VALIDATION, len(held_out_dataset))).astype(int))
+        rows = evenly_spaced(len(held_out_dataset), VALIDATION)
         return [augmented(held_out_dataset.sample(k), cropping, np.random.default_rng([recipe.seed, k])) for k in rows]
 
     setup = TrainSetup(
