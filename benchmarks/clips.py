@@ -29,7 +29,7 @@ from lidarpose.synth.bodies import CLIP_HZ, PoseBank
 from lidarpose.synth.generator import Generator
 from lidarpose.tracking.bones import rigid_bones
 from lidarpose.tracking.clip import TrackPoses
-from lidarpose.tracking.live import follow
+from lidarpose.tracking.live import filter_track
 from lidarpose.tracking.smoothing import smooth
 
 # never a seed of a training run, nor of the clips that the smoother was tuned on, 71001
@@ -84,7 +84,7 @@ def plain_solve(track: TrackPoses) -> np.ndarray:
 
 def live_joints(track: TrackPoses) -> np.ndarray:
     """(T, J, 3) m, NaN where there are none."""
-    return TrackPoses.of_poses(track.times, follow(track), BODY26).joints
+    return TrackPoses.of_poses(track.times, filter_track(track), BODY26).joints
 
 
 WAYS = {

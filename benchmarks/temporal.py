@@ -25,7 +25,7 @@ from lidarpose.skeleton import BODY26, HUMAN15
 from lidarpose.synth.bodies import CLIP_HZ
 from lidarpose.tracking.bones import keep_lengths, lengths_of, measured, rigid_bones
 from lidarpose.tracking.clip import TrackPoses
-from lidarpose.tracking.smoothing import known_spread, settled, smooth
+from lidarpose.tracking.smoothing import known_spread, smooth, with_facing_corrected
 
 SEGMENTS = 3
 COEFFICIENTS = SEGMENTS + 3
@@ -76,11 +76,11 @@ def smoothed(clips: dict[str, np.ndarray], index: int, there: np.ndarray, seen: 
     )
     if track.seen.sum() < 2:
         return None
-    settled_track, steady_track = settled(track), smooth(track)
+    corrected_track, steady_track = with_facing_corrected(track), smooth(track)
     clip = {name: np.full(value.shape, np.nan) for name, value in values.items()}
     clip |= {"steady": clip["joints"].copy(), "steady_spread": clip["spread"].copy()}
     for name in _GIVEN:
-        clip[name][part] = getattr(settled_track, name)
+        clip[name][part] = getattr(corrected_track, name)
     clip["steady"][part], clip["steady_spread"][part] = steady_track.joints, steady_track.spread
     clip["known"] = np.isfinite(clip["steady"]).all((1, 2))
     clip["there"] = there & clip["known"]

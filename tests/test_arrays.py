@@ -9,7 +9,7 @@ from lidarpose.arrays import evenly_spaced
 
 @given(st.integers(0, 500), st.integers(1, 600))
 def test_evenly_spaced(count, limit):
-    indices = evenly_spaced(count, limit)
+    indices = evenly_spaced(count, limit).tolist()
     assert len(indices) == min(count, limit)
     if count <= limit:
         assert indices == list(range(count))

@@ -13,7 +13,7 @@ from lidarpose.inference.predictor import load
 from lidarpose.skeleton import SKELETONS, SMPL24
 from lidarpose.tracking.bones import rigid_bones
 from lidarpose.tracking.clip import TrackPoses
-from lidarpose.tracking.live import LiveFilter, follow
+from lidarpose.tracking.live import LiveFilter, filter_track
 from lidarpose.tracking.motion_model import smooth_joints
 from lidarpose.tracking.smoothing import smooth
 
@@ -72,10 +72,10 @@ def test_paths_are_those_of_one_dense_solve(walker):
     times = np.cumsum(rng.uniform(0.05, 0.3, 12))
     joints, precision = rng.normal(size=(12, 3, 3)), rng.uniform(50, 500, (12, 3))
     precision[4:6] = 0
-    strength = rng.uniform(0.01, 1, (12, 3))
+    process_noise = rng.uniform(0.01, 1, (12, 3))
     for fast, slow in zip(
-        smooth_joints(times, joints, precision, strength),
-        smooth_joints_reference(times, joints, precision, strength),
+        smooth_joints(times, joints, precision, process_noise),
+        smooth_joints_reference(times, joints, precision, process_noise),
         strict=True,
     ):
         np.testing.assert_allclose(fast, slow, rtol=1e-6, atol=1e-8)
@@ -92,7 +92,7 @@ def test_steady_is_nearer_and_smoother(walker, skeleton):
     true, track = walker(skeleton)
     before, steady = error(track.joints, true), error(smooth(track).joints, true)
     assert steady[0] < 0.7 * before[0] and steady[1] < 0.15 * before[1]
-    live = error(np.stack([pose.joints for pose in follow(track)]), true)
+    live = error(np.stack([pose.joints for pose in filter_track(track)]), true)
     assert live[0] < before[0] and live[1] < 0.5 * before[1]
 
 
@@ -105,7 +105,7 @@ def test_a_sensor_that_moves(walker, speed):
     before = error(moved.joints, true + way)
     steady = error(smooth(moved).joints, true + way)
     assert steady[0] < 0.8 * before[0] and steady[1] < 0.2 * before[1]
-    live = error(np.stack([pose.joints for pose in follow(moved)]), true + way)
+    live = error(np.stack([pose.joints for pose in filter_track(moved)]), true + way)
     assert live[0] < 1.1 * before[0] and live[1] < 0.75 * before[1]
 
 
@@ -149,7 +149,7 @@ def test_unseen_frames_are_filled_and_say_so(walker):
     assert np.linalg.norm(steady.joints[5:13] - true[5:13], axis=-1).mean() < 0.1
     assert steady.spread[9].mean() > 1.5 * steady.spread[[3, 15]].mean()
     assert (steady.visible[5:13] == 0).all() and (steady.visible[:5] == 0.9).all()
-    live = follow(given)
+    live = filter_track(given)
     assert live[12] is not None and live[20] is not None and live[48] is None and live[49] is not None
     assert live[10].spread.mean() > 2 * live[4].spread.mean()
 
@@ -176,7 +176,7 @@ def test_filled_joints_are_as_far_off_as_their_spread_says(people_in_motion, gap
 
 def test_the_past_alone_and_a_state_that_goes_on(walker):
     _, track = walker()
-    whole, poses = follow(track), track.poses()
+    whole, poses = filter_track(track), track.poses()
     begun = LiveFilter(track.skeleton)
     for t in range(20):
         begun.update(track.times[t], poses[t])
@@ -189,7 +189,7 @@ def test_tracks_without_or_with_one_frame(walker):
     _, track = walker(frames=1)
     assert np.abs(smooth(track).joints - track.joints).max() < 1e-3
     nobody = TrackPoses.of_poses(np.arange(3.0), [None] * 3, SMPL24)
-    assert smooth(nobody).poses() == follow(nobody) == [None] * 3
+    assert smooth(nobody).poses() == filter_track(nobody) == [None] * 3
 
 
 def test_times_must_increase():

@@ -19,7 +19,7 @@ from lidarpose.viz import draw
 from lidarpose.viz.bird_eye import ScanPanel
 from lidarpose.viz.draw import draw_people, shortened
 from lidarpose.viz.html import MAX_POINTS, render_report, write_report
-from lidarpose.viz.person_view import Panel, bone_sides, describe, project, side, thinned, view_directions
+from lidarpose.viz.person_view import Panel, bone_sides, describe, project, side, view_directions
 
 BLUE, ORANGE = (0x00, 0x72, 0xB2), (0xE0, 0x70, 0x00)
 
@@ -113,13 +113,6 @@ def test_sides_of_bones():
     assert named[at("nose"), at("left_shoulder")] == "left"
     assert named[at("right_knee"), at("right_ankle")] == "right"
     assert named[at("left_hip"), at("right_hip")] == "center"
-
-
-@given(count=st.integers(0, 500), limit=st.integers(1, 200))
-def test_thinned_keeps_distinct_points_in_order(count, limit):
-    index = thinned(count, limit)
-    assert len(index) == min(count, limit)
-    assert (np.diff(index) > 0).all() and (index < count).all()
 
 
 def test_picture_has_left_in_blue_on_the_right_of_the_front_view(tmp_path):

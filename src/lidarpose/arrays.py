@@ -21,6 +21,6 @@ def to_numpy(value: Any) -> Any:
         return tensor.float().numpy()
 
 
-def evenly_spaced(count: int, limit: int) -> list[int]:
+def evenly_spaced(count: int, limit: int) -> np.ndarray:
     """Indices of at most `limit` of `count` things at equal steps, the first and the last among them."""
-    return np.unique(np.linspace(0, count - 1, min(limit, count)).round().astype(int)).tolist()
+    return np.arange(count) if count <= limit else np.linspace(0, count - 1, limit).round().astype(int)

@@ -6,7 +6,7 @@ ANYWHERE, VELOCITY = 1e4, 5.0
 
 
 def smooth_joints_reference(
-    times: np.ndarray, joints: np.ndarray, precision: np.ndarray, strength: np.ndarray
+    times: np.ndarray, joints: np.ndarray, precision: np.ndarray, process_noise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The path (T, J, 3) and its variance (T, J): see `motion_model.smooth_joints`."""
     frames, count, _ = joints.shape
@@ -21,7 +21,7 @@ def smooth_joints_reference(
             right[2 * t] = precision[t, j] * joints[t, j]
             if t:
                 step = times[t] - times[t - 1]
-                noise = strength[t, j] * np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
+                noise = process_noise[t, j] * np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
                 # from what was expected of the frame to what it is
                 jump = np.hstack([-np.array([[1, step], [0, 1]]), np.eye(2)])
                 information[2 * t - 2 : 2 * t + 2, 2 * t - 2 : 2 * t + 2] += jump.T @ np.linalg.inv(noise) @ jump

@@ -149,7 +149,7 @@ def _detector_lines(result) -> Iterator[str]:
 
     rows = pandas.DataFrame(result.rows)
     records = [SimpleNamespace(**row) for row in result.rows]
-    rows["cell"] = [f"{_value(row)} {_ends(row)}".rstrip() for row in records]
+    rows["cell"] = [f"{_value(row)} {_interval_text(row)}".rstrip() for row in records]
     recall = rows[rows.figure == "recall"].set_index(["group", "of", "count", "at"]).cell.unstack(sort=False)
     recall.columns = [f"at {at} (score {score:.2f})" for at, score in result.thresholds.items()]
     yield f"{result.dataset}: {result.scans:,} scans; recall, %, at so many false people a scan:"
@@ -165,10 +165,10 @@ def _detector_lines(result) -> Iterator[str]:
 
 def _table(options: argparse.Namespace) -> None:
     from lidarpose import evaluation
-    from lidarpose.io.files import check_apart, check_suffix, write_atomic
+    from lidarpose.io.files import check_not_input, check_suffix, write_atomic
 
     if options.out is not None:
-        check_apart(options.out, *map(evaluation.scores_path, options.scores))
+        check_not_input(options.out, *map(evaluation.scores_path, options.scores))
     text = evaluation.table(options.scores, format=options.format)
     if options.out is None:
         print(text, end="")
@@ -210,7 +210,7 @@ def _lines(result) -> Iterator[str]:
     joint, distance, points, hidden share."""
     setting, counts = result.setting, result.counts
     mpjpe = result.line("mpjpe")
-    headline = f"MPJPE {_value(mpjpe)} mm {_ends(mpjpe)}".rstrip()
+    headline = f"MPJPE {_value(mpjpe)} mm {_interval_text(mpjpe)}".rstrip()
     yield f"{setting.dataset}: {headline}, {mpjpe.people:,} of {counts['people']:,} people · {setting.method}"
     yield f"  {setting.summary} · {len(setting.joints)} joints"
     split = setting.split + (f" ({setting.split_source})" if setting.split_source else "")
@@ -226,7 +226,7 @@ def _lines(result) -> Iterator[str]:
     name_width = max(len(name) for name, _ in rows)
     yield f"  {'':<{name_width}}{'value':>8}  {'95 % interval':<16}{'people':>8}"
     for name, row in rows:
-        yield f"  {name:<{name_width}}{_value(row):>8}  {_ends(row):<16}{row.people:>8,}"
+        yield f"  {name:<{name_width}}{_value(row):>8}  {_interval_text(row):<16}{row.people:>8,}"
 
 
 def _is_shown(row) -> bool:
@@ -250,7 +250,7 @@ def _value(row) -> str:
     return "-" if row.value is None else f"{row.value:.1f}"
 
 
-def _ends(row) -> str:
+def _interval_text(row) -> str:
     return "" if row.low is None else f"[{row.low:.1f}, {row.high:.1f}]"
 
 

@@ -123,7 +123,7 @@ def output_paths(
 ) -> tuple[Path | None, Path | None, Path | None]:
     """Where `predict` writes its result, in one of the formats, a picture and a page, None for what it does not write.
     Raises InputError where one cannot be written, or is a file that is read."""
-    from lidarpose.io.files import check_apart, check_writable
+    from lidarpose.io.files import check_not_input, check_writable
     from lidarpose.io.point_cloud import SUFFIXES
     from lidarpose.io.sources.folders import is_result, list_folder
 
@@ -137,7 +137,7 @@ def output_paths(
     files = [file for file in files if file.suffix.lower() in SUFFIXES and not is_result(file)]
     inputs = (options.boxes, options.calib, options.weights, *(options.background or ()))
     for path in filter(None, (result, picture, page)):
-        check_apart(path, *sources, *files, *inputs)
+        check_not_input(path, *sources, *files, *inputs)
         # before the work
         check_writable(path)
     return result, picture, page
@@ -154,11 +154,11 @@ def prediction_options(options: argparse.Namespace) -> dict[str, Any]:
 
 def _detect(options: argparse.Namespace) -> None:
     from lidarpose.inference.detection import detect
-    from lidarpose.io.files import check_apart, check_writable
+    from lidarpose.io.files import check_not_input, check_writable
 
     result = _result_path(options.out, Path(options.file).stem, "boxes", ".json")
     if result is not None:
-        check_apart(result, options.file, *(options.background or ()))
+        check_not_input(result, options.file, *(options.background or ()))
         check_writable(result)
     boxes = detect(options.file, **_reading(options))
     if result is None:

@@ -77,16 +77,16 @@ def _predict_recording(
     from lidarpose.io.sources import open_source
     from lidarpose.recording.output import write_recording
     from lidarpose.recording.page import RecordingPage
-    from lidarpose.recording.picture import WaysPicture
+    from lidarpose.recording.picture import TrajectoryPicture
     from lidarpose.recording.predict_recording import FramePredictor
 
     if len(options.source) > 1 and any(map(os.path.isdir, options.source)):
         raise InputError(f"expected one folder, or files, got {len(options.source)}: run the command for each folder")
     frames = {name: getattr(options, name) for name in ("columns", "topic", "meta", "rate", "start", "end")}
     source = open_source(options.source, every=1 if options.every is None else options.every, **frames)
-    steps = FramePredictor(name=source.name, track=options.track, live=options.live, **posing_options)
-    tracks_picture = None if picture is None else WaysPicture(steps.up)
-    frames_page = None if page is None else RecordingPage(steps.up)
+    predictor = FramePredictor(name=source.name, track=options.track, live=options.live, **posing_options)
+    tracks_picture = None if picture is None else TrajectoryPicture(predictor.up)
+    frames_page = None if page is None else RecordingPage(predictor.up)
     views = [view for view in (tracks_picture, frames_page) if view is not None]
 
     def on_line(line: dict[str, Any]) -> None:
@@ -94,11 +94,11 @@ def _predict_recording(
             view.add(line)
 
     if result is None:
-        summary = _print_lines(options, source, steps, on_line)
+        summary = _print_lines(options, source, predictor, on_line)
     else:
         summary = write_recording(
             source,
-            steps,
+            predictor,
             result,
             command=_command(options),
             world=options.world,
@@ -106,31 +106,31 @@ def _predict_recording(
             tell=lambda text: tell(f"lidarpose: {text}"),
         )
     if tracks_picture is not None and picture is not None:
-        write_atomic(picture, tracks_picture.draw(source, steps.wanted, title=Path(source.name).name))
+        write_atomic(picture, tracks_picture.draw(source, predictor.wanted, title=Path(source.name).name))
     if frames_page is not None and page is not None:
-        write_atomic(page, frames_page.render(source, steps.wanted, title=Path(source.name).name))
+        write_atomic(page, frames_page.render(source, predictor.wanted, title=Path(source.name).name))
     outputs = [str(path) for path in (result, picture, page) if path is not None]
     _report(options, source, summary, f" -> {' and '.join(outputs)}" if outputs else "")
 
 
-def _print_lines(options: argparse.Namespace, source, steps, on_line: Callable[[dict[str, Any]], None]):
+def _print_lines(options: argparse.Namespace, source, predictor, on_line: Callable[[dict[str, Any]], None]):
     """Frames as they come, on the standard output. Returns their `Summary`."""
     from lidarpose.recording.coordinates import in_world
     from lidarpose.recording.output import Summary, nothing_read
 
-    if steps.is_tracked and not steps.live:
+    if predictor.is_tracked and not predictor.live:
         raise InputError("--out - prints frames as they come: say --live, which needs no later frames, or name a file")
     if options.format not in (None, "jsonl"):
         raise InputError(f"--out - prints lines of JSON, not {options.format}: name a file")
     summary, last = Summary(), None
-    for frame in steps.predict_all(source.frames()):
+    for frame in predictor.predict_all(source.frames()):
         line = frame.to_dict()
-        line = in_world(line, steps.up) if options.world else line
+        line = in_world(line, predictor.up) if options.world else line
         summary.add(line)
         on_line(line)
         print(json.dumps(line), flush=True)
         last = frame.index, frame.id
-    steps.check_boxes(last)
+    predictor.check_boxes(last)
     if summary.damaged == summary.frames:
         raise nothing_read(source.name, summary.frames, summary.first_error)
     return summary

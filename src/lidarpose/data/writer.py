@@ -127,15 +127,15 @@ def _by_processes(make: Make, shards: list[int], workers: int) -> Iterator[tuple
 
 
 # of a worker process: what makes a shard, the count of what all have done, and whether to stop
-_mine: tuple = ()
+_worker_state: tuple = ()
 
 
 def _start(make: Make, counter, stop) -> None:
-    global _mine
+    global _worker_state
     # the parent says when to stop
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_leave_with_parent, daemon=True).start()
-    _mine = (make, counter, stop)
+    _worker_state = (make, counter, stop)
 
 
 def _leave_with_parent() -> None:
@@ -146,7 +146,7 @@ def _leave_with_parent() -> None:
 
 
 def _shard(shard: int) -> None:
-    make, counter, stop = _mine
+    make, counter, stop = _worker_state
     with closing(_counts(make, shard)) as counts:
         for count in counts:
             with counter.get_lock():

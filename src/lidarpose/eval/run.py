@@ -225,7 +225,7 @@ def run(
 
     Args:
         model: a `Predictor`, anything that answers as it does, or what `load` takes.
-        datasets: folders that `lidarpose prepare` or `synth` wrote, or "bench".
+        datasets: folders that `lidarpose prepare` or `synth` wrote, or "bench" or "bench-2".
         protocol: "clean" or "dapt".
         split: by default test, else val, else "all", which is everybody.
         skeleton: score its joints, by default the dataset's (of synthetic people human15's).

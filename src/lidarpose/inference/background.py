@@ -141,7 +141,7 @@ def _sources(scans: Any, columns: int | None) -> list:
         return [sources[row] for row in evenly_spaced(len(sources), _MOST_SCANS)]
     recording = open_source(sources, columns=columns).recording
     count = sum(1 for _ in recording.lazy_frames()) if recording.count is None else recording.count
-    rows = set(evenly_spaced(count, _MOST_SCANS))
+    rows = set(evenly_spaced(count, _MOST_SCANS).tolist())
     return [frame for row, frame in enumerate(recording.lazy_frames()) if row in rows]
 
 

@@ -44,7 +44,7 @@ from lidarpose.sample import MIN_POINTS, PER_PERSON, Box, Pose, within_reach
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 from lidarpose.tracking.clip import TrackPoses
-from lidarpose.tracking.live import follow
+from lidarpose.tracking.live import filter_track
 from lidarpose.tracking.smoothing import smooth
 
 if TYPE_CHECKING:
@@ -268,7 +268,7 @@ class Predictor(PoseEstimator):
         frame_clouds = [as_points(cloud, f"clouds[{i}]") for i, cloud in enumerate(clouds)]
         people = self._people_of_clouds(frame_clouds, as_origin(sensor_origin), target_skeleton, progress, clips)
         track = TrackPoses.of_poses(seconds, [person.pose for person in people], target_skeleton)
-        steady_poses = follow(track) if live else smooth(track).poses()
+        steady_poses = filter_track(track) if live else smooth(track).poses()
         frames = [
             replace(person, id=i, pose=_with_own(person, pose), warnings=_steady_warnings(person, pose))
             for i, (person, pose) in enumerate(zip(people, steady_poses, strict=True))

@@ -85,7 +85,7 @@ def listed(paths: str | os.PathLike | Iterable[str | os.PathLike]) -> list[str |
     return [paths] if isinstance(paths, str | os.PathLike) else list(paths)
 
 
-def check_apart(out: str | os.PathLike, *inputs: object) -> None:
+def check_not_input(out: str | os.PathLike, *inputs: object) -> None:
     """Raises InputError where the file to write is one of those that are read, by whatever name. Inputs that are no
     paths, or of files that are not there, do not count."""
     for source in inputs:
@@ -305,7 +305,7 @@ def locked(folder: Path, names: str, *, busy: str, wait: float = 0.0) -> Iterato
 
 
 @contextmanager
-def taking_turns(path: Path, on_busy: Callable[[], None]) -> Iterator[None]:
+def exclusive_lock(path: Path, on_busy: Callable[[], None]) -> Iterator[None]:
     """Keeps other processes from what a file in a folder that is there stands for, and waits until they are done. The
     file stays; else as `locked`.
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from lidarpose._version import __version__
 from lidarpose.errors import InputError, LidarPoseError, check_name, missing_extra
-from lidarpose.io.files import atomic_path, check_apart, check_suffix, check_writable, content_digest, write_atomic
+from lidarpose.io.files import atomic_path, check_not_input, check_suffix, check_writable, content_digest, write_atomic
 from lidarpose.models.checkpoint import DIGEST, ENTRY, Header, load_checkpoint
 from lidarpose.models.detector.detector_config import INPUTS, OUTPUT
 from lidarpose.models.detector.network import DetectorNet
@@ -52,7 +52,7 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
             suffix than `FORMATS` says. MissingExtra: without onnx.
     """
     check_name("format", format, FORMATS)
-    check_apart(out, weights)
+    check_not_input(out, weights)
     check_suffix(out, FORMATS[format])
     network, header = load_checkpoint(weights)
     if isinstance(network, DetectorNet) and format == "onnx":

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarpose.errors import InputError, LidarPoseError
-from lidarpose.io.files import taking_turns, write_atomic
+from lidarpose.io.files import exclusive_lock, write_atomic
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.run_dir import CONFIG, LENGTHS, MODEL, read_config, read_log
 
@@ -123,7 +123,7 @@ def run_steps(step: Step, out: Path, execute: Execute, tell: Callable[[str], Non
             continue
         waiting = f"{part.name}: another process is at it, waiting for its end"
         (out / RUNS).mkdir(parents=True, exist_ok=True)
-        with taking_turns(out / RUNS / f".{part.name}.lock", partial(tell, waiting)):
+        with exclusive_lock(out / RUNS / f".{part.name}.lock", partial(tell, waiting)):
             if not is_done(part, out):
                 tell(part.line(out))
                 _run(part, out, execute)

@@ -40,14 +40,14 @@ def in_world(line: dict[str, Any], up: str = "z") -> dict[str, Any]:
     for person in line["people"]:
         changes: dict[str, Any] = {}
         if person["joints"] is not None:
-            changes["joints"] = moved_points(T, person["joints"])
+            changes["joints"] = rounded_points(T, person["joints"])
         if (box := person["box"]) is not None:
             yaw = moved_yaw(box["yaw"], T, rotation_of_boxes(up))
-            changes["box"] = box | {"center": moved_points(T, box["center"]), "yaw": yaw}
+            changes["box"] = box | {"center": rounded_points(T, box["center"]), "yaw": yaw}
         people.append(person | changes)
     return line | {"people": people, "coordinates": "world"}
 
 
-def moved_points(T: np.ndarray, points: Any) -> list:
+def rounded_points(T: np.ndarray, points: Any) -> list:
     """Points (..., 3) m moved by T (4, 4), as lines hold them."""
     return transform_points(T, np.asarray(points)).round(4).tolist()

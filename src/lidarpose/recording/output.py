@@ -21,7 +21,7 @@ from lidarpose.progress import Progress
 from lidarpose.recording.coordinates import in_world
 from lidarpose.recording.predict_recording import FramePoses, FramePredictor
 from lidarpose.recording.result_files import check_format, write_result
-from lidarpose.recording.steady_tracks import steadied
+from lidarpose.recording.steady_tracks import smoothed_lines
 
 try:
     import fcntl
@@ -200,7 +200,7 @@ class Summary:
 
 def write_recording(
     source: Source,
-    steps: FramePredictor,
+    predictor: FramePredictor,
     result: Path,
     *,
     command: dict[str, Any],
@@ -230,7 +230,7 @@ def write_recording(
         elif part.frames:
             tell(f"{part.frames:,} frames are in {part.path}: going on")
         try:
-            _add_frames(source, steps, part)
+            _add_frames(source, predictor, part)
         except KeyboardInterrupt:
             place = f"the finished frames are in {part.path}, and the same command goes on"
             raise KeyboardInterrupt(f"stopped: {place}" if part.frames else "stopped") from None
@@ -238,12 +238,12 @@ def write_recording(
             error = next((line["error"] for line in part.lines()), None)
             part.remove()
             raise nothing_read(source.name, part.frames, error)
-        is_smoothed = steps.is_tracked and not steps.live
-        lines = steadied(part.lines, steps.up, steps.wanted) if is_smoothed else part.lines()
+        is_smoothed = predictor.is_tracked and not predictor.live
+        lines = smoothed_lines(part.lines, predictor.up, predictor.wanted) if is_smoothed else part.lines()
 
         def final() -> Iterator[dict[str, Any]]:
             for line in lines:
-                line = in_world(line, steps.up) if world else line
+                line = in_world(line, predictor.up) if world else line
                 summary.add(line)
                 if on_line is not None:
                     on_line(line)
@@ -261,19 +261,19 @@ def nothing_read(name: str, frames: int, first_error: str | None) -> InputError:
     return file_error(name, f"of {counted(frames, 'frame')} none can be read, the first: {first_error}")
 
 
-def _add_frames(source: Source, steps: FramePredictor, part: PartFile) -> None:
+def _add_frames(source: Source, predictor: FramePredictor, part: PartFile) -> None:
     """Poses the frames that are not in the part yet."""
     frames = source.frames()
     frame = None
     if part.state is not None and part.last is not None:
-        steps.restore(part.state)
+        predictor.restore(part.state)
         index, id = part.last
         frames = source.frames(index)
         frame = next(frames, None)
         if frame is None or (frame.index, frame.id) != (index, id):
             raise file_error(part.path, f"was made of other frames, the last one {id}: remove it to begin anew")
     with Progress(source.count, unit="frames", done=part.frames) as bar:
-        for frame_poses in steps.predict_all(frames):
-            part.append(frame_poses, steps.state())
+        for frame_poses in predictor.predict_all(frames):
+            part.append(frame_poses, predictor.state())
             bar.update(part.frames)
-    steps.check_boxes(part.last)
+    predictor.check_boxes(part.last)

@@ -15,7 +15,6 @@ from lidarpose.sample import Pose
 from lidarpose.skeleton import Skeleton
 from lidarpose.viz.bird_eye import ScanPanel
 from lidarpose.viz.html import render_report
-from lidarpose.viz.person_view import thinned
 
 # frames that are shown at most, and points of each person in each
 _MOST_FRAMES, _PERSON_POINTS = 300, 200
@@ -69,7 +68,7 @@ class RecordingPage:
     def render(self, source: Source, skeleton: Skeleton, *, title: str) -> bytes:
         """The HTML; the source is read again for the points of what is shown."""
         shown = {about["frame"]: k for k, (about, _, _) in enumerate(self._lines)}
-        is_surroundings = set(evenly_spaced(len(shown), _SURROUNDINGS))
+        is_surroundings = set(evenly_spaced(len(shown), _SURROUNDINGS).tolist())
         panels: dict[int, ScanPanel] = {}
         surroundings: list[np.ndarray] = []
         for frame in source.frames(min(shown, default=0)):
@@ -102,7 +101,7 @@ class RecordingPage:
         for box in (person["box"] for person in people if person["box"] is not None):
             is_far &= ~box.contains(points, margin=_NEAR)
             own_points = points[box.contains(points)]
-            clouds.append(own_points[thinned(len(own_points), _PERSON_POINTS)])
+            clouds.append(own_points[evenly_spaced(len(own_points), _PERSON_POINTS)])
         return np.concatenate(clouds), is_far
 
     def _panel(

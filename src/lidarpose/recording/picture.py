@@ -37,7 +37,7 @@ def in_fixed_frame(line: dict[str, Any], fixed: FixedFrame) -> tuple[np.ndarray,
     return T_fixed_sensor, people
 
 
-class WaysPicture:
+class TrajectoryPicture:
     """Collects where people are, line by line of the result, in the fixed frame."""
 
     def __init__(self, up: str):
@@ -113,7 +113,7 @@ class WaysPicture:
             return np.zeros((0, 3))
         is_static, count = self._fixed.T_world_sensor is None, len(self._frames)
         clouds = []
-        for row in [count - 1] if is_static else evenly_spaced(count, _FRAMES):
+        for row in [count - 1] if is_static else evenly_spaced(count, _FRAMES).tolist():
             frame = next(source.frames(self._frames[row]), None)
             if isinstance(frame, Frame):
                 clouds.append(transform_points(self._to_fixed[row], frame.points))

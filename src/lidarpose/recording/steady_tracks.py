@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.geometry import inverse_transform, transform_points
-from lidarpose.recording.coordinates import FixedFrame, moved_points
+from lidarpose.recording.coordinates import FixedFrame, rounded_points
 from lidarpose.sample import Pose
 from lidarpose.skeleton import Skeleton
 from lidarpose.tracking.clip import TrackPoses
@@ -16,7 +16,9 @@ from lidarpose.tracking.smoothing import smooth
 _SMOOTHED = {"spread": 4, "visible": 3, "confidence": 3}
 
 
-def steadied(lines: Callable[[], Iterator[dict[str, Any]]], up: str, skeleton: Skeleton) -> Iterator[dict[str, Any]]:
+def smoothed_lines(
+    lines: Callable[[], Iterator[dict[str, Any]]], up: str, skeleton: Skeleton
+) -> Iterator[dict[str, Any]]:
     """The lines with every track made steady, and people added where they were hidden.
 
     Args:
@@ -75,7 +77,7 @@ def _entry(pose: Pose, T_sensor_fixed: np.ndarray) -> dict[str, Any]:
         for name, (value, digits) in arrays.items()
         if value is not None
     }
-    return values | {"joints": moved_points(T_sensor_fixed, pose.joints)}
+    return values | {"joints": rounded_points(T_sensor_fixed, pose.joints)}
 
 
 def _with_steady(people: list[dict[str, Any]], entries: dict[int, dict[str, Any]]) -> Iterator[dict[str, Any]]:

@@ -27,7 +27,7 @@ def rigid_bones(skeleton: Skeleton) -> np.ndarray:
     ).reshape(-1, 2)
 
 
-def measured(joints: np.ndarray, variance: np.ndarray, bones: np.ndarray) -> np.ndarray:
+def length_statistics(joints: np.ndarray, variance: np.ndarray, bones: np.ndarray) -> np.ndarray:
     """(..., E, 2) of joints (..., J, 3) m with variance (..., J) m^2: what a frame says of the squared length of each
     bone (E, 2), times its weight, and the weight. Sums over frames are what `lengths_of` takes."""
     squared = ((joints[..., bones[:, 0], :] - joints[..., bones[:, 1], :]) ** 2).sum(-1)
@@ -37,7 +37,7 @@ def measured(joints: np.ndarray, variance: np.ndarray, bones: np.ndarray) -> np.
 
 
 def lengths_of(total: np.ndarray, bones: np.ndarray, flip: tuple[int, ...]) -> np.ndarray:
-    """(E,) m: lengths of bones (E, 2), the same left and right, from a sum (E, 2) of `measured`. flip: as in
+    """(E,) m: lengths of bones (E, 2), the same left and right, from a sum (E, 2) of `length_statistics`. flip: as in
     `Skeleton`."""
     bone_index = {frozenset(bone): i for i, bone in enumerate(bones.tolist())}
     mirror_index = [bone_index[frozenset((flip[a], flip[b]))] for a, b in bones.tolist()]

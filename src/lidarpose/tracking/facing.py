@@ -22,7 +22,7 @@ _ACROSS = ("hip", "shoulder")
 _FORWARD, _WALK = 0.3, 0.7
 
 
-def exchanged(
+def swapped_frames(
     times: np.ndarray, joints: np.ndarray, variance: np.ndarray, confidence: np.ndarray | None, skeleton: Skeleton
 ) -> np.ndarray:
     """(T,) bool: the frames in which left and right are to be exchanged.
@@ -31,24 +31,24 @@ def exchanged(
     """
     flip = np.array(skeleton.flip)
     frame_confidence = np.full(len(times), _CONFIDENCE) if confidence is None else confidence.mean(1)
-    odds = _SURE * frame_confidence + _forward_odds(times, joints, skeleton)
+    log_odds = _SURE * frame_confidence + _forward_log_odds(times, joints, skeleton)
     # joints in the middle are their own mirror: nothing is across
-    similarity = _alike(joints - joints[:, flip], variance + variance[:, flip])
-    costs, backpointers = np.array([0.0, odds[0]]), np.zeros((len(times), 2), int)
+    similarity = _cosine_similarity(joints - joints[:, flip], variance + variance[:, flip])
+    costs, backpointers = np.array([0.0, log_odds[0]]), np.zeros((len(times), 2), int)
     for row in range(1, len(times)):
         # [before, now]
         total = costs[:, None] + _TURN * similarity[row - 1] * (1 - np.eye(2))
         backpointers[row] = total.argmin(0)
-        costs = total.min(0) + [0, odds[row]]
-    is_exchanged = np.zeros(len(times), bool)
+        costs = total.min(0) + [0, log_odds[row]]
+    is_swapped = np.zeros(len(times), bool)
     state = int(costs.argmin())
     for row in range(len(times))[::-1]:
-        is_exchanged[row] = state
+        is_swapped[row] = state
         state = backpointers[row, state]
-    return is_exchanged
+    return is_swapped
 
 
-def _alike(offsets: np.ndarray, variance: np.ndarray) -> np.ndarray:
+def _cosine_similarity(offsets: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """(T - 1,) in [-1, 1]: how far the ways from right to left joints (T, J, 3) m are those of the frame before."""
     weight = 1 / np.sqrt(variance[1:] * variance[:-1])
     product = (weight * (offsets[1:] * offsets[:-1]).sum(-1)).sum(-1)
@@ -56,7 +56,7 @@ def _alike(offsets: np.ndarray, variance: np.ndarray) -> np.ndarray:
     return product / np.maximum(np.sqrt(previous_square * current_square), 1e-12)
 
 
-def _forward_odds(times: np.ndarray, joints: np.ndarray, skeleton: Skeleton) -> np.ndarray:
+def _forward_log_odds(times: np.ndarray, joints: np.ndarray, skeleton: Skeleton) -> np.ndarray:
     """(T,) log odds that a frame is the right way round, from where the person goes."""
     pairs = [(name, f"right_{part}") for name in skeleton.joints if (part := name.removeprefix("left_")) in _ACROSS]
     if not pairs or len(times) < 2:

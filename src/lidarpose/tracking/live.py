@@ -8,9 +8,9 @@ import numpy as np
 from lidarpose.sample import Pose
 from lidarpose.skeleton import Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
-from lidarpose.tracking.bones import keep_lengths, lengths_of, measured, rigid_bones
+from lidarpose.tracking.bones import keep_lengths, length_statistics, lengths_of, rigid_bones
 from lidarpose.tracking.clip import TrackPoses
-from lidarpose.tracking.motion_model import SCALES, Belief, odds_after, shared, strengths
+from lidarpose.tracking.motion_model import SCALES, KalmanState, pooled, scale_probabilities_after, usual_process_noise
 from lidarpose.tracking.smoothing import (
     LEAST_FRAMES,
     MAX_GAP,
@@ -36,17 +36,17 @@ class LiveFilter:
 
     def __init__(self, skeleton: Skeleton):
         self.skeleton = skeleton
-        self._usual, self._bones = strengths(skeleton), rigid_bones(skeleton)
+        self._usual, self._bones = usual_process_noise(skeleton), rigid_bones(skeleton)
         self._time: float | None = None
         self._seen: float | None = None
         self._frames = 0
         self._arrays = {
             "origin": np.zeros(3),
-            "odds": np.full((len(SCALES), len(skeleton)), 1 / len(SCALES)),
-            "certainty": np.zeros(len(skeleton)),
+            "scale_probabilities": np.full((len(SCALES), len(skeleton)), 1 / len(SCALES)),
+            "precision_sum": np.zeros(len(skeleton)),
             "bones": np.zeros((len(self._bones), 2)),
         }
-        self._belief = Belief.unknown((len(SCALES), len(skeleton)), _SPEED)
+        self._state = KalmanState.unknown((len(SCALES), len(skeleton)), _SPEED)
 
     def update(self, time: float, pose: Pose | None) -> Pose | None:
         """The steady pose at `time` s, later than the last one's; pose: as predicted, None where the person was not
@@ -60,7 +60,7 @@ class LiveFilter:
         if pose is None:
             if self._seen is None:
                 return None
-            self._belief = self._belief.predicted(step, SCALES[:, None] * self._usual)
+            self._state = self._state.predicted(step, SCALES[:, None] * self._usual)
             joints, spread = self._estimate()
             values: dict[str, Any] = {"confidence": likely_hit(spread), "visible": np.zeros(len(spread))}
             return Pose(joints=joints, skeleton=self.skeleton, spread=spread, **values)
@@ -76,26 +76,28 @@ class LiveFilter:
     def _add(self, step: float, joints: np.ndarray, spread: np.ndarray) -> None:
         """Learns from a frame's joints (J, 3) m about the origin and their spread (J,) m."""
         arrays, precision = self._arrays, precisions(spread)
-        forecast = self._belief.predicted(step, SCALES[:, None] * self._usual)
+        forecast = self._state.predicted(step, SCALES[:, None] * self._usual)
         if self._frames >= LEAST_FRAMES:
-            mean = (arrays["odds"][..., None] * forecast.position).sum(0)
-            variance = (arrays["odds"] * forecast.variance).sum(0)
+            mean = (arrays["scale_probabilities"][..., None] * forecast.position).sum(0)
+            variance = (arrays["scale_probabilities"] * forecast.variance).sum(0)
             precision = precision * frame_weights(joints - mean, 1 / (1 / precision + variance), _FREEDOM)
-        self._belief, likelihood = forecast.updated(joints, precision)
-        arrays["odds"] = odds_after(arrays["odds"], step, shared(likelihood))
-        arrays["certainty"] = arrays["certainty"] + spread**-2
-        arrays["bones"] = arrays["bones"] + measured(joints, spread**2, self._bones)
+        self._state, log_likelihood = forecast.updated(joints, precision)
+        arrays["scale_probabilities"] = scale_probabilities_after(
+            arrays["scale_probabilities"], step, pooled(log_likelihood)
+        )
+        arrays["precision_sum"] = arrays["precision_sum"] + spread**-2
+        arrays["bones"] = arrays["bones"] + length_statistics(joints, spread**2, self._bones)
         self._frames += 1
 
     def _estimate(self) -> tuple[np.ndarray, np.ndarray]:
         """Joints (J, 3) m and their spread (J,) m."""
-        odds = self._arrays["odds"]
-        mean = (odds[..., None] * self._belief.position).sum(0)
-        variance = (odds * self._belief.variance).sum(0)
+        probabilities = self._arrays["scale_probabilities"]
+        mean = (probabilities[..., None] * self._state.position).sum(0)
+        variance = (probabilities * self._state.variance).sum(0)
         if self._frames >= LEAST_FRAMES and len(self._bones):
             lengths = lengths_of(self._arrays["bones"], self._bones, self.skeleton.flip)
             mean = keep_lengths(mean, variance, self._bones, lengths)
-        return mean + self._arrays["origin"], steady_spread(variance, self._arrays["certainty"] / self._frames)
+        return mean + self._arrays["origin"], steady_spread(variance, self._arrays["precision_sum"] / self._frames)
 
     def state(self) -> dict[str, Any]:
         """All it knows as JSON holds it; `from_state` goes on from there."""
@@ -105,7 +107,7 @@ class LiveFilter:
             "seen": self._seen,
             "frames": self._frames,
             "arrays": {name: value.tolist() for name, value in self._arrays.items()},
-            "belief": {name: value.tolist() for name, value in vars(self._belief).items()},
+            "kalman_state": {name: value.tolist() for name, value in vars(self._state).items()},
         }
 
     @classmethod
@@ -114,11 +116,11 @@ class LiveFilter:
         live_filter = cls(skeleton_of(state["skeleton"]))
         live_filter._time, live_filter._seen, live_filter._frames = state["time"], state["seen"], state["frames"]
         live_filter._arrays = {name: np.array(value) for name, value in state["arrays"].items()}
-        live_filter._belief = Belief(**{name: np.array(value) for name, value in state["belief"].items()})
+        live_filter._state = KalmanState(**{name: np.array(value) for name, value in state["kalman_state"].items()})
         return live_filter
 
 
-def follow(track: TrackPoses) -> list[Pose | None]:
+def filter_track(track: TrackPoses) -> list[Pose | None]:
     """The steady pose of each frame of a track, from that frame and those before."""
     live_filter = LiveFilter(track.skeleton)
     return [live_filter.update(float(time), pose) for time, pose in zip(track.times, track.poses(), strict=True)]

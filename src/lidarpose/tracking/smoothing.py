@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 
 from lidarpose.sample import CONFIDENCE_RADIUS
-from lidarpose.tracking.bones import keep_lengths, lengths_of, measured, rigid_bones
+from lidarpose.tracking.bones import keep_lengths, length_statistics, lengths_of, rigid_bones
 from lidarpose.tracking.clip import TrackPoses
-from lidarpose.tracking.facing import exchanged
-from lidarpose.tracking.motion_model import learn_strength, smooth_joints, strengths
+from lidarpose.tracking.facing import swapped_frames
+from lidarpose.tracking.motion_model import learn_process_noise, smooth_joints, usual_process_noise
 
 # frames are trusted by Student's t of so many degrees of freedom: a frame that is off as a whole hardly counts
 _FREEDOM = 1.0
-# rounds of weighing frames; the strength of motion is learned before each of the last
+# rounds of weighing frames; the process noise is learned before each of the last
 _ROUNDS, _LEARNED = 6, 3
 _FIRST_SCALE = 3.0
 # spread where the network does not say, and the least that is believed, m
@@ -38,24 +38,26 @@ def smooth(track: TrackPoses) -> TrackPoses:
     is_seen = track.seen
     if not is_seen.any():
         return track
-    track = settled(track)
+    track = with_facing_corrected(track)
     steps = np.diff(track.times, prepend=track.times[:1])
-    times, usual_strength = np.cumsum(np.minimum(steps, _LONGEST_STEP)), strengths(track.skeleton)
-    spread = known_spread(track.spread, is_seen, len(usual_strength))
+    times, usual = np.cumsum(np.minimum(steps, _LONGEST_STEP)), usual_process_noise(track.skeleton)
+    spread = known_spread(track.spread, is_seen, len(usual))
     precision = precisions(spread)
     # numbers stay small about the first place
     origin = track.joints[is_seen][0].mean(0)
     joints = np.where(is_seen[:, None, None], track.joints - origin, 0.0)
     weight = np.ones((len(times), 1))
-    strength = np.broadcast_to(_FIRST_SCALE * usual_strength, precision.shape)
+    process_noise = np.broadcast_to(_FIRST_SCALE * usual, precision.shape)
     for k in range(_ROUNDS):
         if k >= _ROUNDS - _LEARNED:
-            strength = learn_strength(times, joints, precision * weight, usual_strength)
-        path, variance = smooth_joints(times, joints, precision * weight, strength)
+            process_noise = learn_process_noise(times, joints, precision * weight, usual)
+        path, variance = smooth_joints(times, joints, precision * weight, process_noise)
         weight = frame_weights(path - joints, precision)
     bones = rigid_bones(track.skeleton)
     if is_seen.sum() >= LEAST_FRAMES and len(bones):
-        lengths = lengths_of(measured(joints[is_seen], spread[is_seen] ** 2, bones).sum(0), bones, track.skeleton.flip)
+        lengths = lengths_of(
+            length_statistics(joints[is_seen], spread[is_seen] ** 2, bones).sum(0), bones, track.skeleton.flip
+        )
         path = keep_lengths(path, variance, bones, lengths)
     return filled_in(track, path + origin, steady_spread(variance, (spread**-2).sum(0) / is_seen.sum()))
 
@@ -71,21 +73,21 @@ def precisions(spread: np.ndarray) -> np.ndarray:
     return _USUAL_SPREAD * spread**-3
 
 
-def steady_spread(variance: np.ndarray, certainty: np.ndarray) -> np.ndarray:
+def steady_spread(variance: np.ndarray, mean_precision: np.ndarray) -> np.ndarray:
     """(..., J) m: the expected distance from the truth of joints of that variance m^2 on an axis along their paths.
 
-    What all frames of a person have in common no smoothing takes away: certainty (J,) 1/m^2, mean inverse square of the
-    frames' spread.
+    What all frames of a person have in common no smoothing takes away: mean_precision (J,) 1/m^2, mean inverse
+    square of the frames' spread.
     """
-    return np.sqrt(_PATH**2 * variance + _COMMON**2 / certainty)
+    return np.sqrt(_PATH**2 * variance + _COMMON**2 / mean_precision)
 
 
-def settled(track: TrackPoses) -> TrackPoses:
-    """A track whose facing is settled: left and right are exchanged in the frames that were flipped."""
+def with_facing_corrected(track: TrackPoses) -> TrackPoses:
+    """A track whose facing is corrected: left and right are exchanged in the frames that were flipped."""
     rows = np.flatnonzero(track.seen)
     variance = known_spread(track.spread, track.seen, len(track.skeleton))[rows] ** 2
     confidence = None if track.confidence is None else track.confidence[rows]
-    flipped_rows = rows[exchanged(track.times[rows], track.joints[rows], variance, confidence, track.skeleton)]
+    flipped_rows = rows[swapped_frames(track.times[rows], track.joints[rows], variance, confidence, track.skeleton)]
     flip = np.array(track.skeleton.flip)
     values = {name: getattr(track, name) for name in ("joints", "spread", "visible", "confidence")}
     for name, value in values.items():

@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from lidarpose.arrays import evenly_spaced
 from lidarpose.io.files import check_suffix
 from lidarpose.models.detector.ground import Ground, estimate_ground
 from lidarpose.models.detector.proposals import heights_above
 from lidarpose.sample import Box, Pose
 from lidarpose.viz.draw import SIDE_COLORS, draw_people, png_of, shortened, stack_pictures
-from lidarpose.viz.person_view import Panel, bone_pairs, bone_sides, box_edges, finite, is_known, thinned
+from lidarpose.viz.person_view import Panel, bone_pairs, bone_sides, box_edges, finite, is_known
 
 MAX_SCANS = 12
 _MAX_POINTS = 120_000  # a scan; more only cover each other at this size
@@ -131,7 +132,7 @@ def _draw_panel(ax, panel: ScanPanel, size: np.ndarray) -> None:
     ax.tick_params(labelsize=7, color=_FAINT, labelcolor=_FAINT)
     ax.spines[:].set_color(_HIGH)
     inside_points = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(1)]
-    _draw_points(ax, inside_points[thinned(len(inside_points), _MAX_POINTS)], estimate_ground(points))
+    _draw_points(ax, inside_points[evenly_spaced(len(inside_points), _MAX_POINTS)], estimate_ground(points))
     if panel.sensor is not None:
         ax.plot(*panel.sensor, ls="", marker="^", ms=8, color=_INK, mec="white", zorder=5)
         ax.annotate("sensor", panel.sensor, (7, -3), textcoords="offset points", fontsize=8, zorder=5)

@@ -8,7 +8,7 @@ import numpy as np
 from lidarpose.data.dataset_card import CARD, content_count
 from lidarpose.data.shards import DatasetReader, open_dataset
 from lidarpose.errors import InputError
-from lidarpose.io.files import check_apart, file_error
+from lidarpose.io.files import check_not_input, file_error
 from lidarpose.sample import Box, LabeledSample, PersonInfo, Pose
 from lidarpose.skeleton import skeleton
 from lidarpose.viz.bird_eye import MAX_SCANS, ScanPanel, draw_scans
@@ -29,7 +29,8 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
         The file's path.
 
     Raises:
-        InputError: a folder that is no dataset or has no shard yet, a file that cannot be written or is the dataset's.
+        InputError: fewer than one person or more than 60 (400 in a page), a folder that is no dataset or has no shard
+            yet, a file that cannot be written or is the dataset's.
     """
     limit = 400 if html else MAX_PEOPLE
     if not 1 <= count <= limit:
@@ -37,7 +38,7 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
     dataset = open_dataset(folder)
     name = Path(folder).resolve().name
     path = Path(out) if out is not None else Path(f"{name}.{'html' if html else 'png'}")
-    check_apart(path, dataset.folder / CARD, *dataset.folder.glob("*.parquet"))
+    check_not_input(path, dataset.folder / CARD, *dataset.folder.glob("*.parquet"))
     settings = dataset.card.settings
     title = f"{name}: {content_count(dataset.card.count, settings.get('what', 'people'))}"
     if "scene" in settings:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarpose.arrays import evenly_spaced
 from lidarpose.io.files import check_suffix, write_atomic
 from lidarpose.sample import Pose
 from lidarpose.skeleton import SMPL24
@@ -28,7 +29,6 @@ from lidarpose.viz.person_view import (
     missing_pose,
     project,
     side,
-    thinned,
     view_directions,
 )
 
@@ -278,7 +278,7 @@ def _draw_view(ax, panel: Panel, *, seen_from: np.ndarray, shift: float, window)
     if panel.box is not None:
         add_lines(place(box_edges(panel.box))[0], zorder=1.5, colors=_HAIRLINE, linewidths=1.0)
     rows = np.flatnonzero(np.isfinite(panel.points).all(-1))
-    rows = rows[thinned(len(rows), MAX_POINTS_DRAWN)]
+    rows = rows[evenly_spaced(len(rows), MAX_POINTS_DRAWN)]
     if len(rows):
         positions, depth = place(panel.points[rows])
         order = np.argsort(depth, kind="stable")

@@ -12,6 +12,7 @@ from typing import TypeGuard
 import numpy as np
 
 from lidarpose._version import __version__
+from lidarpose.arrays import evenly_spaced
 from lidarpose.io.files import check_suffix, write_atomic
 from lidarpose.sample import Pose, within_reach
 from lidarpose.skeleton import SMPL24, Skeleton
@@ -26,7 +27,6 @@ from lidarpose.viz.person_view import (
     middle,
     missing_pose,
     side,
-    thinned,
 )
 
 MAX_POINTS = 60_000  # of all people together: about 0.9 MB of text
@@ -36,7 +36,6 @@ _FEW_BOXES = 100
 # of all scans, and of each at least: points, half of them so many m about its people; and how far about all of them the
 # scan is shown, m
 _SCAN_POINTS, _FEWEST_SCAN_POINTS, _NEAR, _SCAN_REACH = 40_000, 15_000, 1.0, 15.0
-_SCHEMA = 1
 
 
 def write_report(
@@ -70,8 +69,6 @@ def render_report(people: list[Panel], *, title: str, summary: list[dict], scans
     limit = max(_FEWEST_POINTS, MAX_POINTS // max(len(people), 1))
     people_data = [_person_data(p, limit) for p in people]
     data = {
-        "schema": _SCHEMA,
-        "unit": "mm",
         "skeletons": {name: _skeleton_data(s) for name, s in skeletons.items()},
         "people": people_data,
         "scans": [_scan_data(scan, max(_FEWEST_SCAN_POINTS, _SCAN_POINTS // len(scans))) for scan in scans],
@@ -109,7 +106,7 @@ def _person_data(person: Panel, limit: int) -> dict:
     center = middle(person)
     center = np.zeros(3) if center is None else center
     rows = np.flatnonzero(within_reach(person.points))
-    rows = rows[thinned(len(rows), limit)]
+    rows = rows[evenly_spaced(len(rows), limit)]
     forward = facing_of(person)
     data: dict[str, object] = {
         "points": _millimeters(person.points[rows], center),
@@ -134,7 +131,7 @@ def _scan_data(scan: ScanPanel, limit: int) -> dict:
     for box in scan.boxes or boxes[:: max(len(boxes) // _FEW_BOXES, 1)]:
         is_near |= box.contains(points, margin=_NEAR)
     rows = [np.flatnonzero(is_near), np.flatnonzero(~is_near)]
-    rows = [group[thinned(len(group), limit // 2)] for group in rows]
+    rows = [group[evenly_spaced(len(group), limit // 2)] for group in rows]
     points = points[np.sort(np.concatenate(rows))]
     if not len(centers):
         centers = points if len(points) else np.zeros((1, 3))

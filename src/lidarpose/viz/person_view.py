@@ -140,11 +140,6 @@ def finite(points: np.ndarray) -> np.ndarray:
     return points[np.isfinite(points).all(-1)]
 
 
-def thinned(count: int, limit: int) -> np.ndarray:
-    """Indices of at most `limit` of `count` points, evenly spread and the same each time."""
-    return np.arange(count) if count <= limit else np.linspace(0, count - 1, limit).round().astype(int)
-
-
 def middle(person: Panel) -> np.ndarray | None:
     """A point (3,) in the person: of a skeleton, else of the points, most of which may be of a wall; None where there
     is nothing."""

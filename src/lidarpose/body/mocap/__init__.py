@@ -59,7 +59,7 @@ def load_motion(
     """Reads the motion of a file, or of all files in a folder and its folders, as rotations of the shipped body.
 
     Rotation formats (AMASS, LiDARHuman26M, SLOPER4D, corpora) keep every turn; the others are retargeted by positions.
-    Frames that are not finite are left out and counted.
+    Frames that are not finite are left out; `Motion.dropped` counts them.
 
     Args:
         path: A folder's clips are named by their paths in it, and get the lowest rate among its files unless `hz` is

@@ -166,7 +166,7 @@ def sole_points(rotations: np.ndarray) -> np.ndarray:
     return ankle[:, :, None] + sole @ np.swapaxes(foot, -1, -2)
 
 
-def planted_way(points: np.ndarray) -> np.ndarray:
+def planted_displacement(points: np.ndarray) -> np.ndarray:
     """The way (n, T, 3) m of the body if the points that bear it do not slide; z is 0.
 
     points (n, T, P, 3) m seen from the pelvis in axes that do not turn, T close moments; the way starts at 0.
@@ -181,7 +181,7 @@ def planted_way(points: np.ndarray) -> np.ndarray:
     return displacement
 
 
-def walked_way(pace: np.ndarray, strides: np.ndarray, course: np.ndarray) -> np.ndarray:
+def walked_displacement(pace: np.ndarray, strides: np.ndarray, course: np.ndarray) -> np.ndarray:
     """The way (n, T, 2) m over the ground of people who make `pace` (n, T) m a stride, have made `strides` (n, T) and
     head for `course` (n, T) rad."""
     displacement = np.zeros((*pace.shape, 2))
@@ -351,7 +351,7 @@ _LIMB_ANGLES = np.array(
 _STEPS, _DAMPING, _LONGEST = 4, 1e-5, 20.0
 
 
-def settled(angles: np.ndarray, kind: np.ndarray) -> np.ndarray:
+def fitted_to_floor(angles: np.ndarray, kind: np.ndarray) -> np.ndarray:
     """The poses (n, 27) with those of kinds that rest on the floor fitted to it: no arm or leg is below what bears the
     body, and what touches the floor is as low as that. Damped least squares, limb by limb."""
     rows = np.flatnonzero(_ON_FLOOR[kind])

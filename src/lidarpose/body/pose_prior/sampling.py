@@ -4,9 +4,10 @@ A pose is 27 angles (`ANGLES`, degrees, the same sign on both sides of the body)
 activity, a kind of arm for each side, where between the two ends of its range the activity stands, noise, and for
 gaits a phase; `latents` says how they go on in time. The angles are kept inside the joints' ranges, left and right are
 exchanged in half of the poses, arms are pushed out of the trunk, standing people are set on both feet and balanced
-(`constraints.balanced`), those who are on the floor fitted to it (`constraints.settled`), one matrix product turns the
-angles into Euler angles of the 24 bones, and bodies that pass through themselves (`constraints.self_collision`) or do
-not rest on the ground with what they should (`constraints.hovering`) are replaced by spare ones.
+(`constraints.balanced`), those who are on the floor fitted to it (`constraints.fitted_to_floor`), one matrix product
+turns the angles into Euler angles of the 24 bones, and bodies that pass through themselves
+(`constraints.self_collision`) or do not rest on the ground with what they should (`constraints.hovering`) are replaced
+by spare ones.
 
 Frame of the result: x forward, y left, z up, facing +x, in the rest pose of `rig` (T-pose, every bone's axes along
 the body's).
@@ -62,7 +63,7 @@ _FREE_ARM, _TRIES = np.array([16.0, 6.0, -16.0, 0.0]), 3
 
 
 @dataclass(frozen=True, kw_only=True)
-class PosePrior:
+class DrawnPoses:
     """Drawn poses. rotations (n, 24, 3, 3) float32, local, facing +x; kind (n,) indices into `KINDS`; moved
     (n, 24, 3, 3) float32 the local rotations dt seconds later, step (n, 3) float32 m the way of the root until then,
     both in the axes of `rotations`. With dt = 0 nothing has moved."""
@@ -88,7 +89,7 @@ class DrawnClips:
 
 def sample_rotations(
     rng: np.random.Generator, n: int, *, mix: dict[str, float] | None = None, dt: float = 0.0
-) -> PosePrior:
+) -> DrawnPoses:
     """Draws n poses from the prior, and with dt > 0 what they are dt seconds later; the poses do not depend on dt.
 
     Args:
@@ -107,9 +108,9 @@ def sample_rotations(
     latents, rotations = _draw_people(rng, n, _kind_shares(mix), np.zeros(1))
     if dt == 0:
         rotations = without_yaw(rotations[:, 0])
-        return PosePrior(rotations=rotations, kind=latents.kind, moved=rotations, step=np.zeros((n, 3), np.float32))
+        return DrawnPoses(rotations=rotations, kind=latents.kind, moved=rotations, step=np.zeros((n, 3), np.float32))
     motion = _motion(latents, np.linspace(0, dt, 1 + int(np.ceil(dt / _MOMENT))))
-    return PosePrior(
+    return DrawnPoses(
         rotations=motion.rotations[:, 0],
         kind=motion.kind,
         moved=motion.rotations[:, -1],
@@ -206,7 +207,7 @@ def _poses(latents: Latents, times: np.ndarray) -> tuple[np.ndarray, Stride]:
         latents = latents.take(np.repeat(np.arange(n), moments)).at(np.tile(times, n))
     stride = _angles(latents)
     angles = constraints.balanced(_free_arms(stride.angles, moments), latents.kind)
-    angles = constraints.settled(angles, latents.kind)
+    angles = constraints.fitted_to_floor(angles, latents.kind)
     return rotations_from_angles(angles).reshape(n, moments, 24, 3, 3), stride
 
 
@@ -220,12 +221,14 @@ def _motion(latents: Latents, times: np.ndarray) -> DrawnClips:
     capsules = constraints.undersides(constraints.capsule_ends(*constraints.body_frames(flat_rotations)))
     points = np.concatenate([constraints.sole_points(flat_rotations).reshape(len(flat_rotations), 8, 3), capsules], 1)
     points = points.reshape(n, moments, points.shape[1], 3)
-    displacement = constraints.planted_way(points)
+    displacement = constraints.planted_displacement(points)
     is_traveling = np.isin(latents.kind, _TRAVELS)
     if is_traveling.any():
         course = latents.course(times)[is_traveling]
         pace = stride.pace.reshape(n, moments)[is_traveling]
-        path = constraints.walked_way(pace, latents.strides(np.broadcast_to(times, (n, moments)))[is_traveling], course)
+        path = constraints.walked_displacement(
+            pace, latents.strides(np.broadcast_to(times, (n, moments)))[is_traveling], course
+        )
         displacement[is_traveling, :, :2] = path @ np.swapaxes(inverse_yaw[is_traveling, :2, :2], -1, -2)
         rotations[is_traveling, :, 0] = rotation_about("z", course).astype(np.float32) @ rotations[is_traveling, :, 0]
     lowest_height = points[..., 2].min(2)

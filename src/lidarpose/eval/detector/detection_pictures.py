@@ -5,12 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidarpose.arrays import evenly_spaced
 from lidarpose.eval.detector.detection_scores import FALSE, REFERENCE, DetectorResult
 from lidarpose.eval.detector.labeled_scans import LabeledScan, ScanSet
 from lidarpose.io.files import shorten
 from lidarpose.sample import Box
 from lidarpose.viz.draw import png_of
-from lidarpose.viz.person_view import box_edges, thinned
+from lidarpose.viz.person_view import box_edges
 
 # crops a sheet and beside each other; how far a crop reaches, m
 MOST, _PER_ROW, _REACH = 30, 6, 2.0
@@ -62,7 +63,7 @@ def _crop(scan: LabeledScan, box: Box, label_parts: Sequence[str]) -> _Crop:
     where = shorten(" ".join((scan.name, scan.sensor, scan.kind)), 36)
     label = " · ".join(filter(None, label_parts)) + f"\n{where} · {num_inside} inside"
     return _Crop(
-        points=points[thinned(len(points), _MAX_POINTS)],
+        points=points[evenly_spaced(len(points), _MAX_POINTS)],
         box=box,
         people=[person for person in people if person is not box],
         towards=towards / max(float(np.linalg.norm(towards)), 1e-9),

@@ -28,7 +28,7 @@ from lidarpose.io.sources.nuscenes import open_nuscenes
 
 __all__ = ["RECORDINGS", "DamagedFrame", "Frame", "FrameSource", "Source", "is_single_scan", "open_source"]
 
-# of `RECORDINGS`, the module whose `open_recording(path, how)` reads it
+# of `RECORDINGS`, the module whose `open_recording(path, options)` reads it
 _READERS = {".mcap": "rosbag", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "ouster", ".pcapng": "ouster"}
 
 

@@ -82,15 +82,15 @@ def describe(entries: Sequence[Path]) -> str:
     return f"a folder with {', '.join(parts)}"
 
 
-def open_files(name: str, paths: Sequence[Path], how: ReadingOptions) -> IndexedRecording:
+def open_files(name: str, paths: Sequence[Path], options: ReadingOptions) -> IndexedRecording:
     """Point files, a frame each, in natural order or, where their names are plainly times, in that of time. Where
     columns are not known they are those of the first .bin file."""
     paths, times = in_order(paths)
     suffixes = sorted({path.suffix.lower() for path in paths})
     warnings = [f"mixes {', '.join(suffixes)} files: one sensor is assumed"] if len(suffixes) > 1 else []
-    if how.topic is not None or how.meta is not None:
+    if options.topic is not None or options.meta is not None:
         warnings.append("topic and meta are for recordings: they say nothing of point files")
-    columns = how.columns
+    columns = options.columns
     if columns is None and ".bin" in suffixes:
         columns, notes = _columns_of([path for path in paths if path.suffix.lower() == ".bin"])
         warnings += notes
@@ -103,7 +103,9 @@ def open_files(name: str, paths: Sequence[Path], how: ReadingOptions) -> Indexed
         cloud = read_points(paths[i], columns=columns)
         return Sweep(points=cloud.points, warnings=cloud.warnings)
 
-    return IndexedRecording(name=name, ids=ids, times=times if how.name_times else None, read=read, warnings=warnings)
+    return IndexedRecording(
+        name=name, ids=ids, times=times if options.name_times else None, read=read, warnings=warnings
+    )
 
 
 def scan_id(path: Path) -> str:

@@ -23,7 +23,7 @@ class Sweep:
     """What a sensor saw in one turn, as the reader of a format decodes it.
 
     Args:
-        points: (n, 3) m in the sensor's frame; rows that are NaN or 0, 0, 0 are no returns.
+        points: (n, 3) m in the recording's frame, most often the sensor's; rows that are NaN or 0, 0, 0 are no returns.
         T_world_sensor: (4, 4) m, or None where the sensor's pose is not known; z of the world is up.
         origin: (3,) m, the sensor's place in the points' frame; None where it is not known.
         ring: (n,) the beam of each point, or None.

@@ -20,7 +20,7 @@ _CHANNEL = "LIDAR_TOP"
 _TABLES = ("sample_data", "sample", "scene", "ego_pose", "calibrated_sensor", "sensor")
 
 
-def open_nuscenes(folder: Path, how: ReadingOptions) -> IndexedRecording | None:
+def open_nuscenes(folder: Path, options: ReadingOptions) -> IndexedRecording | None:
     """The sweeps of one scene (topic), or of all in the order of time; None for a folder that is not nuScenes'.
 
     folder: the data's, or that of its tables (v1.0-mini, ...) where it has several.
@@ -35,7 +35,7 @@ def open_nuscenes(folder: Path, how: ReadingOptions) -> IndexedRecording | None:
         names = ", ".join(path.name for path in versions)
         raise file_error(folder, f"expected one version of nuScenes, got {names}: name the folder of one")
     try:
-        sweeps = _sweeps(versions[0], how.topic)
+        sweeps = _sweeps(versions[0], options.topic)
     except InputError:
         raise
     except (LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:

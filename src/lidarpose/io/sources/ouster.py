@@ -44,7 +44,7 @@ _COLUMNS_PER_PACKET = 16
 _NUM_PEEKED = 2000
 
 
-def open_recording(path: Path, how: ReadingOptions) -> Recording:
+def open_recording(path: Path, options: ReadingOptions) -> Recording:
     """Opens a capture of an Ouster sensor, whose metadata is a JSON file: the one that is named (meta), else the one of
     the same stem beside it; without one, of a Velodyne sensor.
 
@@ -52,9 +52,9 @@ def open_recording(path: Path, how: ReadingOptions) -> Recording:
         InputError: No capture, of another sensor, or an Ouster's without its metadata.
         MissingExtra: A Velodyne's without the library that decodes it.
     """
-    metadata = how.meta or path.with_suffix(".json")
-    if how.meta is None and not metadata.exists():
-        return velodyne.open_recording(path, how)
+    metadata = options.meta or path.with_suffix(".json")
+    if options.meta is None and not metadata.exists():
+        return velodyne.open_recording(path, options)
     return OusterRecording(path, metadata)
 
 
@@ -227,7 +227,7 @@ class OusterRecording(PacketRecording):
             lines.append(f"the packets are of the sensor {serial}: its beams may point elsewhere")
         return lines
 
-    def turns(self) -> Iterator[tuple[float, Callable[[], Sweep]]]:
+    def sweeps(self) -> Iterator[tuple[float, Callable[[], Sweep]]]:
         has_clock = None
         for capture_time, packets in self._packets_of_turns():
             clock = np.frombuffer(packets[0], self.format.packet)["columns"]["time"]

@@ -134,7 +134,7 @@ class PacketRecording(ABC):
         self._damage: InputError | None = None
 
     @abstractmethod
-    def turns(self) -> Iterator[tuple[float, Callable[[], Sweep]]]:
+    def sweeps(self) -> Iterator[tuple[float, Callable[[], Sweep]]]:
         """Of each turn its time, s, and what decodes it."""
 
     def packets(self) -> Iterator[Datagram]:
@@ -160,7 +160,7 @@ class PacketRecording(ABC):
         return [f"{count} {problem}" for problem, count in counts.items() if count]
 
     def lazy_frames(self, first: int = 0) -> Iterator[LazyFrame]:
-        for index, (time, decode) in enumerate(self.turns()):
+        for index, (time, decode) in enumerate(self.sweeps()):
             if index >= first:
                 yield LazyFrame(f"{index:06d}", time, decode)
         if self._damage is not None:

@@ -44,7 +44,7 @@ _MIN_NORM = 1e-3
 _MAX_KEPT = 1000
 
 
-def open_recording(path: Path, how: ReadingOptions) -> "BagRecording":
+def open_recording(path: Path, options: ReadingOptions) -> "BagRecording":
     """Opens a .mcap, .bag or .db3 file, or a folder that rosbag2 made.
 
     The topic of the clouds is by default the only one with clouds, or the one with most.
@@ -61,7 +61,7 @@ def open_recording(path: Path, how: ReadingOptions) -> "BagRecording":
             packed_file = next(path.glob("*.zstd"), None)
             remedy = f"; unpack {packed_file.name} first (unzstd)" if packed_file else "; was it copied completely?"
             raise file_error(path, f"expected a recording's {' or '.join(_FILES)} files in this folder{remedy}")
-    return BagRecording(str(path), [_open_file(file) for file in files], how.topic)
+    return BagRecording(str(path), [_open_file(file) for file in files], options.topic)
 
 
 def _open_file(path: Path) -> RecordFile | SqliteFile:

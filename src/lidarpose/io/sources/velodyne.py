@@ -21,7 +21,7 @@ _RING = 6
 _NUM_TRIED, _NUM_PEEKED = 2000, 5
 
 
-def open_recording(path: Path, how: ReadingOptions) -> "VelodyneRecording":
+def open_recording(path: Path, options: ReadingOptions) -> "VelodyneRecording":
     """Opens a capture of a Velodyne sensor.
 
     Raises:
@@ -81,7 +81,7 @@ class VelodyneRecording(PacketRecording):
             raise file_error(self.name, problem) from None
         return config, b""
 
-    def turns(self) -> Iterator[tuple[float, Callable[[], Sweep]]]:
+    def sweeps(self) -> Iterator[tuple[float, Callable[[], Sweep]]]:
         config, end = self._model()
         self._num_damaged = self._num_lost = num_turns = 0
         decoder = self._library.StreamDecoder(config)

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from lidarpose.errors import InputError
-from lidarpose.io.files import check_apart, check_suffix, file_error
+from lidarpose.io.files import check_not_input, check_suffix, file_error
 from lidarpose.models.checkpoint import Header, SafetensorsFile, save_checkpoint
 from lidarpose.models.dapt.dapt_config import CONFIGS, RELEASED_FAULTS, DaptConfig, named_config
 from lidarpose.models.dapt.dapt_net import DaptNet
@@ -61,7 +61,7 @@ def import_released(source: str | os.PathLike, out: str | os.PathLike, *, config
     Raises InputError, one line that names the file and the tensor, for all that does not fit; then nothing is written.
     """
     check_suffix(out, ".safetensors")
-    check_apart(out, source)
+    check_not_input(out, source)
     network = import_dapt(source, config)
     option = "" if config is None else f" --config {config}"
     card = {
