@@ -8,40 +8,25 @@ from dataclasses import replace
 import numpy as np
 import pandas
 import pytest
+from walking_people import FRAMES, PLACES, STEPS, moving_source, walking_clouds
 
 import lidarpose
 from lidarpose import Box, InputError
 from lidarpose.cli import main
 from lidarpose.geometry import UP_AXES, rigid_transform, rotation_about
 from lidarpose.io.sources.frame import Frame, FrameSource, IndexedRecording, Sweep
-from lidarpose.lidar.raycast import scan
 from lidarpose.recording import output, page, picture, result_files
 from lidarpose.recording.coordinates import in_world
 from lidarpose.recording.frame_boxes import FrameBoxes
 from lidarpose.recording.predict_recording import FramePredictor
-from lidarpose.synth.bodies import draw_bodies
-from lidarpose.synth.environment.mesh import Mesh, quad, union
 from lidarpose.viz.bird_eye import draw_scan_and_people
 
-FRAMES, DAMAGED = 7, 4
-# where two people stand in the first frame, and how far they go in each, m
-PLACES, STEPS = np.array([[4.0, 1.5], [3.0, -3.0]]), np.array([[0.1, 0.0], [0.0, 0.08]])
+DAMAGED = 4
 
 
 @pytest.fixture(scope="module")
 def clouds():
-    """Points (n, 3) m of each frame: two people on flat ground about a VLP-32C."""
-    sensor = lidarpose.sensor("vlp-32c")
-    bodies = draw_bodies(None, captured=0.0, count=12, seed=1, block=0, moving=False)
-    standing = [i for i, kind in enumerate(bodies.kinds) if kind in ("stand", "idle", "walk")][:2]
-    floor = quad(30.0, np.zeros(2)).moved((0.0, 0.0, -sensor.height))
-    frames = []
-    for k in range(FRAMES):
-        feet = np.column_stack([PLACES + k * STEPS, [-sensor.height] * 2])
-        people = [Mesh(bodies.vertices[i], bodies.faces).moved(at) for i, at in zip(standing, feet, strict=True)]
-        everything = union([*people, floor])
-        frames.append(scan(everything.vertices, everything.faces, sensor).points)
-    return frames
+    return walking_clouds()
 
 
 @pytest.fixture(scope="module")
@@ -300,26 +285,6 @@ def test_csv_and_parquet_have_a_row_a_person_and_joint(tracked, tmp_path):
 
 
 # ---- in Python
-
-
-def moving_source(clouds, boxes=None):
-    """The frames as of a sensor that goes and turns, whose pose is known."""
-    poses = []
-    for k in range(len(clouds)):
-        T_world_sensor = np.eye(4)
-        T_world_sensor[:3, :3] = rotation_about("z", 0.3 * k)
-        T_world_sensor[:3, 3] = [100 + k, -50.0, 2.0]
-        poses.append(T_world_sensor)
-
-    def read(i):
-        T = np.linalg.inv(poses[i])
-        points = (clouds[i] + [100.0, -50.0, 2.0]) @ T[:3, :3].T + T[:3, 3]
-        return Sweep(
-            points=points, T_world_sensor=poses[i], origin=(np.array([100.0, -50, 2]) @ T[:3, :3].T + T[:3, 3])
-        )
-
-    ids = [str(k) for k in range(len(clouds))]
-    return FrameSource(IndexedRecording(name="moving", ids=ids, times=np.arange(len(clouds)) / 10, read=read))
 
 
 def test_tracks_of_a_moving_sensor_live_in_the_world(clouds, model):

@@ -1,0 +1,223 @@
+"""Recordings whose sensor goes and turns, whose times are uneven, or whose up is not z; the columns of their tables."""
+
+import json
+from itertools import pairwise
+
+import numpy as np
+import pandas
+import pytest
+from walking_people import FRAMES, boxes_of, moving_source, places_in_world, walking_clouds, world_pose
+
+import lidarpose
+from lidarpose.cli import main
+from lidarpose.geometry import UP_AXES
+from lidarpose.inference.known_places import KnownPlaces
+from lidarpose.inference.predictor import Predictor
+from lidarpose.recording import output, result_files
+from lidarpose.recording.coordinates import FixedFrame
+from lidarpose.recording.known_people import KnownPeople
+from lidarpose.recording.predict_recording import FramePredictor
+from lidarpose.sample import Box
+
+
+@pytest.fixture(scope="module")
+def model():
+    return lidarpose.load("tiny", tta=1)
+
+
+@pytest.fixture(autouse=True)
+def one_model(model, monkeypatch):
+    """The same loaded network for every command."""
+    monkeypatch.setattr("lidarpose.inference.predictor.load", lambda *_, **__: model)
+
+
+def written(source, path, model, *, world=False, **options):
+    """The lines that `write_recording` writes, of people in given boxes."""
+    predictor = FramePredictor(model=model, **options)
+    output.write_recording(source, predictor, path, command={}, world=world)
+    return [json.loads(line) for line in open(path)]
+
+
+def assert_where_people_are(lines, tolerance=0.25):
+    """Lines in the world's frame have both people where they are."""
+    assert len(lines) == FRAMES
+    for k, line in enumerate(lines):
+        assert line["coordinates"] == "world"
+        places = [np.mean(person["joints"], 0)[:2] for person in line["people"]]
+        offsets = np.linalg.norm(np.array(places)[:, None] - places_in_world(k), axis=-1)
+        assert offsets.shape == (2, 2) and offsets.min(1).max() < tolerance and set(offsets.argmin(1)) == {0, 1}
+
+
+# ---- a sensor that moves
+
+
+@pytest.mark.parametrize("options", [{}, {"track": True}, {"live": True}], ids=["frames", "smoothed", "live"])
+def test_poses_in_the_world_of_a_sensor_that_moves(options, model, tmp_path):
+    source = moving_source(walking_clouds())
+    lines = written(source, tmp_path / "a.jsonl", model, world=True, boxes=boxes_of(FRAMES), **options)
+    assert_where_people_are(lines)
+    centers = [[person["box"]["center"][:2] for person in line["people"]] for line in lines]
+    for k, frame_centers in enumerate(centers):
+        offsets = np.linalg.norm(np.array(frame_centers)[:, None] - places_in_world(k), axis=-1)
+        assert offsets.min(1).max() < 0.01
+    if options:
+        # steady: from frame to frame people go as they do
+        tracks = [{person["track"]: np.mean(person["joints"], 0) for person in line["people"]} for line in lines]
+        steps = np.array([[now[id] - before[id] for id in (0, 1)] for before, now in pairwise(tracks)])
+        assert np.linalg.norm(steps, axis=-1).max() < 0.2
+
+
+def test_printed_lines_in_the_world(monkeypatch, tmp_path, capsys):
+    clouds = walking_clouds()
+    monkeypatch.setattr("lidarpose.io.sources.open_source", lambda *_, **__: moving_source(clouds))
+    boxes = [
+        {"frame": k, "people": [{"center": box.center.tolist(), "size": box.size.tolist()} for box in boxes]}
+        for k, boxes in boxes_of(FRAMES).items()
+    ]
+    (tmp_path / "boxes.json").write_text(json.dumps(boxes))
+    words = ["predict", str(tmp_path), "--boxes", str(tmp_path / "boxes.json"), "--out", "-", "-q"]
+    assert main([*words, "--world"]) == 0
+    assert_where_people_are([json.loads(line) for line in capsys.readouterr().out.splitlines()])
+    assert main(words) == 0
+    assert all("coordinates" not in json.loads(line) for line in capsys.readouterr().out.splitlines())
+
+
+def test_frames_whose_pose_is_missing_stay_where_the_sensor_was():
+    T = world_pose(3)
+    fixed = FixedFrame("z")
+    np.testing.assert_array_equal(fixed.from_sensor(None), np.eye(4))
+    np.testing.assert_array_equal(fixed.from_sensor(T.tolist()), T)
+    np.testing.assert_array_equal(fixed.from_sensor(None), T)
+    # without any pose z is up
+    y_up = FixedFrame("y").from_sensor(None)
+    np.testing.assert_allclose(y_up[:3, :3] @ [0, 1, 0], [0, 0, 1], atol=1e-12)
+
+
+# ---- another axis up
+
+
+@pytest.mark.parametrize("live", [False, True])
+def test_tracks_with_another_axis_up(live, model):
+    frames = {}
+    for up in ("z", "-y"):
+        source = moving_source(walking_clouds(), up=up)
+        frames[up] = list(lidarpose.predict_recording(source, up=up, track=True, live=live, model=model))
+    R_level_input = UP_AXES["-y"]
+    for z_up, y_down in zip(frames["z"], frames["-y"], strict=True):
+        assert [person.id for person in z_up.poses] == [person.id for person in y_down.poses] and len(z_up.poses) == 2
+        for one, other in zip(z_up.poses, y_down.poses, strict=True):
+            np.testing.assert_allclose(other.joints @ R_level_input.T, one.joints, atol=2e-3)
+            np.testing.assert_allclose(other.points @ R_level_input.T, one.points, atol=2e-3)
+            np.testing.assert_allclose(R_level_input @ other.box.center, one.box.center, atol=2e-3)
+            assert abs(np.angle(np.exp(1j * (other.box.yaw - one.box.yaw)))) < 0.01
+
+
+# ---- times and origins
+
+
+def test_times_of_frames_part_tracks_and_a_known_origin_is_read(model, monkeypatch):
+    """After a gap nobody is known any more."""
+    times = 1.7e9 + np.array([0, 0.1, 0.25, 0.3, 9.0, 9.1, 9.2])
+    origins, predict_in = [], Predictor.predict_in
+
+    def noted(self, clouds, origin, *arguments, **options):
+        origins.append(origin)
+        return predict_in(self, clouds, origin, *arguments, **options)
+
+    monkeypatch.setattr(Predictor, "predict_in", noted)
+    source = moving_source(walking_clouds(), times=times)
+    frames = list(lidarpose.predict_recording(source, boxes=boxes_of(FRAMES), track=True, model=model))
+    assert [frame.time for frame in frames] == times.tolist()
+    assert [{person.id for person in frame.poses} for frame in frames] == [{0, 1}] * 4 + [{2, 3}] * 3
+    expected_origins = [frame.origin for frame in source.frames()]
+    assert len({tuple(origin) for origin in expected_origins}) == FRAMES
+    np.testing.assert_allclose(origins, expected_origins)
+
+
+def test_times_that_stand_still_or_jump_back_cost_no_frame(model, tmp_path):
+    times = [0.0, 0.1, 0.1, 0.05, 0.2, 0.3, 0.4]
+    source = moving_source(walking_clouds(), times=times)
+    lines = written(source, tmp_path / "a.jsonl", model, world=True, boxes=boxes_of(FRAMES), track=True)
+    assert [line["time"] for line in lines] == times
+    assert_where_people_are(lines)
+
+
+# ---- what is known of people
+
+
+def test_known_places():
+    """Of two people, one of whom needs no verification, and of a place that held nobody."""
+    box = Box(center=np.array([5.0, 0.0, 1.0]), size=np.array([0.6, 0.6, 1.8]), score=0.9)
+    known = KnownPlaces(
+        boxes=[box],
+        pelvises=np.array([[5.0, 0.0, 1.0]]),
+        tracks=np.array([[5.0, 0.0, 1.0], [9.0, 0.0, 1.0]]),
+        reach=np.array([0.5, 0.5]),
+        rejected=np.array([[0.0, 7.0, 1.0], [9.1, 0.0, 1.0]]),
+    )
+    centers = np.array([[5.2, 0.0, 0.9], [5.05, 0.1, 0.9], [9.3, 0.0, 1.0], [0.2, 7.0, 1.0], [0.4, 7.0, 1.0]])
+    assert known.index_of(centers, np.ones(5, bool)).tolist() == [-1, 0, -1, -1, -1]
+    # only who is sure enough is the person known
+    assert known.index_of(centers, np.array([1, 0, 1, 1, 1], bool)).tolist() == [0, -1, -1, -1, -1]
+    # of the second nobody is known: what is where they are expected may be weak, even where nobody was
+    assert known.least_scores(centers, np.array([-1, 0, -1, -1, -1]), 0.5).tolist() == [0.5, 0.5, 0.1, np.inf, 0.5]
+    moved = known.level(UP_AXES["y"])
+    np.testing.assert_allclose(moved.rejected, known.rejected @ UP_AXES["y"].T)
+    np.testing.assert_allclose(moved.boxes[0].center, UP_AXES["y"] @ box.center)
+
+
+def test_places_that_held_nobody_are_known_where_the_sensor_has_gone():
+    people = KnownPeople(up="z", least_score=0.5, live=False)
+    T = world_pose(1)
+    people._rejected = np.array([[*(T[:3, :3] @ [4.0, 1.0, 0.0] + T[:3, 3]), 10.0]])
+    np.testing.assert_allclose(people.expected(10.5, T).rejected, [[4.0, 1.0, 0.0]], atol=1e-9)
+    later = people.expected(10.5, world_pose(2)).rejected
+    assert np.linalg.norm(later - [4.0, 1.0, 0.0]) > 0.5
+    assert not len(people.expected(20.0, T).rejected)
+
+
+# ---- tables
+
+
+def line_of(frame, people):
+    return {
+        "frame": frame,
+        "id": f"scan {frame}",
+        "time": frame / 10,
+        "people": people,
+        "skeleton": {"joints": ["pelvis", "nose"]},
+    }
+
+
+def person_of(number, **changes):
+    """Somebody all of whose values differ."""
+    values = np.arange(12) / 100 + number
+    person = {"id": f"p{number}", "track": number, "filled": number % 2 == 1, "mounted": number % 2 == 0}
+    person |= {"joints": [values[:3].tolist(), values[3:6].tolist()], "confidence": values[6:8].tolist()}
+    person |= {"spread": values[8:10].tolist(), "visible": values[10:12].tolist(), "out_of_range": ["nose"]}
+    person |= {"person": 0.9, "second_person": 0.2, "score": 0.7}
+    return person | changes
+
+
+@pytest.mark.parametrize("suffix", ["csv", "parquet"])
+def test_tables_have_every_value_of_every_frame(suffix, tmp_path, monkeypatch):
+    if suffix == "parquet":
+        pytest.importorskip("pyarrow")
+    lines = [line_of(k, [person_of(2 * k), person_of(2 * k + 1)] if k else []) for k in range(5)]
+    read = pandas.read_csv if suffix == "csv" else pandas.read_parquet
+    tables = []
+    # the first rows that are written together have nobody
+    for rows in (200, 1, 2):
+        monkeypatch.setattr(result_files, "_ROWS_OF", rows)
+        result_files.write_result(tmp_path / f"{rows}.{suffix}", lines)
+        tables.append(read(tmp_path / f"{rows}.{suffix}"))
+    for table in tables[1:]:
+        pandas.testing.assert_frame_equal(table, tables[0])
+    table = tables[0]
+    assert len(table) == 2 * 2 * 4
+    row = table[(table.track == 5) & (table.joint == "nose")].iloc[0]
+    expected = {"frame": 2, "frame_id": "scan 2", "time": 0.2, "person": 1, "id": "p5", "filled": True}
+    expected |= {"x": 5.03, "y": 5.04, "z": 5.05, "confidence": 5.07, "spread": 5.09, "visible": 5.11}
+    expected |= {"in_range": False, "person_probability": 0.9, "second_person": 0.2, "score": 0.7, "mounted": False}
+    assert {name: row[name] for name in expected} == pytest.approx(expected)
+    assert bool(table[(table.track == 5) & (table.joint == "pelvis")].iloc[0].in_range)
