@@ -14,6 +14,7 @@ from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import center_of
 from lidarpose.skeleton import BODY26, SMPL24
+from lidarpose.synth import generator
 from lidarpose.synth.bodies import draw_bodies, draw_moving_bodies
 from lidarpose.synth.generator import BLOCK, LEAST_POINTS, Generator
 from lidarpose.synth.scene import SCENES
@@ -99,6 +100,25 @@ def test_difficulty_asked_for_leaves_the_others_alone():
     # other seeds and other indices are other people
     points = {maker.person(seed, index).sample.points.tobytes() for seed in (1, 2, 3) for index in (0, 1, BLOCK)}
     assert len(points) == 9
+
+
+def test_cyclists_ride_and_sitters_sit_on_something_however_easy_the_scene(monkeypatch):
+    drawn, draw_scene = [], generator._draw_scene
+
+    def spy(config, bodies, row, *others):
+        scene = draw_scene(config, bodies, row, *others)
+        drawn.append((bodies.kinds[row], {prop.name for prop in scene.props}))
+        return scene
+
+    monkeypatch.setattr(generator, "_draw_scene", spy)
+    maker = Generator(scene=SCENES["wild"])
+    kinds = maker._bodies(SEED, 0).kinds
+    for row in [row for row, kind in enumerate(kinds) if kind in ("cycle", "sit")]:
+        maker.person(SEED, row, hard=0.0)
+    assert {kind for kind, _ in drawn} == {"cycle", "sit"}
+    assert all("bicycle" in names for kind, names in drawn if kind == "cycle")
+    seats = [bool(names & {"chair", "wheelchair"}) for kind, names in drawn if kind == "sit"]
+    assert np.mean(seats) > 0.5
 
 
 # --- right in space

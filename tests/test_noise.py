@@ -352,6 +352,14 @@ def test_cuts_come_with_difficulty():
     assert 0.04 < lost[2] < 0.12 and 0.02 < lost[1] < 0.09 and 0.005 < lost[0] < 0.06
 
 
+def test_boxes_may_be_cut_or_too_large_without_jitter():
+    exact = replace(WILD, jitter=0.0, loose=0.0, cut=0.0)
+    errors = {"none": exact, "cut": replace(exact, cut=1.0), "loose": replace(exact, loose=1.0)}
+    sizes = {name: np.array([box.size for box in boxes(value, RNG(2), 200)]) for name, value in errors.items()}
+    assert (sizes["none"] > 4).all() and (sizes["cut"] < 2.5).all()
+    assert sizes["cut"].mean() < sizes["loose"].mean() - 0.2 and (sizes["loose"] < 4).all()
+
+
 def test_the_paper_cuts_nothing():
     (box,) = boxes(SCENES["paper"].crop, RNG(3), 1)
     assert box.contains(PLACE.of_body(BODY.astype(float))).all() and (box.size > 4).all()

@@ -59,6 +59,13 @@ def test_a_sensor_is_mounted_so_that_the_person_fits(seed, distance, tall, pitch
         assert -height + tall / 2 == pytest.approx((low + high) / 2)
 
 
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(1, 7.9), st.floats(0.4, 2.1), st.sampled_from(sorted(SENSORS)))
+def test_a_sensor_near_people_is_above_their_ground(seed, distance, tall, name):
+    for cut in (0.0, 1.0):
+        assert draw_height(sensor(name), distance, tall, 0.5, 0.0, 0.0, np.random.default_rng(seed), cut=cut) >= 0.1
+
+
 @pytest.mark.parametrize("name", sorted(SENSORS))
 def test_hardly_anybody_is_cut_by_the_field_of_view(name):
     """At most about 5 percent stick out where there is room for them."""

@@ -144,6 +144,8 @@ def test_a_finished_run_stays_as_it_is(tmp_path, unbroken):
 
 def test_what_a_run_begins_with_may_have_been_moved(tmp_path):
     """The weights it was begun with are read again: it could not go on without them."""
+    with_body = Pretrain(body="/old/smpl.npz", motion="/old/motion.npz")
+    run_dir.check_resumable(tmp_path, with_body, replace(with_body, body="/new/smpl.npz", motion="/new/motion.npz"))
     begun = Pretrain(init=str(tmp_path / "old/model.safetensors"))
     run_dir.check_resumable(tmp_path, begun, replace(begun, init=str(tmp_path / "new/model.safetensors")))
     for other in (str(tmp_path / "new/best.safetensors"), ""):

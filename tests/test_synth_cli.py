@@ -230,6 +230,16 @@ def test_a_sensor_s_file_counts_by_content(tmp_path, capsys):
     (tmp_path / "b" / "mine.json").write_text("[-10, -5, 0, 5, 11]")
     assert synth(tmp_path / "d", *words, tmp_path / "b" / "mine.json") == 2
     assert "tables" in one_line(capsys)
+    # the same where the scene is changed to it
+    file = tmp_path / "a" / "mine.json"
+    assert synth(tmp_path / "s", "-n", 3, "--set", f"sensors={file}") == 0
+    settings = open_dataset(tmp_path / "s").card.settings
+    assert settings["sensors"] == ["mine.json"] and "set" not in settings
+    assert str(tmp_path) not in (tmp_path / "s" / "dataset.json").read_text()
+    capsys.readouterr()
+    file.write_text("[-10, -5, 0, 5, 11]")
+    assert synth(tmp_path / "s", "-n", 3, "--set", f"sensors={file}") == 2
+    assert "tables" in one_line(capsys)
 
 
 def test_streets_hold_everybody_of_a_turn(tmp_path, monkeypatch, capsys):

@@ -330,6 +330,13 @@ def test_the_paper_s_people_are_all_as_hard_as_the_paper_s(asked, scene):
     assert [hard for _, hard in sorted(asked)] == [min(k / 48, 1.0) for k in range(96)]
 
 
+@pytest.mark.parametrize("hard", [0.0, 0.4])
+def test_the_difficulty_of_the_scene_is_the_highest(asked, hard):
+    list(chunks(replace(RECIPE, scene="wild", set=(f"hard={hard}",), easy=0.0, batch=4, people=32)))
+    difficulties = np.array([difficulty for _, difficulty in asked])
+    assert difficulties.max() <= hard and difficulties.mean() == pytest.approx(2 / 3 * hard, abs=0.1)
+
+
 def test_easier_people_are_seen_better():
     generator = Generator(scene=SCENES["wild"])
     easy, full = (np.mean([generator.person(1, k, hard=h).facts.visible for k in range(64)]) for h in (0.0, 1.0))

@@ -27,7 +27,7 @@ from lidarpose.synth.bodies import Bodies, PoseBank, draw_bodies, draw_moving_bo
 from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.environment.surroundings import ground, occluder, surroundings
 from lidarpose.synth.place import Place, draw_place, recorded_place
-from lidarpose.synth.props import draw_props
+from lidarpose.synth.props import POSED_WITH_A_PROP, draw_props
 from lidarpose.synth.scene import RandomStream, SceneConfig, scene_config
 from lidarpose.synth.simulate import (
     Scene,
@@ -230,8 +230,10 @@ def _draw_scene(
     if (rng.random() < config.company * config.hard) or acquisition.crowded:
         background.append(_second_person(block, row, place, rng, close=acquisition.crowded))
     props = []
-    if rng.random() < config.carry * config.hard:
-        props = draw_props(rng, kind=bodies.kinds[first_row], joints=bodies.joints[first_row])
+    kind = bodies.kinds[first_row]
+    # what carries somebody, or is pushed, is there however easy the scene is
+    if rng.random() < config.carry * (1.0 if kind in POSED_WITH_A_PROP else config.hard):
+        props = draw_props(rng, kind=kind, joints=bodies.joints[first_row])
     conditions = draw_conditions(config, device, rng)
     scene = Scene(
         config=config,

@@ -177,7 +177,7 @@ def draw_box(
     """
     low, high = np.array(extent)
     yaw, cut_draw = place.yaw + heading, 1.0
-    if not errors.jitter:
+    if not (errors.jitter or errors.loose or errors.cut):
         low, high = low - _ALL, high + _ALL
     else:
         *room_draws, loose_draw, loose_share, bottom_draw, depth_share, cut_draw = rng.random(8).tolist()

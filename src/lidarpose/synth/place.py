@@ -30,6 +30,8 @@ _MOUNT_TILT = np.radians(1.5)
 _TILTED, _AHEAD = np.radians(10.0), np.radians(50.0)
 # lasers nearer than this share one elevation, rad
 _SAME_ELEVATION = 1e-9
+# nearer people, m, stand on the ground that the sensor is at least so high above, m
+_ON_OWN_GROUND, _LOWEST = 8.0, 0.1
 # edges of a field of view steeper than this leave room for anybody, rad
 _STEEPEST = np.radians(80.0)
 
@@ -167,10 +169,11 @@ def draw_height(
     pitch_at_azimuth = pitch * cos(azimuth)
     edges = [min(max(device.elevations[end] - pitch_at_azimuth, -_STEEPEST), _STEEPEST) for end in (0, -1)]
     low, high = distance * tan(edges[0]), distance * tan(edges[1])
-    if rng.random() < cut:
-        return float(height)
-    if high - low <= tall:
-        # taller than the fan: the middle of the fan looks at the middle of the person
-        return float(tall / 2 - (low + high) / 2)
-    # feet, at -height, not below the fan; head, at tall - height, not above it
-    return float(min(max(height, tall - high), -low))
+    if rng.random() >= cut:
+        if high - low <= tall:
+            # taller than the fan: the middle of the fan looks at the middle of the person
+            height = tall / 2 - (low + high) / 2
+        else:
+            # feet, at -height, not below the fan; head, at tall - height, not above it
+            height = min(max(height, tall - high), -low)
+    return float(max(height, _LOWEST) if distance < _ON_OWN_GROUND else height)

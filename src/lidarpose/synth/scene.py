@@ -151,7 +151,8 @@ class SceneConfig:
         crop: errors of the crop's box.
         recorded: 1: captured people stay where they were recorded, as without the paper's scene sampling; 0: they are
             placed at random.
-        clothes: how far cloth and hair stand off the skin, relative to the street's; 0: bare.
+        clothes: how far cloth and hair stand off the skin, relative to the street's; 0: bare but for skirts and hats,
+            which `carry` draws.
         hard: difficulty in [0, 1]; scales what hides a person or spoils their crop, not the sensor's own noise.
             Whatever it is, boxes jitter and the field of view ends.
     """

@@ -115,14 +115,15 @@ class SynthesisJob:
 
     def card(self) -> DatasetCard:
         """The dataset's card: all that decides its content."""
-        sensors = self.sensors or scene_config(self.scene).sensors
+        sensors = self.sensors or scene_config(self.scene).changed(self.set).sensors
+        scene_changes = [change for change in self.set if not change.startswith("sensors=")]
         settings: dict[str, Any] = {
             "what": self.what,
             "sensors": [name if name in SENSORS else Path(name).name for name in sensors],
             "seed": self.seed,
         }
         if self.what != "streets":
-            settings |= {"scene": self.scene, "hard": self.hard} | ({"set": list(self.set)} if self.set else {})
+            settings |= {"scene": self.scene, "hard": self.hard} | ({"set": scene_changes} if scene_changes else {})
         # files by content, so that another file of the same name is noticed and the same one elsewhere is not
         tables = [name for name in dict.fromkeys(sensors) if name not in SENSORS]
         if tables:

@@ -125,8 +125,9 @@ class SyntheticSource:
 
     def _difficulty(self, index: int, rng: np.random.Generator) -> float:
         """Of example `index`, in [0, 1]."""
-        ceiling = min(index / self.easy, 1.0) if self.easy else 1.0
-        return ceiling if self._generator.config.follows_paper else ceiling * np.sqrt(rng.random())
+        config = self._generator.config
+        ceiling = config.hard * (min(index / self.easy, 1.0) if self.easy else 1.0)
+        return ceiling if config.follows_paper else ceiling * np.sqrt(rng.random())
 
     def clip(self, index: int, *, trans_center: bool) -> ClipExample:
         """A clip of somebody as difficult as the scene is."""

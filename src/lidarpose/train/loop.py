@@ -97,8 +97,8 @@ def train(
 
     setup: samples or a network of your own instead of the recipe's (`setup.make_setup`); the run is as long as it says.
     job: the old name of `setup`. folder: a new one (None: the next number in `runs`), or with `resume` that of a run
-    with the same recipe (its length and what of `recipes.FREE` may differ; of data, shards, motion and init the last
-    names are compared, not what is there). device: "cpu", or None for what Accelerate finds; tracker:
+    with the same recipe (its length and what of `recipes.FREE` may differ; of data, shards, motion, body and init
+    the last names are compared, not what is there). device: "cpu", or None for what Accelerate finds; tracker:
     "tensorboard" or "wandb", which must be installed; draw: what makes pictures of validation people, None for none.
     Raises InputError where the folder or the recipe does not fit, or where the loss stops being finite: the last good
     state then stays. Raises `Interrupted` after SIGINT or SIGTERM, once the state is saved.

@@ -36,7 +36,7 @@ _NAMES = r"(?:config\.json|log\.jsonl|\w+\.safetensors|people-\d+\.png)"
 LOCK_WAIT = 10.0
 SCHEMA = "lidarpose.run/2"
 # settings that are files or folders, which may have been moved
-PATHS = ("data", "shards", "motion", "init")
+PATHS = ("data", "shards", "motion", "body", "init")
 # how a run's length is called: a run may become longer, its schedule follows
 LENGTHS = ("people", "epochs", "scenes")
 # progress of a run besides tensors: steps taken, seconds, error of the best and of the last validation in mm (of a

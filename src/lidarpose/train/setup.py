@@ -147,6 +147,10 @@ def _detection(recipe: TrainDetector) -> TrainSetup:
     )
 
 
+# parameters of a `PoseNet` that its answer whether somebody is there does not depend on
+_OF_POSES = ("part.", "level_joints.", "joint.heatmap.", "vote.residual.", "vote.offset")
+
+
 def _verification(recipe: TrainVerifier) -> TrainSetup:
     trained, header = load_checkpoint(weights_path(recipe.init))
     if not isinstance(trained, PoseNet):
@@ -157,8 +161,11 @@ def _verification(recipe: TrainVerifier) -> TrainSetup:
     def network() -> nn.Module:
         verifier = expand_weights(trained, config)
         assert verifier.person is not None
-        # whether somebody is there is all that it is to tell: the whole network learns by it
+        # whether somebody is there is all that it is to tell: the whole network learns by it, and what only poses read
+        # learns nothing, of which processes that average gradients would wait for
         verifier.person.detach_inputs = False
+        for name, parameter in verifier.named_parameters():
+            parameter.requires_grad_(not name.startswith(_OF_POSES))
         return verifier
 
     return TrainSetup(

@@ -1,5 +1,5 @@
 """What people carry, wear, push, sit on and ride."""
 
-from lidarpose.synth.props.attachments import Prop, draw_props
+from lidarpose.synth.props.attachments import POSED_WITH_A_PROP, Prop, draw_props
 
-__all__ = ["Prop", "draw_props"]
+__all__ = ["POSED_WITH_A_PROP", "Prop", "draw_props"]

@@ -460,6 +460,8 @@ _RIDES: dict[str, tuple[tuple[float, Callable[[Points, list[float]], Prop | None
     "push": ((0.5, partial(_pushed, "pram")), (0.95, partial(_pushed, "trolley"))),
     "sit": ((0.12, _wheelchair), (0.85, _seat)),
 }
+# activities whose poses make no sense without what is ridden, pushed or sat on
+POSED_WITH_A_PROP = frozenset(_RIDES)
 # how often somebody of an activity carries something
 _CARRIES = {
     **dict.fromkeys(("walk", "idle"), 0.36),
