@@ -235,6 +235,13 @@ def test_joints_at_the_end_of_the_range_are_named():
     entry = json.loads(pose.to_json())["people"][0]
     assert entry["out_of_range"] == pose.out_of_range and len(entry["visible"]) == 24
     assert all(0 <= value <= 1 for value in entry["visible"])
+    # by several looks, of whom the first is mirrored
+    mode[:] = 10
+    for joint in ("left_wrist", "right_wrist", "head"):
+        mode[BODY26.index(joint), 2] = 23
+    for tta in (1, 4):
+        pose = Predictor(Scripted(mode), name="x", tta=tta).predict(blob(30))
+        assert set(pose.out_of_range) == {"left_wrist", "right_wrist", "head"}
     # nothing is said where all are in range
     pose = Predictor(Scripted(np.full((26, 3), 10)), name="x").predict(blob(30))
     assert pose.warnings == () and pose.out_of_range == [] and pose.in_range.all()

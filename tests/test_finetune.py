@@ -198,6 +198,9 @@ def test_points_joints_and_the_view_move_together(seed, number):
     flip = list(BODY26.flip)
     mirrored = np.allclose(np.nan_to_num(after), np.nan_to_num(before[:, flip]), atol=1e-4)
     assert mirrored or np.allclose(np.nan_to_num(after), np.nan_to_num(before), atol=1e-4)
+    # left and right are exchanged where the points are mirrored, and nowhere else
+    R = np.linalg.lstsq(person.points - person.points.mean(0), shown.points - shown.points.mean(0))[0]
+    assert (np.linalg.det(R) < 0) == mirrored
     unlabelled = np.isnan(person.joints).any(-1)
     np.testing.assert_array_equal(np.isnan(shown.joints).any(-1), unlabelled[flip] if mirrored else unlabelled)
     if shown.view[4]:
@@ -236,15 +239,24 @@ def test_a_mirror_exchanges_what_is_seen_and_left_and_right_parts():
     assert 10 < mirrored < 30
 
 
-def test_half_of_people_are_centered_on_a_guess_of_the_pelvis():
+@pytest.mark.parametrize("labeled", [True, False])
+def test_half_of_people_are_centered_on_a_guess_of_the_pelvis(labeled):
     joints = np.nan_to_num(someone().joints, nan=6.0)
-    person = replace(someone(), pose=body26(joints, np.ones(26)), joint_labels=np.full(26, SEEN))
-    pelvis = BODY26.index("pelvis")
-    draw = [augmented(person, Augmentation(refined=1.0), np.random.default_rng(k)).joints[pelvis] for k in range(300)]
+    hips = [BODY26.index(f"{side}_hip") for side in ("left", "right")]
+    if not labeled:
+        joints[BODY26.index("pelvis")] = np.nan
+    labels = np.where(np.isnan(joints).any(1), UNLABELED, SEEN)
+    person = replace(someone(), pose=body26(joints, np.ones(26)), joint_labels=labels)
+    rows = [BODY26.index("pelvis")] if labeled else hips
+
+    def pelvis(person):
+        return person.joints[rows].mean(0)
+
+    draw = [pelvis(augmented(person, Augmentation(refined=1.0), np.random.default_rng(k))) for k in range(300)]
     np.testing.assert_allclose(np.std(draw, 0), PELVIS_ERROR, rtol=0.2)
     np.testing.assert_allclose(np.mean(draw, 0), 0, atol=0.02)
-    still = [augmented(person, Augmentation(refined=0.0), np.random.default_rng(k)).joints[pelvis] for k in range(3)]
-    np.testing.assert_allclose(still, [person.joints[pelvis] - center_of(person.points)] * 3, atol=1e-5)
+    still = [pelvis(augmented(person, Augmentation(refined=0.0), np.random.default_rng(k))) for k in range(3)]
+    np.testing.assert_allclose(still, [pelvis(person) - center_of(person.points)] * 3, atol=1e-5)
 
 
 @pytest.mark.parametrize("how", [Augmentation(cut=1.0), Augmentation(box=1.0)], ids=["cut", "box"])

@@ -10,7 +10,7 @@ from lidarpose.inference.verification import AROUND
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.detection_scene import detection_scene
 from lidarpose.train import scan_people
-from lidarpose.train.augment import UNKNOWN_PART
+from lidarpose.train.augment import UNKNOWN_PART, seen
 from lidarpose.train.data_loader import MixedSource
 from lidarpose.train.detector.candidate_source import scene_to_search
 from lidarpose.train.recipes import Pretrain
@@ -66,6 +66,27 @@ def test_a_crop_shows_its_person_and_says_what_is_not_theirs(scan):
         # where the sensor is known it is known for what is shown
         assert example.view[4] == 0 or np.linalg.norm(example.view[:3]) == pytest.approx(1)
     assert 0.3 < np.mean(mirrored) < 0.7 and np.nanmax(second) == 1
+
+
+def test_what_the_sensor_sees_is_mirrored_with_the_person(scan, monkeypatch):
+    monkeypatch.setattr(scan_people, "_NOISE", 0.0)
+    monkeypatch.setattr(scan_people, "_SCALE", 0.0)
+    num_mirrored = 0
+    for person, example in examples(scan, 60):
+        joints, points = example.joints.astype(float), example.points.astype(float)
+        is_visible = seen(joints, points[example.part == UNKNOWN_PART])
+        assert (example.visible == is_visible).mean() > 0.95
+        if not example.view[4]:
+            continue
+        sensor = example.view[:3].astype(float) * np.exp(example.view[3])
+        true_distances = np.linalg.norm(scan.joints[person].astype(float) - scan.origin, axis=1)
+        distances = np.linalg.norm(joints - sensor, axis=1)
+        is_mirrored = not np.allclose(distances, true_distances, atol=2e-3)
+        num_mirrored += is_mirrored
+        np.testing.assert_allclose(
+            distances[list(BODY26.flip)] if is_mirrored else distances, true_distances, atol=2e-3
+        )
+    assert num_mirrored > 5
 
 
 def test_an_example_depends_on_its_number_alone():

@@ -219,6 +219,16 @@ def test_a_clip_of_clouds(clouds):
     assert not np.allclose(steady[3].joints, each[3].joints)
     first = model.predict_clip(given[:3], sensor_origin=(0, 0, 0), live=True)
     same = model.predict_clip(given, sensor_origin=(0, 0, 0), live=True)
+    # looked at as a whole the track is smoothed, live it is filtered, by the times that are given
+    own = [person.pose for person in each]
+    for seconds in (None, np.cumsum([0.0, 0.1, 0.4, 0.1, 0.1, 0.3, 0.1, 0.1])):
+        times = np.arange(8) / 10 if seconds is None else seconds
+        track = TrackPoses.of_poses(times, own, each.skeleton)
+        for is_live, wanted in ((False, smooth(track).poses()), (True, filter_track(track))):
+            clip = model.predict_clip(given, seconds, sensor_origin=(0, 0, 0), skeleton="human15", live=is_live)
+            np.testing.assert_allclose(clip.to_numpy(), [pose.joints for pose in wanted], atol=1e-5)
+    with pytest.raises(InputError, match="times: expected 8 finite numbers"):
+        model.predict_clip(given, np.zeros(8), sensor_origin=(0, 0, 0))
     # what comes later changes nothing but the rounding of a batch of another size
     np.testing.assert_allclose(first.to_numpy(), same.to_numpy()[:3], rtol=0, atol=1e-6)
     assert len(model.predict_clip([])) == 0
