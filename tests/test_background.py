@@ -25,7 +25,7 @@ def test_what_stands_still_is_learned_and_who_moves_is_kept(recording):
             assert (~static)[frame.person == k].mean() > 0.6, k
 
 
-def test_who_waits_and_leaves_is_not_static():
+def test_who_waits_and_leaves_is_not_static(monkeypatch):
     rng = np.random.default_rng(0)
     wall = rng.uniform((5, -3, 0), (5.01, 3, 3), (4000, 3))
     person = rng.uniform((3, 0, 0), (3.4, 0.4, 1.7), (400, 3))
@@ -34,4 +34,8 @@ def test_who_waits_and_leaves_is_not_static():
     background = learn_background(scans)
     assert is_static(wall, background).all() and not is_static(person, background).any()
     assert is_static(person, learn_background(scans[:12])).all()
+    # of many scans some are read, from the first to the last
+    monkeypatch.setattr("lidarpose.inference.background._MOST_SCANS", 5)
+    few = learn_background(scans[8:14] + scans[14:] * 3)
+    assert is_static(wall, few).all() and not is_static(person, few).any()
     assert not len(learn_background([np.zeros((0, 3)), wall])) and not is_static(wall, np.zeros((0, 3))).any()

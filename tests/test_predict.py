@@ -516,6 +516,7 @@ def test_other_up_axes_give_the_same_person_in_the_files_frame(model, sweep, tmp
         for a, b in zip(expected, people, strict=True):
             assert a.num_points == b.num_points
             np.testing.assert_allclose(a.joints @ R_input_level.T, b.joints, atol=2e-3)
+            np.testing.assert_allclose(a.points @ R_input_level.T, b.points, atol=1e-4)
             np.testing.assert_allclose(b.box.center, R_input_level @ a.box.center)
         assert people.warnings == ()
     assert people[0].picture().startswith(b"\x89PNG")
@@ -585,6 +586,11 @@ def test_two_people_in_a_crop_are_flagged_and_the_flag_says_who_is_meant(model, 
         assert person.second_person > 0.5 and person.person > 0.5
         assert any("two people" in line and line.endswith(who) for line in person.warnings)
     assert np.linalg.norm(boxed.joints[0] - pelvises[meant]) < 0.1
+    # whatever is up
+    R_input_level = UP_AXES["y"].T
+    moved = {**box, "center": (R_input_level @ center).tolist()}
+    turned = lidarpose.predict(both @ R_input_level.T, boxes=[moved], up="y", sensor_origin=(0, 0, 0), model=model)[0]
+    assert np.linalg.norm(turned.joints[0] - R_input_level @ pelvises[meant]) < 0.1
     boxed.save(tmp_path / "two.json")
     (entry,) = json.loads((tmp_path / "two.json").read_text())["people"]
     assert entry["second_person"] == round(boxed.second_person, 4) and entry["warnings"] == list(boxed.warnings)
@@ -789,9 +795,16 @@ def test_what_is_no_person_in_metres_with_z_up_is_warned_about(model, points, ch
 
 
 def test_all_who_may_be_upside_down_are_looked_at_in_one_batch(model, points, monkeypatch):
-    batches, run = [], model.backend.run
+    batches, origins, run, poses = [], [], model.backend.run, model.poses
+
+    def noted(clouds, origin, *arguments, **options):
+        origins.append(origin)
+        return poses(clouds, origin, *arguments, **options)
+
     monkeypatch.setattr(model.backend, "run", lambda clouds, view: batches.append(len(clouds)) or run(clouds, view))
-    people = model.predict([points * [1, -1, -1]] * 3)
+    monkeypatch.setattr(model, "poses", noted)
+    people = model.predict([points * [1, -1, -1]] * 3, sensor_origin=(0.1, 0.2, 0.3))
+    np.testing.assert_allclose(origins, [(0.1, 0.2, 0.3), (0.1, -0.2, -0.3)])
     assert ["try up -z" in person.warnings[-1] for person in people] == [True] * 3
     # two passes as they are, two turned over
     assert batches == [3] * 4

@@ -110,6 +110,8 @@ def test_tracks_with_another_axis_up(live, model):
             np.testing.assert_allclose(other.points @ R_level_input.T, one.points, atol=2e-3)
             np.testing.assert_allclose(R_level_input @ other.box.center, one.box.center, atol=2e-3)
             assert abs(np.angle(np.exp(1j * (other.box.yaw - one.box.yaw)))) < 0.01
+            # on foot, as long as they are known too
+            assert one.box.mounted is other.box.mounted is False
 
 
 # ---- times and origins

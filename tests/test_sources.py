@@ -322,7 +322,7 @@ def test_what_is_no_path_is_said(wrong):
             read(wrong)
 
 
-def test_background_is_learned_of_any_source(tmp_path):
+def test_background_is_learned_of_any_source(tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
     wall = rng.uniform((5, -3, 0), (5.01, 3, 3), (4000, 3))
     for k in range(12):
@@ -330,6 +330,10 @@ def test_background_is_learned_of_any_source(tmp_path):
     expected = learn_background([tmp_path / f"{k}.npy" for k in range(12)])
     for source in (tmp_path, str(tmp_path / "*.npy"), [tmp_path]):
         assert np.array_equal(read_background(source), expected)
+    # of many frames some are read, from the first to the last
+    monkeypatch.setattr("lidarpose.inference.background._MOST_SCANS", 4)
+    some = learn_background([tmp_path / f"{k}.npy" for k in (0, 4, 7, 11)])
+    assert np.array_equal(read_background(tmp_path), some) and not np.array_equal(some, expected)
 
 
 # ---- datasets
