@@ -126,8 +126,8 @@ def test_clean_shows_what_lies_in_a_displaced_box(sets):
 
 
 class Asked(Fake):
-    def predict_in(self, points, origin, skeleton=None, progress=False, *, box_centers):
-        self.centers += list(box_centers)
+    def predict_in(self, points, origin, skeleton=None, progress=False, *, box_centers, as_given):
+        self.centers += [] if box_centers is None else list(box_centers)
         return self.predict(points, sensor_origin=origin, skeleton=skeleton)
 
 

@@ -203,8 +203,9 @@ class EvalSetup:
         name, clips = model.skeleton.name, self._clips(samples)
         # all of them have one, or none; of the boxes that cut, not those that labels made
         centers = [person.crop_box.center for person in samples if person.crop_box is not None]
-        if hasattr(model, "predict_in") and not clips and centers:
-            people = model.predict_in(clouds, origin, name, box_centers=np.stack(centers))
+        if hasattr(model, "predict_in") and not clips:
+            box_centers = np.stack(centers) if centers else None
+            people = model.predict_in(clouds, origin, name, box_centers=box_centers, as_given=True)
         else:
             people = model.predict(clouds, sensor_origin=origin, skeleton=name, **clips)
         for person in people:

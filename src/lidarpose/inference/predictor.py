@@ -284,6 +284,7 @@ class Predictor(PoseEstimator):
         *,
         pelvises: np.ndarray | None = None,
         box_centers: np.ndarray | None = None,
+        as_given: bool = False,
     ) -> Poses:
         """As `predict` of clouds (n, 3) m, of which more is known.
 
@@ -291,11 +292,12 @@ class Predictor(PoseEstimator):
             pelvises: (N, 3) m, nearly, where each cloud shows one person alone: the pass that finds them is spared.
             box_centers: (N, 3) m of the boxes that cut the clouds out: where a cloud shows two people, who is nearer to
                 the center is meant.
+            as_given: nobody is looked at upside down, which costs as much as the pose where that is unsure, to warn of
+                it.
         """
         target_skeleton = self.in_skeleton(skeleton)
-        people = self._people(
-            list(clouds), origin, target_skeleton, progress, centers=pelvises, box_centers=box_centers
-        )
+        known = {"centers": pelvises, "box_centers": box_centers, "as_given": as_given}
+        people = self._people(list(clouds), origin, target_skeleton, progress, **known)
         return Poses(people=tuple(people), skeleton=target_skeleton, model=self.model)
 
     def _people_of_clouds(self, clouds, origin, target_skeleton, progress, clips) -> list[PersonPose]:
@@ -307,7 +309,7 @@ class Predictor(PoseEstimator):
         return people
 
     def _people(
-        self, clouds, origin, target_skeleton, progress, clips=None, centers=None, box_centers=None
+        self, clouds, origin, target_skeleton, progress, clips=None, centers=None, box_centers=None, as_given=False
     ) -> list[PersonPose]:
         cleaned_clouds = [clean(cloud) for cloud in clouds]
         is_usable = np.array([not is_few(points) for points, _ in cleaned_clouds], bool)
@@ -332,7 +334,7 @@ class Predictor(PoseEstimator):
                 continue
             if warning := oversize_warning(points, pose):
                 notes.append(warning)
-            elif centers is None and looks_unsure(pose, part):
+            elif centers is None and not as_given and looks_unsure(pose, part):
                 unsure_rows.append(i)
         # a second look at the few whose pose looks unsure; where pelvises are known people were seen upright before
         flipped_clouds = [best_poses[i][1] * UPSIDE_DOWN for i in unsure_rows]
