@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from dataset_files import write_lidarhuman26m, write_sloper4d
+from matplotlib.text import Text
 from training_runs import Killed, few_to_validate_on  # noqa: F401
 
 from lidarpose.cli import main
@@ -484,12 +485,14 @@ def _study(scale):
     points.append({"label": "9", "mpjpe": None})
     curves = [{"name": name, "title": name, "points": points} for name in ("jitter", "clusters")]
     ends = [{"group": g, "mean": 90.0 * scale, "quartiles": [50, 80, 120], "worst": 600} for g in ("head", "wrists")]
-    setting = {"dataset": "people", "protocol": "clean"}
-    return {"curves": curves, "ends": ends, "who": "9 people", "setting": setting}
+    setting = {"dataset": "synth-9-abc", "protocol": "clean"}
+    return {"curves": curves, "ends": ends, "who": "9 people of synth-9-abc", "setting": setting}
 
 
 @pytest.mark.parametrize("name", ["fig7", "fig8"])
-def test_curves_and_ends_of_several_networks(tmp_path, name):
+def test_curves_and_ends_of_several_networks(tmp_path, name, monkeypatch):
+    drawn, png_of = [], charts.png_of
+    monkeypatch.setattr(charts, "png_of", lambda figure, path: drawn.append(figure) or png_of(figure, path))
     selected = cells(TABLES[name], Options(), ["dapt", "ours"])
     for scale, cell in enumerate(selected, 1):
         folder = cell.evaluation.product(tmp_path)
@@ -498,6 +501,9 @@ def test_curves_and_ends_of_several_networks(tmp_path, name):
         steps._note(cell.evaluation, tmp_path, done=True)
     (path,) = figures.draw(name, selected, tmp_path)
     assert path == tmp_path / f"{name}.png" and path.read_bytes().startswith(b"\x89PNG")
+    # who was scored, not what their folder is called
+    words = " ".join(text.get_text() for text in drawn[0].findobj(Text))
+    assert "the stand-in" in words and "synth-9-abc" not in words
     assert path.read_bytes() != _drawn_alone(name, selected[:1], tmp_path)
 
 

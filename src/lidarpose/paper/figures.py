@@ -4,6 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -47,8 +48,16 @@ def _picture(name: str, cells: dict[str, Cell], out: Path) -> bytes:
     if name == "fig5":
         return _side_by_side(cells, out)
     paths = {row: cell.evaluation.product(out) / "stability.json" for row, cell in cells.items() if cell.evaluation}
-    studies = {row: json.loads(path.read_text())["studies"][0] for row, path in paths.items()}
+    target = next(iter(cells.values())).target
+    title = "the stand-in" if isinstance(target.test, Step) else target.title
+    studies = {row: _titled(json.loads(path.read_text())["studies"][0], title) for row, path in paths.items()}
     return (compare_stability if name == "fig7" else compare_ends)(studies)
+
+
+def _titled(study: dict[str, Any], title: str) -> dict[str, Any]:
+    """A study of stability.json with a title in place of the name of its dataset's folder."""
+    dataset = study["setting"]["dataset"]
+    return study | {"who": study["who"].replace(dataset, title), "setting": study["setting"] | {"dataset": title}}
 
 
 def _side_by_side(cells: dict[str, Cell], out: Path) -> bytes:
