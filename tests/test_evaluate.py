@@ -126,7 +126,7 @@ def test_clean_shows_what_lies_in_a_displaced_box(sets):
 
 
 class Asked(Fake):
-    def predict_in(self, points, origin, skeleton=None, progress=False, *, box_centers, as_given):
+    def predict_in(self, points, origin, skeleton=None, progress=False, *, box_centers, check_upside_down):
         self.centers += [] if box_centers is None else list(box_centers)
         return self.predict(points, sensor_origin=origin, skeleton=skeleton)
 

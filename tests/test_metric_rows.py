@@ -36,8 +36,9 @@ def four():
 
 def test_rows_by_hand():
     rows = {(x.figure, x.group, x.of): x for x in metric_rows.metric_rows(*four())}
-    # steps of 0, 20 cm and -20 cm: second differences of 20 and, but for who is flipped, 40 cm
-    assert 200 < rows["acceleration", "all", "frames in a row"].value < 450
+    # steps of 0, 20 and -20 cm: second differences of 20 and 40 cm, of four joints of who is flipped 40 aside too
+    expected = (200 + (11 * 400 + 4 * np.hypot(400, 400)) / 15) / 2
+    assert rows["acceleration", "all", "frames in a row"].value == pytest.approx(expected, rel=1e-4)
     # one of three people of 100 points and more
     assert rows["turned_round", "points", "100 and more"].value == pytest.approx(100 / 3)
     assert rows["turned_round", "points", "20 to 100"].value == 0

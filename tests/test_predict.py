@@ -810,6 +810,6 @@ def test_all_who_may_be_upside_down_are_looked_at_in_one_batch(model, points, mo
     assert batches == [3] * 4
     # who only wants poses is spared it
     batches.clear()
-    same = model.predict_in([points * [1, -1, -1]] * 3, np.array([0.1, 0.2, 0.3]), as_given=True)
+    same = model.predict_in([points * [1, -1, -1]] * 3, np.array([0.1, 0.2, 0.3]), check_upside_down=False)
     assert batches == [3] * 2
     np.testing.assert_array_equal(same.to_numpy(), people.to_numpy())

@@ -205,7 +205,7 @@ class EvalSetup:
         centers = [person.crop_box.center for person in samples if person.crop_box is not None]
         if hasattr(model, "predict_in") and not clips:
             box_centers = np.stack(centers) if centers else None
-            people = model.predict_in(clouds, origin, name, box_centers=box_centers, as_given=True)
+            people = model.predict_in(clouds, origin, name, box_centers=box_centers, check_upside_down=False)
         else:
             people = model.predict(clouds, sensor_origin=origin, skeleton=name, **clips)
         for person in people:

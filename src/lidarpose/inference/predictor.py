@@ -284,7 +284,7 @@ class Predictor(PoseEstimator):
         *,
         pelvises: np.ndarray | None = None,
         box_centers: np.ndarray | None = None,
-        as_given: bool = False,
+        check_upside_down: bool = True,
     ) -> Poses:
         """As `predict` of clouds (n, 3) m, of which more is known.
 
@@ -292,11 +292,11 @@ class Predictor(PoseEstimator):
             pelvises: (N, 3) m, nearly, where each cloud shows one person alone: the pass that finds them is spared.
             box_centers: (N, 3) m of the boxes that cut the clouds out: where a cloud shows two people, who is nearer to
                 the center is meant.
-            as_given: nobody is looked at upside down, which costs as much as the pose where that is unsure, to warn of
-                it.
+            check_upside_down: whether those whose pose is unsure are looked at upside down too, to warn of it, which
+                costs as much as the pose.
         """
         target_skeleton = self.in_skeleton(skeleton)
-        known = {"centers": pelvises, "box_centers": box_centers, "as_given": as_given}
+        known = {"centers": pelvises, "box_centers": box_centers, "check_upside_down": check_upside_down}
         people = self._people(list(clouds), origin, target_skeleton, progress, **known)
         return Poses(people=tuple(people), skeleton=target_skeleton, model=self.model)
 
@@ -309,7 +309,15 @@ class Predictor(PoseEstimator):
         return people
 
     def _people(
-        self, clouds, origin, target_skeleton, progress, clips=None, centers=None, box_centers=None, as_given=False
+        self,
+        clouds,
+        origin,
+        target_skeleton,
+        progress,
+        clips=None,
+        centers=None,
+        box_centers=None,
+        check_upside_down=True,
     ) -> list[PersonPose]:
         cleaned_clouds = [clean(cloud) for cloud in clouds]
         is_usable = np.array([not is_few(points) for points, _ in cleaned_clouds], bool)
@@ -334,7 +342,7 @@ class Predictor(PoseEstimator):
                 continue
             if warning := oversize_warning(points, pose):
                 notes.append(warning)
-            elif centers is None and not as_given and looks_unsure(pose, part):
+            elif centers is None and check_upside_down and looks_unsure(pose, part):
                 unsure_rows.append(i)
         # a second look at the few whose pose looks unsure; where pelvises are known people were seen upright before
         flipped_clouds = [best_poses[i][1] * UPSIDE_DOWN for i in unsure_rows]

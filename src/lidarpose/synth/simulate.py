@@ -34,7 +34,7 @@ _DAPT_NOISE = 0.02
 
 @dataclass(frozen=True, kw_only=True)
 class ScanConditions:
-    """A sensor's noise, the same for all frames of a clip.
+    """A sensor's noise, as strong in all frames of a clip; what it adds to each ring is drawn anew in every frame.
 
     Args:
         sigma: of a range, m.
