@@ -296,8 +296,15 @@ class Predictor(PoseEstimator):
                 costs as much as the pose.
         """
         target_skeleton = self.in_skeleton(skeleton)
-        known = {"centers": pelvises, "box_centers": box_centers, "check_upside_down": check_upside_down}
-        people = self._people(list(clouds), origin, target_skeleton, progress, **known)
+        people = self._people(
+            list(clouds),
+            origin,
+            target_skeleton,
+            progress,
+            centers=pelvises,
+            box_centers=box_centers,
+            check_upside_down=check_upside_down,
+        )
         return Poses(people=tuple(people), skeleton=target_skeleton, model=self.model)
 
     def _people_of_clouds(self, clouds, origin, target_skeleton, progress, clips) -> list[PersonPose]:

@@ -39,9 +39,9 @@ SCHEMA = "lidarpose.boxes/1"
 
 
 class Boxes(list[Box]):
-    """People's boxes in a scan, found ones surest first: a list of `Box`. source: the file; warnings: lines about the
-    scan; detector: the version of what found them; up: the scan's up axis or direction, see `rotation_from_up`, by
-    default that of the boxes, z where none says it."""
+    """People's boxes in a scan, detected ones surest first: a list of `Box`. source: the file; warnings: lines about
+    the scan; detector: its version where they were detected; up: the scan's up axis or direction, see
+    `rotation_from_up`, by default that of the boxes, z where none says it."""
 
     def __init__(
         self,
