@@ -1,14 +1,19 @@
-# make demo: people seen by three LiDARs, true and predicted. make test: the tests, two files at a time. Both set up .venv first.
+# make demo: people seen by three LiDARs, true and predicted. make test: the tests, two files at a time; make test-long: the
+# rest of what a change must pass. All set up .venv first.
 PYTHON ?= python3
 PIP = .venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: demo test test-slow fuzz check lint docs clean
+.PHONY: demo test test-long test-slow fuzz check lint docs clean
 
 demo: .venv/synth
 	.venv/bin/lidarpose demo
 
 test: .venv/test
 	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist loadfile
+
+# the tests that take more than a second each, mostly runs that are killed, taken up and scored
+test-long: .venv/test
+	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist loadfile -m long
 
 # the tests that take more than ten seconds each: README's figures, exports, the wheel, the types of the pages' snippets
 test-slow: .venv/test

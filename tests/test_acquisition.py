@@ -105,6 +105,7 @@ def test_every_share_is_as_often_as_it_says():
     assert np.mean([one.speed > 0 for one in frames]) == pytest.approx(0.5, abs=0.03)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SHARES)
 def test_a_share_of_one_holds_for_everybody_and_their_source_says_so(name):
     config = WILD.changed((f"{name}=1",))
@@ -130,6 +131,7 @@ def test_a_share_of_one_holds_for_everybody_and_their_source_says_so(name):
 # --- several sensors
 
 
+@pytest.mark.long
 def test_merged_clouds_have_the_far_side_of_the_body():
     def far_side(config):
         """The share of the trunk's points that lie behind its middle as the first sensor sees it."""
@@ -317,6 +319,7 @@ def test_points_of_an_inverted_sensor_lie_on_its_rings_and_stand_upright():
 # --- two people in one crop
 
 
+@pytest.mark.long
 def test_crowded_crops_hold_two_and_the_center_says_who_is_meant():
     others = []
     for index in range(40):

@@ -29,6 +29,7 @@ def run(network, clouds):
     return network(network.prepare(clouds))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_has_about_as_many_parameters_as_asked_for(kind):
     for size in ("tiny", "small"):

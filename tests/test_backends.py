@@ -77,6 +77,7 @@ def test_backends_agree_on_people_of_all_sizes(models):
     assert equal < 1e-3 * len(sizes) * 26 * 3
 
 
+@pytest.mark.long
 def test_backends_agree_to_the_end(models):
     # the second pass is centered on what the first one found: differences must not grow
     clouds = [blob(size, seed) for seed, size in enumerate((5, 6, 9, 17, 40, 99, 300, 1200, 5000) * 2)]
@@ -149,6 +150,7 @@ def raw_of(logits, **more):
     return Raw.from_pose(outputs | {"heatmap": logits} | more)
 
 
+@pytest.mark.long
 def test_decoders_differ_and_each_is_taken(models):
     cloud = blob(400)
     center = cloud.mean(0)
@@ -271,6 +273,7 @@ def test_the_second_pass_is_centered_on_the_pelvis_to_a_centimeter():
 # ---- which backend
 
 
+@pytest.mark.long
 def test_backends_are_chosen(tmp_path):
     path = tmp_path / "mine.safetensors"
     path.write_bytes(bundled_path("tiny").read_bytes())
@@ -435,6 +438,7 @@ def program(modules, code, cwd):
 EXTRAS = ("torch", "accelerate", "onnx", "onnxscript", "numba", "threadpoolctl", "pyarrow")
 
 
+@pytest.mark.long
 def test_the_base_install_predicts_and_informs(tmp_path):
     code = """
         import numpy as np
@@ -462,6 +466,7 @@ LACKING = {
 DAMAGED = "predict crop.npy --weights bad.safetensors"
 
 
+@pytest.mark.long
 def test_what_needs_an_extra_names_it_in_one_line(tmp_path):
     (tmp_path / "bad.safetensors").write_bytes(b"no weights at all")
     code = f"""
@@ -486,6 +491,7 @@ def test_what_needs_an_extra_names_it_in_one_line(tmp_path):
     assert needs[2] == (f"running {DEFAULT}.safetensors with torch", "train")
 
 
+@pytest.mark.long
 def test_predicting_and_the_demo_load_nothing_that_they_do_not_need(tmp_path):
     heavy = ("torch", "numba", "pandas", "matplotlib", "tqdm", "onnx", "scipy", "sympy")
     code = f"""

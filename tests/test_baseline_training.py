@@ -89,6 +89,7 @@ def test_labels_are_the_nearest_labelled_joint_within_reach():
     assert torch.allclose(offset[0, :2], torch.tensor([[0.2, 0, 0], [-0.1, 0, 0]]))
 
 
+@pytest.mark.long
 @BOTH
 def test_joints_without_a_label_teach_nothing_and_answers_are_in_the_cloud_s_frame(config):
     objective = BaselineObjective(config=config)
@@ -114,6 +115,7 @@ def test_joints_without_a_label_teach_nothing_and_answers_are_in_the_cloud_s_fra
     np.testing.assert_allclose(objective.joints(network, objective.collate(moved)), joints + step, atol=1e-4)
 
 
+@pytest.mark.long
 def test_the_second_softmax_flattens_the_loss_of_parts():
     torch.manual_seed(0)
     terms = {}
@@ -258,6 +260,7 @@ def test_recipes_are_as_published():
     assert Pretrain(model="dapt").size == "paper" and Pretrain(model="ours") == replace(Pretrain(), model="ours")
 
 
+@pytest.mark.long
 def test_all_networks_are_listed(capsys):
     assert not main(["models", "--json"])
     rows = json.loads(capsys.readouterr().out)
@@ -274,6 +277,7 @@ def test_all_networks_are_listed(capsys):
     assert "129,720,766" in capsys.readouterr().out
 
 
+@pytest.mark.long
 @BOTH
 @pytest.mark.parametrize("skeleton", [WAYMO14, SMPL24])
 def test_weights_go_on_by_the_names_of_joints(config, skeleton, tmp_path):
@@ -296,6 +300,7 @@ def test_weights_go_on_by_the_names_of_joints(config, skeleton, tmp_path):
     assert all(torch.equal(a, b) for a, b in zip(again.state_dict().values(), new.values(), strict=True))
 
 
+@pytest.mark.long
 def test_pretrain_predict_evaluate_and_finetune(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["--workers", "0", "--pictures", "0", "--validate", "1000"]

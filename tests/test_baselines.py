@@ -199,6 +199,7 @@ def _run(network: torch.nn.Module, points: torch.Tensor, valid: torch.Tensor) ->
     return outputs.posed()
 
 
+@pytest.mark.long
 @torch.no_grad()
 @pytest.mark.parametrize(
     "name", ["prn", "prn-small", "lpformer", "lpformer-small", "pointnet++", "lidarcap-small", "ne-small"]
@@ -269,6 +270,7 @@ def test_weights_fit_every_grid_and_a_point_reads_its_own_cell():
     assert {tuple(cell) for cell in cells.tolist()} == expected
 
 
+@pytest.mark.long
 @torch.no_grad()
 def test_clips_do_not_mix():
     points, valid = _cloud(6, (40,) * 2 * CLIP_FRAMES)

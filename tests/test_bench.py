@@ -105,6 +105,7 @@ class Knowing:
         return Poses(people=tuple(people), skeleton=BODY26)
 
 
+@pytest.mark.long
 def test_the_second_is_scored_by_condition_family_and_sensor():
     model = Knowing()
     result = evaluation.evaluate(model, "bench-2", limit=600)
@@ -117,6 +118,7 @@ def test_the_second_is_scored_by_condition_family_and_sensor():
     assert not any("auroc" in line.figure for line in result.lines)
 
 
+@pytest.mark.long
 def test_people_are_told_from_objects_by_who_says_so(tmp_path):
     run = evaluation.run(Knowing(lambda cloud: np.exp(-len(cloud) / 100)), ["bench-2"], limit=300)
     result = run.scores.results[0]
@@ -132,6 +134,7 @@ def test_people_are_told_from_objects_by_who_says_so(tmp_path):
     assert set(again.family) == set(run.evaluations[0].predictions.family) != {""}
 
 
+@pytest.mark.long
 def test_the_command_prints_slices_of_the_second(capsys, tmp_path):
     assert not main(["evaluate", "tiny", "bench-2", "--limit", "30", "--out", str(tmp_path / "out")])
     text = capsys.readouterr().out

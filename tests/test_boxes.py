@@ -46,6 +46,7 @@ def _have_own_ids(people):
     return len(set(ids)) == len(ids)
 
 
+@pytest.mark.long
 @settings(max_examples=80, deadline=None)
 @given(people=people.filter(_have_own_ids), bare=st.booleans(), bom=st.booleans())
 def test_file_and_structure_agree(tmp_path_factory, people, bare, bom):

@@ -99,6 +99,7 @@ def test_a_score_is_the_share_of_people_among_those_that_are_left():
         assert rows.sum() > 30 and abs(scores[rows].mean() - labels[rows].mean()) < 0.08
 
 
+@pytest.mark.long
 def test_scores_are_fitted_on_level_scans_as_detection_sees_them(tmp_path, monkeypatch):
     scene = detection_scene(3, 12)
     R = rotation_about("y", np.radians(20.0))

@@ -111,6 +111,7 @@ def test_a_damaged_file_names_the_byte(stored, tmp_path, change, words):
     assert_one_line(path, words.format(size=stored.stat().st_size))
 
 
+@pytest.mark.long
 @settings(max_examples=120, deadline=None)
 @given(at=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 def test_a_flipped_bit_is_noticed(stored, tmp_path_factory, at, bit):

@@ -207,6 +207,7 @@ def test_info_counts_the_people_of_all_runs(monkeypatch, capsys):
     assert "  500 people, 0.50 hours; all its runs 1,500 people, 1.75 hours" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_backends_decoders_and_tta(crop, capsys):
     results = {}
     for words in ("", "--backend onnx", "--backend torch", "--decode argmax", "--decode dark", "--tta 2"):
@@ -298,6 +299,7 @@ def test_what_is_read_is_never_written_over(crop, boxes, tmp_path, capsys):
     assert run("predict", crop, "--boxes", default, "--out", "-") == 0
 
 
+@pytest.mark.long
 def test_a_warning_of_a_file_is_a_line_without_our_source(crop, tmp_path, out):
     file = SafetensorsFile.open(bundled_path("tiny"))
     metadata = {name: text for name, text in file.metadata.items() if name != DIGEST}

@@ -188,6 +188,7 @@ def test_losses_vanish_at_the_truth(name, clips):
 # ---- runs
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CONFIGS)
 def test_a_run_on_clips_is_evaluated_and_predicts(name, folder, clips, tmp_path, monkeypatch):
     monkeypatch.setattr(setup, "VALIDATION", CLIP_FRAMES)
@@ -306,6 +307,7 @@ def test_people_alone_make_no_clips(tmp_path):
         make_setup(recipe(Pretrain, "lidarcap", shards=(str(write_clips(tmp_path / "p", people)),)))
 
 
+@pytest.mark.long
 def test_raw_files_of_lidarhuman26m_become_a_score(tmp_path):
     """By the published protocol: centered on trans, as the network was trained."""
     smpl = files.write_smpl(tmp_path / "SMPL_NEUTRAL.npz")
@@ -464,6 +466,7 @@ def test_evaluation_shows_true_windows(predictor, folder, clips):
     np.testing.assert_allclose(result.predictions.pred, expected, atol=1e-3)
 
 
+@pytest.mark.long
 def test_people_who_are_drawn_from_clips_stand_alone(predictor, folder, clips, monkeypatch):
     """Frames that lie apart are no window, however evenly they are spread; a study of stability draws, too."""
     result = evaluation.run(predictor, [folder], limit=8).evaluations[0].predictions

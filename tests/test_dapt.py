@@ -151,6 +151,7 @@ NECKS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("config", NECKS.values(), ids=NECKS)
 @pytest.mark.parametrize("n", [1, 2, 40, 700])
 def test_batch_mates_do_not_matter(config, n):

@@ -192,6 +192,7 @@ def test_background_is_supervised_and_joints_without_a_label_teach_nothing():
 # --- batches
 
 
+@pytest.mark.long
 @BOTH
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_nobody_depends_on_batch_mates_or_on_the_order_of_points(task, layout):
@@ -211,6 +212,7 @@ def test_nobody_depends_on_batch_mates_or_on_the_order_of_points(task, layout):
     np.testing.assert_allclose(task.joints(net, alone_)[0], task.joints(net, among)[3], atol=1e-5)
 
 
+@pytest.mark.long
 @BOTH
 def test_the_order_of_people_does_not_matter(task):
     people = [person(n, n) for n in (40, 0, 300, 9)]
@@ -300,6 +302,7 @@ def test_joints_are_body26s_and_those_that_the_stage_teaches():
 # --- gradients
 
 
+@pytest.mark.long
 @BOTH
 @pytest.mark.parametrize("rare", [False, True])
 def test_gradients_of_two_halves_average_to_those_of_the_whole(task, rare):
@@ -338,6 +341,7 @@ def test_gradients_of_two_halves_average_to_those_of_the_whole(task, rare):
     assert off > 1e-2 * largest
 
 
+@pytest.mark.long
 @BOTH
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("n", [1, 2, 1500])
@@ -373,6 +377,7 @@ def test_all_learns_but_heads_that_a_stage_does_not_ask_whose_gradient_is_zero(s
     assert still == ({"query", "inter_feat"} if stage == "pretrain" else {"coordinate", "feat", "inter_feat"})
 
 
+@pytest.mark.long
 @BOTH
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_half_precision(task, layout):
@@ -393,6 +398,7 @@ def test_half_precision(task, layout):
 # --- learning
 
 
+@pytest.mark.long
 @BOTH
 def test_it_learns_four_people_by_heart(task):
     people = [person(30, k, size=0.25) for k in range(4)]
@@ -636,6 +642,7 @@ def test_statistics_are_torch_s_own_and_nothing_else_moves():
         assert torch.equal(value, before[name]) != name.endswith((*NORMS, "num_batches_tracked")), name
 
 
+@pytest.mark.long
 def test_statistics_that_run_along_are_stale_and_are_estimated_anew_before_every_judgement():
     """A few steps at a high rate: momentum 0.01 remembers the weights of the beginning."""
     source = Fixed(8)
@@ -653,6 +660,7 @@ def test_statistics_that_run_along_are_stale_and_are_estimated_anew_before_every
     assert anew < 0.6 * stale
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("task", "times"), [(PRETRAIN, 1.0), (FINETUNE, 10.0)], ids=("pretrain", "finetune"))
 def test_a_killed_run_of_the_papers_network_ends_with_the_same_statistics(tmp_path, monkeypatch, task, times):
     """Three chunks, the last one of four steps: statistics are of the last whole one."""
@@ -708,6 +716,7 @@ def test_the_last_layers_of_heatmaps_learn_at_a_rate_of_their_own(task):
     assert sum(times > 1 for times in due.values()) == (6 if task is FINETUNE else 0)
 
 
+@pytest.mark.long
 def test_statistics_are_of_all_processes_people(tmp_path):
     setup = setup_of(PRETRAIN)
     loop.train(SHORT, tmp_path / "run", setup=setup)

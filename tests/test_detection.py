@@ -146,6 +146,7 @@ def test_one_person_is_found_once(scene, fake, monkeypatch):
     assert len(lidarpose.detect(scene[0])) == len(boxes) == len(PLACES)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("up", ["-y", "x", "0.26,0,0.97"])
 def test_other_frames_show_the_same_people(model, scene, up, tmp_path):
     points, joints = scene
@@ -182,6 +183,7 @@ def test_a_tilted_sensor_is_told(model, scene):
     assert sum(found_at(poses.to_numpy()[:, 0] @ tilt, joints)) >= 4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("axis", ["z", "-y"])
 def test_boxes_of_a_tilted_scan_say_what_is_up(model, scene, tmp_path, axis):
     tilt = rotation_about("y", np.radians(20.0))
@@ -230,6 +232,7 @@ def test_boxes_of_a_tilted_sensor_face_as_people_do_whatever_axis_is_up(scene, u
     assert len(boxes) >= 4 and np.median(off) < np.radians(25)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("factor", "word"), [(1000, "millimeters"), (100, "centimeters"), (0.001, "kilometers")])
 def test_units_are_told_before_anyone_is_found(scene, factor, word):
     (warning,) = lidarpose.detect(scene[0] * factor).warnings
@@ -259,6 +262,7 @@ def test_axes_are_told(scene):
     assert "no ground was found" in warning and "up axis" in warning
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("up", ["y", "-y", "x", "-x"])
 def test_a_warning_names_the_axis_with_which_people_are_detected(scene, file, up):
     near = scene[0][np.abs(scene[0][:, :2]).max(1) < 6]
@@ -380,6 +384,7 @@ def test_a_detector_that_is_not_calibrated_scores_as_its_network_does(scene, fak
 # ---- background
 
 
+@pytest.mark.long
 def test_a_background_is_not_searched(scene, tmp_path, fake):
     """People keep their points where they touch it, and a person in it is none."""
     points, joints = scene

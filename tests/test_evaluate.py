@@ -505,6 +505,7 @@ def test_what_cannot_be_written_or_perturbed_is_an_error_before_anybody_is_predi
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
+@pytest.mark.long
 def test_numpy_s_numbers_one_dataset_alone_and_options_of_load(tmp_path):
     run = evaluation.run("tiny", "bench", limit=np.int64(3), seed=np.int32(2), tta=2, sensor_unknown=True)
     evaluation.write(run, tmp_path / "new")

@@ -205,6 +205,7 @@ def test_plain_people_of_a_synthesized_folder_have_a_row(synthetic):
     assert row.people == sum(wanted)
 
 
+@pytest.mark.long
 def test_curves_say_what_was_done(synthetic, monkeypatch):
     monkeypatch.setattr(module, "CAST", 2)
     monkeypatch.setattr(module, "SENSORS", ("vlp-16", "os1-128"))

@@ -107,6 +107,7 @@ def run(*arguments):
         return done.code
 
 
+@pytest.mark.long
 def test_evaluate_and_table_from_the_command_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run("evaluate", "tiny", "bench", "--limit", "12", "--seed", "3") == 0

@@ -34,6 +34,7 @@ def outputs_of(network, arrays):
         return network.eval()(Batch.from_arrays(arrays))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("heatmap", ["window", "full", "none"])
 def test_more_blocks_and_convolutions_change_nothing(arrays, heatmap):
     torch.manual_seed(0)
@@ -61,6 +62,7 @@ def test_small_begins_where_tiny_is(arrays):
     assert (outputs_of(PoseNet(preset("small")), arrays).joints() - before).norm(dim=-1).mean() > 0.2
 
 
+@pytest.mark.long
 def test_all_that_is_new_learns(arrays):
     torch.manual_seed(0)
     network, _ = load_checkpoint(bundled_path("tiny"))

@@ -125,6 +125,7 @@ class Halved(torch.nn.Module):
         return self.linear(x).relu().sum(1), x / 2
 
 
+@pytest.mark.long
 def test_a_module_becomes_onnx_of_free_length_that_tells_only_what_it_is_told():
     module = Halved()
     content = module_to_onnx(module, (torch.ones(3, 5, 8),), ({0: "rows"},), ["x"], ["sum", "half"], {"note": "a note"})
@@ -326,6 +327,7 @@ def test_weights_that_are_no_numbers_are_said_to_be_damaged(folder, tmp_path):
         model.predict(people(300)[0][0])
 
 
+@pytest.mark.long
 def test_another_program_s_onnx_and_another_version_s(folder, tmp_path):
     entry = json.loads(read_header(folder / "net.safetensors").to_json())
     for change, words in (
@@ -379,6 +381,7 @@ def test_without_onnx_the_extra_is_named(folder, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.long
 def test_a_wrong_export_is_not_written(folder, tmp_path, monkeypatch):
     network, _ = load_checkpoint(folder / "net.safetensors")
     other, _ = load_checkpoint(stored_network(tmp_path / "other.safetensors", SMALL, seed=5))

@@ -177,6 +177,7 @@ def test_links_are_followed(tmp_path):
     assert (tmp_path / "link.txt").is_symlink() and (tmp_path / "there" / "a.txt").read_text() == "new"
 
 
+@pytest.mark.long
 def test_npz_of_zeros_is_bounded(tmp_path, monkeypatch):
     np.savez_compressed(tmp_path / "a.npz", zeros=np.zeros(2**24), ones=np.ones(3))
     arrays, names = read_npz(tmp_path / "a.npz", ["ones", "none"], expected="an npz")

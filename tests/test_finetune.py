@@ -397,12 +397,14 @@ def test_pretraining_takes_nobody_who_is_kept_for_testing(datasets, tmp_path):
 SHORT = {"workers": 0, "pictures": 0, "validate": 1000}
 
 
+@pytest.mark.long
 def test_pretraining_on_shards(synthetic, tmp_path):
     recipe = Pretrain(shards=(str(synthetic),), people=32, batch=4, scene="paper", **SHORT)
     loop.train(recipe, tmp_path / "run")
     assert read_header(tmp_path / "run" / run_dir.MODEL).card["recipe"]["shards"] == ["people"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name, epochs", [("humanm3", 6), ("lidarhuman26m", 20), ("sloper4d", 30), ("waymo", 20)])
 def test_from_raw_files_to_scores(datasets, name, epochs, tmp_path, capsys, monkeypatch):
     """Raw files, prepare, a few steps, evaluate: the joints come out where they went in, and the steps pay."""
@@ -437,6 +439,7 @@ def two_stages(people, neck, *words):
     assert not main(["evaluate", "second/model.safetensors", str(people), "--protocol", "dapt"])
 
 
+@pytest.mark.long
 def test_the_paper_s_two_stages(datasets, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     two_stages(datasets["humanm3"], "mde", "--keep-anchors", "true")
@@ -452,6 +455,7 @@ def test_the_paper_s_two_stages(datasets, tmp_path, capsys, monkeypatch):
         assert torch.equal(begun[anchors], pretrained.state_dict()[anchors]) == keep
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("neck", ["finest", "prn"])
 def test_necks_from_the_command_line_and_coordinates_in_both_stages(datasets, tmp_path, capsys, monkeypatch, neck):
     monkeypatch.chdir(tmp_path)
@@ -467,6 +471,7 @@ def test_necks_from_the_command_line_and_coordinates_in_both_stages(datasets, tm
     assert setup.network().state_dict().keys() == trained.state_dict().keys()
 
 
+@pytest.mark.long
 def test_a_run_on_a_dataset_is_taken_up(datasets, tmp_path):
     data = (str(datasets["lidarhuman26m"]),)
     recipe = Finetune(data=data, init="tiny", epochs=3, batch=2, scene="paper", **SHORT)

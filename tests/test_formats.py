@@ -63,6 +63,7 @@ def folder(tmp_path_factory):
 TYPES = ["<f4", "<f8", "i1", "<i2", "<i4", "<i8", "u1", "<u2", "<u4", "<u8"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
 @settings(max_examples=40, deadline=None)
 @given(data=st.data(), names=st.permutations(["x", "Y", "z", "ring", "_"]), count=st.integers(1, 20))
@@ -87,6 +88,7 @@ def test_pcd_of_any_types_and_order(folder, encoding, data, names, count):
     same(read(folder, f"{encoding}.pcd", header + content), expected, tuple(names))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
 @settings(max_examples=40, deadline=None)
 @given(data=st.data(), names=st.permutations(["x", "y", "Z", "red"]), count=st.integers(1, 20))

@@ -134,6 +134,7 @@ SCALARS = st.none() | st.integers(-(2**63), 2**63 - 1) | st.floats() | st.boolea
 LISTS = st.none() | st.lists(st.none() | st.floats() | st.integers(-9, 300), max_size=12)
 
 
+@pytest.mark.long
 @fuzz
 @given(
     column=st.sampled_from(sorted(TABLES["people"])),

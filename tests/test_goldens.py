@@ -194,6 +194,7 @@ def test_the_shipped_weights_are_of_the_recorded_networks():
 GOLDEN_POSES = json.loads((FOLDER.parent / "golden_poses.json").read_text())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("backend", ["onnx", "torch"])
 @pytest.mark.parametrize("name", BUNDLED)
 def test_the_pose_of_a_fixed_cloud(name, backend):

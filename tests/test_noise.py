@@ -140,6 +140,7 @@ def surface(seed, n=300):
     return mesh, Hits(points=points, face=face, column=face, ring=ring, columns=0, rows=0, column0=0, row0=0)
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None)
 @given(seeds, st.floats(0, 0.9), st.floats(0, 1), st.floats(1, 300))
 def test_the_compiled_twin_agrees_draw_by_draw(seed, dropout, weak, range_max):

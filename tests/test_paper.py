@@ -325,6 +325,7 @@ def test_wrong_words_are_one_line(tmp_path, monkeypatch, capsys, words, told):
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("words", [["fig6"], ["table1", "--table-only"]])
 def test_a_folder_that_the_command_made_is_its_own(tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
@@ -426,6 +427,7 @@ def test_an_evaluation_that_was_killed_while_its_files_were_put_in_place_is_done
     assert len(asked) == 1 and steps.is_done(step, tmp_path)
 
 
+@pytest.mark.long
 def test_a_training_that_takes_longer_than_its_hours_is_made_shorter(tmp_path):
     words = ("pretrain", "--size", "tiny", "--people", "200000", "--batch", "4", "--workers", "0", "--pictures", "0")
     step = Step(words, hours=0.0005)
@@ -545,6 +547,7 @@ def test_an_out_folder_of_something_else_is_refused(tmp_path):
     assert report.SCHEMA == "lidarpose.paper/1"
 
 
+@pytest.mark.long
 def test_raw_files_of_lidarhuman26m_become_a_row_of_table_1(tmp_path, smpl, monkeypatch):
     """Every step as a user types it; so few frames teach nothing."""
     monkeypatch.setitem(RECIPES[Finetune]["lidarcap"], "epochs", 8.0)

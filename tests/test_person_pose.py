@@ -1,6 +1,7 @@
 """One person's result: what its JSON says and where its picture draws."""
 
 import numpy as np
+import pytest
 
 import lidarpose.viz.bird_eye as bird_eye
 import lidarpose.viz.draw as picture
@@ -61,6 +62,7 @@ def test_pictures_stand_upright_whatever_the_axes(monkeypatch):
             assert drawn[-1].box is None
 
 
+@pytest.mark.long
 def test_a_searched_scan_is_drawn_from_above(monkeypatch, tmp_path):
     """With z up whatever the axes, with the sensor where its place is known; above the people's cards."""
     panels = []

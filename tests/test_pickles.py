@@ -213,6 +213,7 @@ HOSTILE = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("words", HOSTILE)
 def test_hostile_instructions(refused, words):
     for data in HOSTILE[words]:
@@ -249,6 +250,7 @@ def test_hostile_arrays(refused, old, new, hint):
     assert hint in refused(b"\x80\x02" + array.replace(old, new, 1) + b".")
 
 
+@pytest.mark.long
 def test_memory_and_time_stay_in_proportion_to_the_file(load, refused):
     """A few bytes each refer to what was read before, have one hash with all others, or make an object."""
 

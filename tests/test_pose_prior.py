@@ -251,6 +251,7 @@ def test_the_fit_finds_a_known_mixture(tmp_path):
 # clips
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_people_move_as_fast_as_people(kind):
     joints, _ = placed(clips(kind))
@@ -460,6 +461,7 @@ def test_hands_stay_out_of_the_trunk():
 # unusual poses
 
 
+@pytest.mark.long
 def test_unusual_people_enter_by_their_share_alone():
     assert activities.unusual_mix(0.0) is None and set(UNUSUAL) == set(BY_HAND)
     assert not activities.SHARES[[KINDS.index(name) for name in UNUSUAL]].any()
@@ -469,6 +471,7 @@ def test_unusual_people_enter_by_their_share_alone():
     assert all(drawn(50, kind, **activities.unusual_mix(1.0)).kind.min() >= KINDS.index("squat") for kind in range(3))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", UNUSUAL)
 def test_unusual_poses_are_possible(kind):
     rotations = drawn(1500, 4, **{kind: 1}).rotations

@@ -557,6 +557,7 @@ def test_a_sweep_of_another_up_axis_is_told(model, tmp_path, points):
 # ---- loading, results
 
 
+@pytest.mark.long
 def test_load_takes_names_and_paths(points, tmp_path, monkeypatch):
     expected = lidarpose.load("tiny", tta=1).predict(points).joints
     copy = tmp_path / "mine.safetensors"
@@ -569,6 +570,7 @@ def test_load_takes_names_and_paths(points, tmp_path, monkeypatch):
         np.testing.assert_allclose(joints, expected, atol=1e-4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gap", [0.7, 1.6, 2.2])
 @pytest.mark.parametrize("meant", [0, 1])
 def test_two_people_in_a_crop_are_flagged_and_the_flag_says_who_is_meant(model, standing, tmp_path, meant, gap):
@@ -655,6 +657,7 @@ def test_people_are_found_in_what_holds_them(model, points):
     assert poses[1] in poses and poses != model.predict([points[:0]]) and len({*poses, poses[0], poses}) == 3
 
 
+@pytest.mark.long
 def test_points_are_as_good_as_their_file(tmp_path, points):
     path = tmp_path / "person.npy"
     np.save(path, points)

@@ -233,6 +233,7 @@ class Slow:
             yield 1
 
 
+@pytest.mark.long
 def test_workers_end_when_the_run_is_stopped(tmp_path):
     made = writer.make_shards(Slow(tmp_path), [0, 1], workers=2)
     for _, people in made:

@@ -284,6 +284,7 @@ def test_tiles_without_a_dense_place_have_no_column(monkeypatch):
 # --- candidates
 
 
+@pytest.mark.long
 def test_candidates_see_what_the_words_say(scene):
     _, points, ground = scene
     origin = np.array([0.3, -0.2, 0.1])

@@ -33,6 +33,7 @@ ALL_ELEVATIONS = np.linspace(-1.5, 1.5, 24)
 SPINNING = [name for name, s in SENSORS.items() if isinstance(s, Sensor)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("scene", range(6))
 def test_same_as_embree(scene):
     data = np.load(PARITY)
@@ -131,6 +132,7 @@ def test_any_mesh_all_round_same_as_reference(mesh):
         assert_same(cast_ray_list(vertices, mesh[1], rays), cast_ray_list_reference(vertices, mesh[1], rays))
 
 
+@pytest.mark.long
 @settings(deadline=None, max_examples=60)
 @given(
     seed=st.integers(0, 2**32 - 1), spread=st.floats(0.05, 20), size=st.floats(0.01, 10), count=st.integers(1, 40),

@@ -96,6 +96,7 @@ def test_frames_whose_pose_is_missing_stay_where_the_sensor_was():
 # ---- another axis up
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("live", [False, True])
 def test_tracks_with_another_axis_up(live, model):
     frames = {}

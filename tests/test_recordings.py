@@ -249,6 +249,7 @@ def test_names_that_are_no_text_are_escaped_in_tables(clouds, tmp_path):
     assert set(table["frame_id"]) == {"\\udcff0"} == set(pandas.read_parquet(tmp_path / "out.parquet")["frame_id"])
 
 
+@pytest.mark.long
 def test_a_file_of_the_folder_is_not_overwritten(clouds, tmp_path, capsys):
     np.savetxt(tmp_path / "0.csv", clouds[0], fmt="%.3f", delimiter=",")
     before = (tmp_path / "0.csv").read_bytes()
@@ -472,6 +473,7 @@ def test_warnings_that_differ_in_numbers_and_their_signs_are_one():
     assert len(summary.warning_lines(8)) == 2
 
 
+@pytest.mark.long
 def test_of_a_recording_of_one_frame_the_people_are_drawn(drive, tmp_path, monkeypatch):
     drawn, above = [], []
 

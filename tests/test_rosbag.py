@@ -285,6 +285,7 @@ def test_a_pose_is_none_where_no_chain_is_known(tmp_path):
     assert np.array_equal(frame.T_world_sensor, np.eye(4)) and frame.origin is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("suffix, compression", CONTAINERS)
 def test_a_recording_that_is_cut_off_keeps_what_is_whole(tmp_path, suffix, compression):
     path = write(tmp_path / f"drive{suffix}", clouds(suffix, 40, 2000), compression=compression)

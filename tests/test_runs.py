@@ -89,6 +89,7 @@ def test_what_is_saved_is_the_running_mean_of_the_weights(unbroken, tmp_path):
     assert max((mean[name] - last[name]).abs().max() for name in mean) > 1e-3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("clip, moves", [(0.0, True), (1.0, True), (1e-12, False)])
 def test_gradients_are_clipped(clip, moves, tmp_path):
     """Adam divides by the gradient's size, but not by less than its epsilon."""
@@ -113,6 +114,7 @@ def test_an_unbroken_run(unbroken):
     assert lines[-1]["validation_mm"] == header.card["validation_mm"] > 0 and "validation_mm" not in lines[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name, call, saved",
     [
@@ -159,6 +161,7 @@ def test_a_run_keeps_its_recipe(unbroken, change):
         loop.train(replace(RECIPE, **change), unbroken, resume=True)
 
 
+@pytest.mark.long
 def test_a_run_may_become_shorter_and_longer(tmp_path):
     folder = tmp_path / "run"
     train_until_killed(RECIPE, folder, "_step", BATCHES)
@@ -196,6 +199,7 @@ def started(recipe, folder, environment=None, **options):
     return subprocess.Popen(words, env=environment, stderr=subprocess.PIPE, text=True, **options)
 
 
+@pytest.mark.long
 def test_killed_for_good_with_workers_and_taken_up(tmp_path):
     """SIGKILL: nothing is tidied, and the workers end by themselves."""
     recipe = replace(RECIPE, workers=1, people=40 * CHUNK)
@@ -221,6 +225,7 @@ def test_killed_for_good_with_workers_and_taken_up(tmp_path):
     assert people_of(tmp_path / "run") == list(range(CHUNK, longer.people + 1, CHUNK))
 
 
+@pytest.mark.long
 def test_what_a_kill_leaves_is_no_obstacle(tmp_path, unbroken):
     folder = tmp_path / "run"
     folder.mkdir()
@@ -347,6 +352,7 @@ DAMAGE = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "damage", "message"), DAMAGE)
 def test_a_damaged_run_is_one_line_that_names_the_file(copy, name, damage, message):
     damage(copy / name)
@@ -360,6 +366,7 @@ def test_a_config_in_another_unicode_encoding_is_read(copy, unbroken, encoding):
     assert_resumes_to(unbroken, copy)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_run_that_is_told_to_stop_saves_and_goes_on_to_the_same_losses(monkeypatch, tmp_path, unbroken, number):
     folder, original = tmp_path / "run", PoseNetObjective.terms
@@ -388,6 +395,7 @@ def test_a_second_request_stops_at_once():
     assert signal.getsignal(signal.SIGINT) is before
 
 
+@pytest.mark.long
 def test_a_run_without_a_state_says_that_it_starts_over(copy, unbroken, capsys):
     (copy / run_dir.STATE).unlink()
     assert_resumes_to(unbroken, copy)
@@ -399,6 +407,7 @@ def steep(value):
     return (value - value).abs().sqrt()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "step, poison",
     [(BATCHES + 2, lambda value: value * float("nan")), *((k, steep) for k in (BATCHES + 1, 2 * BATCHES, 3 * BATCHES))],
@@ -457,6 +466,7 @@ def test_the_command_line_trains_and_goes_on(tmp_path, capsys):
     assert pictures and all(name.endswith(".png") for name in pictures)
 
 
+@pytest.mark.long
 def test_runs_without_a_name_are_numbered(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = ["pretrain", "--people", "4", "--batch", "2", "--scene", "paper", "--workers", "0", "--pictures", "0"]
@@ -548,6 +558,7 @@ def test_a_run_s_rates_follow_its_schedule(monkeypatch, tmp_path):
     np.testing.assert_allclose(rates, np.outer(due, [RECIPE.rate, RECIPE.muon_rate]))
 
 
+@pytest.mark.long
 def test_the_best_validation_is_kept_across_a_resume(monkeypatch, tmp_path):
     errors = [50.0, 40.0, 60.0, 45.0]
 
@@ -568,6 +579,7 @@ def test_the_best_validation_is_kept_across_a_resume(monkeypatch, tmp_path):
     assert not errors and best() == (40.0, 2 * CHUNK)
 
 
+@pytest.mark.long
 def test_another_seed_begins_with_other_weights(tmp_path, monkeypatch):
     monkeypatch.setattr(setup, "VALIDATION", 0)
 

@@ -71,6 +71,7 @@ def test_people_are_spread_over_the_dataset(dataset):
     assert len(_spread(people, "people", 1)) == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -167,6 +168,7 @@ def test_a_scan_is_drawn_with_its_people(tmp_path):
         draw_scans([panel()], tmp_path / "scan.jpg")
 
 
+@pytest.mark.long
 def test_nothing_and_too_much_are_drawn_too():
     empty = ScanPanel(points=np.zeros((0, 3)), sensor=None)
     broken = ScanPanel(points=np.full((9, 3), np.nan), label="$x")
@@ -184,6 +186,7 @@ def test_everybody_is_inside_the_window_and_the_sensor_too(size):
     assert 40 < size.min() * scale < 50
 
 
+@pytest.mark.long
 def test_a_scan_is_as_wide_as_the_cards_below_it():
     for count in (0, 1, 4, 5):
         cards = [Panel(points=POINTS[:9]) for _ in range(count)]
@@ -192,6 +195,7 @@ def test_a_scan_is_as_wide_as_the_cards_below_it():
         assert image.shape[1] == pytest.approx(max(widths + [836]), abs=5)
 
 
+@pytest.mark.long
 def test_view_of_streets_shows_them_from_above(tmp_path, monkeypatch):
     monkeypatch.setattr(shard_job, "STREET_FRAMES", 2)
     monkeypatch.setattr(shard_job, "PER_SHARD", {"streets": 2})

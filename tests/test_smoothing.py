@@ -154,6 +154,7 @@ def test_unseen_frames_are_filled_and_say_so(walker):
     assert live[10].spread.mean() > 2 * live[4].spread.mean()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("gap", [4, 8, 12])
 def test_filled_joints_are_as_far_off_as_their_spread_says(people_in_motion, gap):
     """By the number of frames to the nearest one that was seen; a hand that moves fast must not be said to be near."""

@@ -141,6 +141,7 @@ def people(tmp_path_factory):
     return folder
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size, recipe", [("tiny", "default"), ("paper-tiny", "paper")])
 def test_fine_tuning_begins_at_random(people, tmp_path, monkeypatch, size, recipe):
     monkeypatch.chdir(tmp_path)

@@ -66,6 +66,7 @@ def command(out, *words):
     return subprocess.Popen([sys.executable, "-m", "lidarpose", "synth", "--out", str(out), *WORDS, *words], **settings)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("workers", ["1", "2"])
 def test_killed_at_any_time_the_same_command_goes_on(dataset, tmp_path, workers):
     out = tmp_path / "killed"
@@ -90,6 +91,7 @@ def test_killed_at_any_time_the_same_command_goes_on(dataset, tmp_path, workers)
     assert content(out) == content(dataset)
 
 
+@pytest.mark.long
 def test_workers_give_the_same_bytes(dataset, tmp_path, capsys):
     assert synth(tmp_path / "two", *WORDS, "--workers", 2) == 0
     assert content(tmp_path / "two") == content(dataset)
@@ -98,6 +100,7 @@ def test_workers_give_the_same_bytes(dataset, tmp_path, capsys):
     assert "0 people made, 60 were there" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_second_command_leaves_the_first_one_s_files_alone(tmp_path, capsys):
     out = tmp_path / "out"
     first = command(out)
@@ -204,6 +207,7 @@ def test_a_folder_that_is_none_or_another_ones_is_refused(tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["file"] and file.read_text() == "mine"
 
 
+@pytest.mark.long
 def test_a_full_disk_is_one_line_and_leaves_no_half_shard(tmp_path):
     resource = pytest.importorskip("resource")
     limit = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (20000, {resource.RLIM_INFINITY}))"
@@ -270,6 +274,7 @@ def test_sensors_are_listed(capsys):
     assert capsys.readouterr().out.splitlines() == listing()
 
 
+@pytest.mark.long
 def test_synth_needs_no_torch(tmp_path):
     code = "import sys; from lidarpose.cli import main; main(); raise SystemExit('torch' in sys.modules)"
     words = ["synth", "--out", str(tmp_path / "a"), "-n", "2"]
@@ -285,6 +290,7 @@ def clouds(data, **settings):
     return [sample.points for batch in DataLoader(data, collate_fn=list, **settings) for sample in batch]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("workers", [2, 3])
 @pytest.mark.parametrize("batch", [1, 4])
 def test_people_are_the_same_in_any_number_of_workers(workers, batch):

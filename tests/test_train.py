@@ -254,6 +254,7 @@ def whole():
     return list(chunks(RECIPE))
 
 
+@pytest.mark.long
 def test_chunks_are_the_same_from_any_start_by_any_number_of_workers(whole, monkeypatch):
     assert len(whole) == 3 and all(len(batches) == BATCHES for batches in whole)
     joints = np.concatenate([b["joints"] for batches in whole for b in batches])

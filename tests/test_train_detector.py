@@ -141,6 +141,7 @@ def test_a_candidate_s_answer_is_its_own():
     torch.testing.assert_close(together, alone, atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.long
 def test_the_file_gives_what_the_network_gives(tmp_path):
     torch.manual_seed(0)
     network, path = DetectorNet(CONFIG), tmp_path / "detector.onnx"
@@ -162,6 +163,7 @@ def test_the_file_gives_what_the_network_gives(tmp_path):
         open_detector(path)
 
 
+@pytest.mark.long
 def test_a_pose_network_is_no_detector_and_a_detector_poses_nobody(tmp_path):
     with refused("expected a detector, got a network of the kind pose"):
         open_detector(bundled_path("tiny", ".onnx"))
@@ -237,6 +239,7 @@ def test_average_precision_is_the_mean_precision_of_true_ones():
     assert average_precision(logit, torch.zeros(4, dtype=torch.bool)) == 0
 
 
+@pytest.mark.long
 def test_a_handful_of_candidates_is_learned_by_heart():
     torch.manual_seed(0)
     objective = DetectorObjective(config=SMALL)
@@ -260,6 +263,7 @@ def log_of(folder):
     return [{name: value for name, value in line.items() if name != "seconds"} for line in lines]
 
 
+@pytest.mark.long
 def test_a_killed_run_goes_on_to_the_same_losses(quick_scans, tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     loop.train(RECIPE, whole)

@@ -90,6 +90,7 @@ def test_the_crops_are_those_that_are_verified(monkeypatch):
         assert len(cloud) == 1024 or any(len(a) == len(cloud) and np.allclose(a, cloud, atol=1e-4) for a in shown)
 
 
+@pytest.mark.long
 def test_people_and_mistakes_are_told_by_distance_and_points():
     examples = [scan_crops(0, number) for number in range(4, 8)]
     person = np.concatenate([example.person for example in examples])
@@ -151,6 +152,7 @@ def test_groups_of_like_size_hold_every_crop_once():
     assert objective.scores(network, an_example(0, 0)).shape == (0, 2)
 
 
+@pytest.mark.long
 def test_all_of_the_network_learns_to_tell_people(quick_crops):
     torch.manual_seed(0)
     begun = setup.make_setup(replace(RECIPE, init=str(quick_crops)))
@@ -184,6 +186,7 @@ def test_people_missed_at_one_false_one_a_scan(monkeypatch):
     assert missed_by_verifier(objective, torch.nn.Linear(1, 1), examples, 1)[0] == 0
 
 
+@pytest.mark.long
 def test_a_killed_run_goes_on_to_the_same_losses(quick_crops, tmp_path):
     recipe = replace(RECIPE, init=str(quick_crops))
     whole, killed = tmp_path / "whole", tmp_path / "killed"

@@ -99,6 +99,7 @@ def error(model, clouds, truth):
     return np.linalg.norm(joints - truth, axis=-1).mean(), joints
 
 
+@pytest.mark.long
 def test_more_passes_are_better_than_one_and_results_say_how_many():
     """The pass that finds the pelvis counts too; alone is the one after it."""
     clouds, truth = people(64)

@@ -515,6 +515,7 @@ def test_frames_larger_than_any_of_waymo_s_are_not_parsed(v1, monkeypatch):
     assert not items and skipped[0].reason == "frame cannot be read" and "message Frame has" in skipped[0].where
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "field", [b"\x2a\x00", b"\x32\x00", b"\x38\x01", b"\x0a\x00"], ids=["lasers", "labels", "?", "one"]
 )
