@@ -11,9 +11,11 @@ from lidarpose.errors import InputError
 from lidarpose.lidar.raycast import scan
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.synth.detection_scene import DetectionScene, detection_scene
-from lidarpose.synth.environment.layouts import LEFT_OUT
+from lidarpose.synth.environment.layouts import LAYOUTS, LEFT_OUT
+from lidarpose.synth.environment.mesh import shape
+from lidarpose.synth.environment.site import Mount, Site
 from lidarpose.synth.environment.things import KINDS, THINGS
-from lidarpose.synth.environment.traffic import vehicle
+from lidarpose.synth.environment.traffic import with_windows
 
 LEFT_OUT_THINGS = {name for name, thing in THINGS.items() if thing.left_out}
 
@@ -96,18 +98,47 @@ def test_a_third_of_the_people_in_training_do_not_stand(train, heldout):
     assert 0.26 < low < 0.4 and of_heldout < low - 0.05
 
 
-def test_beams_pass_the_windows_of_some_vehicles_and_end_inside():
-    beam = Sensor(name="beam", elevations=np.zeros(1), azimuth_step=np.pi / 2, range_max=20.0)
+def test_beams_pass_the_windows_of_some_cars_and_end_inside():
+    beam = Sensor(name="beam", elevations=np.zeros(1), azimuth_step=np.pi / 90, range_max=20.0)
     depths = []
-    for number in range(60):
-        mesh = vehicle(np.random.default_rng(number))
-        low, high = mesh.vertices.min(0), mesh.vertices.max(0)
-        assert low[2] > -0.01 and 1.2 < high[2] < 4.1 and 3.4 < np.ptp(mesh.vertices[:, 0]) < 9.5
-        # from the side, at the height of a car's windows
-        points = scan(mesh.moved((0.0, 6.0, -0.8 * high[2])).vertices, mesh.faces, beam).points
-        depths += (points[:, 1] - (6.0 - high[1])).tolist()
-    # at glass or a wall, and on seats, heads or the far window
-    assert sum(depth < 0.35 for depth in depths) > 20 and sum(depth > 0.4 for depth in depths) > 3
+    for number in range(30):
+        car, angle = shape("car", 4.4, 1.8, 1.5), 0.3 * number
+        mesh = with_windows(car.moved((20.0, -30.0, 2.0), angle), np.random.default_rng(number))
+        mesh = mesh.moved((-20.0, 30.0, -2.0)).moved((0.0, 0.0, 0.0), -angle)
+        # all that is added is inside
+        np.testing.assert_allclose(
+            [mesh.vertices.min(0), mesh.vertices.max(0)], [car.vertices.min(0), car.vertices.max(0)], atol=1e-4
+        )
+        # from the side, at the height of the windows
+        points = scan(mesh.moved((0.0, 6.0, -1.2)).vertices, mesh.faces, beam).points
+        depths += (points[:, 1] - 5.1).tolist()
+    # at glass, and on seats, heads or the far window
+    assert sum(depth < 0.35 for depth in depths) > 100 and sum(depth > 0.4 for depth in depths) > 20
+
+
+def test_what_is_no_car_has_no_windows():
+    van = shape("van", 5.0, 2.0, 2.0)
+    assert with_windows(van, np.random.default_rng(0)) is van
+
+
+def test_people_stand_on_the_road_up_to_its_kerb():
+    road = Sensor(name="beam", elevations=np.zeros(1), azimuth_step=np.pi / 2, range_max=20.0)
+    mount = Mount(height=2.0, R_sensor_level=np.eye(3), turn=0.0, view=(0.0, np.pi))
+    kerbs = []
+    for number in range(20):
+        layout = LAYOUTS["street"](np.random.default_rng(number))
+        site, y = Site(layout, road, mount), layout.sensor[1]
+        ground = next(mesh for name, mesh in site.items if name == "ground").vertices
+        for offset in (-0.3, 0.3, -1.9, 1.9):
+            for side in (-1, 1):
+                place = np.array([0.0, side * (layout.road + offset) - y])
+                # nearest in y of the ground's rows of vertices that lie on the same side of the kerb
+                is_same_side = (np.abs(ground[:, 1] + y) > layout.road + 0.01) == (offset > 0)
+                rows = ground[is_same_side]
+                expected = rows[np.argmin(np.abs(rows[:, 1] - place[1])), 2]
+                assert site.level(place) == pytest.approx(expected, abs=1e-6)
+        kerbs.append(layout.areas[0][4])
+    assert max(kerbs) > 0.1 and min(kerbs) == 0
 
 
 @pytest.mark.parametrize("wrong", [{"seed": -1}, {"index": 1.5}, {"family": "test"}])

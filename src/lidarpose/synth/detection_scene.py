@@ -40,7 +40,7 @@ from lidarpose.synth.environment.site import (
     scatter,
 )  # fmt: skip
 from lidarpose.synth.environment.things import KINDS, LEAVES
-from lidarpose.synth.environment.traffic import add_surroundings
+from lidarpose.synth.environment.traffic import add_surroundings, with_windows
 from lidarpose.synth.scene import RandomStream
 from lidarpose.synth.simulate import label_box
 
@@ -104,6 +104,9 @@ def detection_scene(seed: int, index: int, *, family: str = "train") -> Detectio
     is_training = family == "train"
     place = pick(rng, _TRAINING_PLACES if is_training else _PLACES)
     layout = LAYOUTS[place](rng)
+    if not is_training:
+        # frozen scenes: beside a road's middle all stand as high as on the pavement
+        layout = replace(layout, road=None)
     device = draw_sensor(layout.indoors, is_training, rng)
     mount = draw_mount(device, layout, rng)
     duration = device.duration if isinstance(device, RayPattern) else 0.0
@@ -120,7 +123,10 @@ def detection_scene(seed: int, index: int, *, family: str = "train") -> Detectio
     if is_training and len(feet):
         scatter(site, _AMONG_PEOPLE, int(rng.integers(0, 5)), feet, rng)
     add_screens(site, feet, rng)
-    people, items = _on_relief(people, site.items, Relief.draw(layout.indoors, rng), mount.height + layout.sensor[2])
+    items = site.items
+    if is_training:
+        items = [(name, with_windows(mesh, rng) if name == "car" else mesh) for name, mesh in items]
+    people, items = _on_relief(people, items, Relief.draw(layout.indoors, rng), mount.height + layout.sensor[2])
     meshes = [(number, *item) for number, person in enumerate(people) for item in person.meshes(duration)]
     meshes += [(-1, *item) for item in items]
     # a person's body and clothes are no thing, things are nobody

@@ -33,6 +33,7 @@ class Layout:
         ceiling: m; inf outdoors.
         by_car: the sensor may be a car's.
         things: how many more stand about, relative to others.
+        road: |y| m up to which the ground of a street is at z = 0 and its areas beyond at theirs; None: elsewhere.
     """
 
     items: list[Item]
@@ -43,6 +44,7 @@ class Layout:
     ceiling: float = np.inf
     by_car: bool = False
     things: float = 1.0
+    road: float | None = None
 
 
 _XS = np.concatenate([np.linspace(-70, -42, 5), np.arange(-38, 39, 2.5), np.linspace(42, 70, 5)])
@@ -72,7 +74,8 @@ def street(rng: np.random.Generator) -> Layout:
     areas.append((-40.0, 40.0, -road + 2.0, road - 2.0, 0.0))
     is_on_road = rng.random() < 0.6
     y = rng.uniform(-1, 1) * (road - 2.0) if is_on_road else rng.choice([-1, 1]) * rng.uniform(road + 0.5, front - 0.5)
-    return Layout(items=items, areas=areas, sensor=(0.0, y, 0.0 if is_on_road else kerb), by_car=is_on_road)
+    sensor = (0.0, y, 0.0 if is_on_road else kerb)
+    return Layout(items=items, areas=areas, sensor=sensor, by_car=is_on_road, road=road)
 
 
 def _fronts(side: int, front: float, z: float, rng: np.random.Generator) -> list[Item]:

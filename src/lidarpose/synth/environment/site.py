@@ -73,6 +73,9 @@ class Site:
 
     def level(self, place: np.ndarray) -> float:
         """z of the flat ground at (2,) m."""
+        if self.layout.road is not None:
+            y = place[1] + self.layout.sensor[1]
+            return 0.0 if abs(y) <= self.layout.road else float(self.areas[0, 4])
         is_inside = (place[0] >= self.areas[:, 0]) & (place[0] <= self.areas[:, 1])
         is_inside &= (place[1] >= self.areas[:, 2]) & (place[1] <= self.areas[:, 3])
         return float(self.areas[np.argmax(is_inside), 4])

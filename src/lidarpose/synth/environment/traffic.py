@@ -27,22 +27,32 @@ def _is_window() -> np.ndarray:
     return (heights.mean(1) > _SILL) & (heights.min(1) < _ROOF)
 
 
-def vehicle(rng: np.random.Generator) -> Mesh:
-    """Heads along +x. Beams pass some of a car's windows, to the seats and to who sits on them."""
-    u = rng.random(8)
-    body = car(u, rng)
-    if len(body.faces) != len(_is_window()):
-        return body
-    length, width, height = np.ptp(body.vertices, axis=0)
-    is_open = _is_window() & (rng.random(len(body.faces)) < rng.choice([0.0, 0.5, 1.0]))
-    parts = [Mesh(body.vertices, body.faces[~is_open])]
+def with_windows(car_mesh: Mesh, rng: np.random.Generator) -> Mesh:
+    """A mesh "car" anywhere, at any yaw: beams pass all of its windows, some or none, to the dashboard, the wheel, the
+    seats and to who sits on them. Any other mesh as it is."""
+    is_window, unit = _is_window(), shape("car")
+    if len(car_mesh.faces) != len(is_window):
+        return car_mesh
+    is_open = is_window & (rng.random(len(is_window)) < rng.choice([0.0, 0.5, 1.0]))
+    # x, y, z of the unit car go to these rows, its origin to the last one
+    rows = np.linalg.lstsq(np.column_stack([unit.vertices, np.ones(len(unit.vertices))]), car_mesh.vertices)[0]
+    length, width, height = np.linalg.norm(rows[:3], axis=1)
+    side = rng.choice([-0.22, 0.22]) * width
+    dashboard = shapes.box((0.35, 0.85 * width, 0.1)).moved((0.2 * length, 0, 0.56 * height))
+    wheel = shape("ball", 0.04, 0.18, 0.18).moved((0.15 * length, side, 0.64 * height))
+    parts = [dashboard, wheel]
     for x, y in ((0.06, 0.22), (0.06, -0.22), (-0.16, 0.22), (-0.16, -0.22)):
         x, y, z = x * length, y * width, 0.62 * height
         parts.append(shapes.box((0.1, 0.45, 0.24 * height)).moved((x - 0.15, y, z)))
         if rng.random() < 0.3:
             parts.append(shapes.box((0.22, 0.42, 0.12 * height)).moved((x, y, z)))
             parts.append(shape("ball", 0.1, 0.09, 0.12).moved((x, y, 0.82 * height)))
-    return union(parts)
+    inside = union(parts).placed(rows[:3] / [[length], [width], [height]], rows[3])
+    return union([Mesh(car_mesh.vertices, car_mesh.faces[~is_open]), inside])
+
+
+def _vehicle(rng: np.random.Generator) -> Mesh:
+    return car(rng.random(8), rng)
 
 
 def _post(rng: np.random.Generator) -> Mesh:
@@ -80,7 +90,7 @@ def _corner(rng: np.random.Generator) -> Mesh:
 
 
 # what stands along roads: names of `things.KINDS`, how often, and builders
-_ROADSIDE = (("pole", 0.5, _post), ("bush", 0.15, _clump), ("wall end", 0.2, _corner), ("car", 0.15, vehicle))
+_ROADSIDE = (("pole", 0.5, _post), ("bush", 0.15, _clump), ("wall end", 0.2, _corner), ("car", 0.15, _vehicle))
 
 
 def _put(site: Site, name: str, mesh: Mesh, position: tuple[float, float], nearest: float) -> None:
@@ -97,7 +107,7 @@ def _add_road(site: Site, offset: float, turn: int, rng: np.random.Generator) ->
     position, mean_gap = -_REACH + 12 * rng.random(), rng.choice([2.0, 8.0, 25.0])
     heading = pi * rng.integers(2) + turn * pi / 2
     while position < _REACH:
-        mesh = vehicle(rng).moved((0, 0, 0), heading + rng.normal(0, 0.05))
+        mesh = _vehicle(rng).moved((0, 0, 0), heading + rng.normal(0, 0.05))
         _put(site, "car", mesh, (offset, position) if turn % 2 else (position, offset), _NEAREST)
         position += 5.0 + rng.exponential(mean_gap)
 
