@@ -121,6 +121,26 @@ def test_frames_turned_round_are_turned_back(walker, skeleton):
     np.testing.assert_allclose(steady.joints, smooth(track).joints, atol=1e-9)
 
 
+@pytest.mark.parametrize("gap", [1.0, 3600.0])
+def test_people_may_turn_about_in_a_gap(gap):
+    rng, standing = np.random.default_rng(0), rest_pose(SMPL24)
+    facing = np.array([1.0] * 8 + [-1.0] * 4)
+    times = np.concatenate([np.arange(8) / 10, 0.7 + gap + np.arange(4) / 10])
+    true = standing * np.stack([facing, facing, np.ones(12)], 1)[:, None]
+    joints = true + rng.normal(0, 0.02, true.shape)
+    track = TrackPoses(times=times, joints=joints, skeleton=SMPL24, spread=np.full((12, 24), 0.03))
+    assert np.linalg.norm(smooth(track).joints - true, axis=-1).mean() < 0.03
+
+
+def test_somebody_who_hops_is_not_held_still():
+    rng, times = np.random.default_rng(0), np.arange(60) / 10
+    true = rest_pose(SMPL24) + np.stack([0 * times, 0 * times, 0.1 * np.sin(2 * np.pi * 1.5 * times)], 1)[:, None]
+    joints = true + rng.normal(0, 0.03 / 1.6, true.shape)
+    track = TrackPoses(times=times, joints=joints, skeleton=SMPL24, spread=np.full((60, 24), 0.03))
+    before, after = (np.linalg.norm(values - true, axis=-1).mean() for values in (joints, smooth(track).joints))
+    assert after < before
+
+
 @pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=SKELETONS)
 def test_bones_keep_their_length(walker, skeleton):
     true, track = walker(skeleton)

@@ -14,8 +14,9 @@ from lidarpose.skeleton import Skeleton
 _SURE = 6.0
 # what confidence is taken for where the network does not say
 _CONFIDENCE = 0.6
-# cost of a frame flipped against the one before: nobody turns about in a tenth of a second
-_TURN = 40.0
+# cost of a frame flipped against the one before: nobody turns about in a tenth of a second, and it falls by e with each
+# further half second, s
+_TURN, _TURN_STEP, _TURN_TIME = 40.0, 0.1, 0.5
 # what is across the body
 _ACROSS = ("hip", "shoulder")
 # log odds for walking forwards rather than backwards, at most, and the speed of half as much, m/s
@@ -34,10 +35,11 @@ def swapped_frames(
     log_odds = _SURE * frame_confidence + _forward_log_odds(times, joints, skeleton)
     # joints in the middle are their own mirror: nothing is across
     similarity = _cosine_similarity(joints - joints[:, flip], variance + variance[:, flip])
+    turn_cost = _TURN * np.minimum(1.0, np.exp((_TURN_STEP - np.diff(times)) / _TURN_TIME)) * similarity
     costs, backpointers = np.array([0.0, log_odds[0]]), np.zeros((len(times), 2), int)
     for row in range(1, len(times)):
         # [before, now]
-        total = costs[:, None] + _TURN * similarity[row - 1] * (1 - np.eye(2))
+        total = costs[:, None] + turn_cost[row - 1] * (1 - np.eye(2))
         backpointers[row] = total.argmin(0)
         costs = total.min(0) + [0, log_odds[row]]
     is_swapped = np.zeros(len(times), bool)

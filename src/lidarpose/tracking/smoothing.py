@@ -14,7 +14,9 @@ from lidarpose.tracking.motion_model import learn_process_noise, smooth_joints, 
 _FREEDOM = 1.0
 # rounds of weighing frames; the process noise is learned before each of the last
 _ROUNDS, _LEARNED = 6, 3
-_FIRST_SCALE = 3.0
+# the process noise of the first rounds, times the usual one: of less, fast motion of the whole body looks like frames
+# that are off
+_FIRST_SCALE = 10.0
 # spread where the network does not say, and the least that is believed, m
 _SPREAD, _LEAST_SPREAD = 0.08, 0.005
 # a joint counts by its spread to the power of -3, which is better than -2: at this spread, m, both are the same
