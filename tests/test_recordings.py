@@ -272,6 +272,7 @@ def test_csv_and_parquet_have_a_row_a_person_and_joint(tracked, tmp_path):
         result_files.write_result(tmp_path / name, lines)
         made.append(read(tmp_path / name))
     csv, parquet = made
+    assert set(csv.coordinates) == set(parquet.coordinates) == {"sensor"}
     people = [(line, person) for line in lines for person in line["people"]]
     assert len(csv) == len(parquet) == 24 * len(people)
     line, person = people[-1]
@@ -279,6 +280,11 @@ def test_csv_and_parquet_have_a_row_a_person_and_joint(tracked, tmp_path):
     assert (row.frame, row.frame_id, row.track, row.joint) == (line["frame"], line["id"], person["track"], "pelvis")
     assert [row.x, row.y, row.z] == person["joints"][0] and row.spread == person["spread"][0]
     np.testing.assert_allclose(csv[["x", "y", "z", "confidence"]], parquet[["x", "y", "z", "confidence"]])
+    # the world's frame is not known in all
+    moved = [in_world(line | {"T_world_sensor": np.eye(4).tolist()}) if line["frame"] % 2 else line for line in lines]
+    result_files.write_result(tmp_path / "world.csv", moved)
+    world = pandas.read_csv(tmp_path / "world.csv")
+    assert (world.coordinates == np.where(world.frame % 2, "world", "sensor")).all()
     # nobody in all frames: the columns are there
     result_files.write_result(tmp_path / "none.parquet", [line | {"people": []} for line in lines])
     none = pandas.read_parquet(tmp_path / "none.parquet")

@@ -13,7 +13,8 @@ from lidarpose.sample import JOINT_COLUMNS
 FORMATS = ("jsonl", "csv", "parquet")
 # frames whose rows are written at a time
 _ROWS_OF = 200
-_COLUMNS = ("frame", "frame_id", "time", "person", "id", "track", "filled", *JOINT_COLUMNS)
+_COLUMNS = ("frame", "frame_id", "time", "person", "id", "track", "filled", *JOINT_COLUMNS, "coordinates")
+_TEXT_COLUMNS = ("id", "frame_id", "joint", "coordinates")
 
 
 def write_result(path: Path, lines: Iterable[dict[str, Any]]) -> None:
@@ -61,11 +62,11 @@ def _tables(lines: Iterable[dict[str, Any]]) -> Iterator[Any]:
     chunk, is_first = list(islice(remaining, _ROWS_OF)), True
     while chunk or is_first:
         table = pandas.DataFrame([row for line in chunk for row in _rows(line)], columns=list(_COLUMNS))
-        for name in ("id", "frame_id", "joint"):
+        for name in _TEXT_COLUMNS:
             table[name] = table[name].astype("string")
         types = {"frame": "int64", "person": "int64", "track": "Int64", "filled": "bool"}
         types |= {"in_range": "boolean", "mounted": "boolean"}
-        float_columns = set(_COLUMNS) - set(types) - {"id", "frame_id", "joint"}
+        float_columns = set(_COLUMNS) - set(types) - set(_TEXT_COLUMNS)
         yield table.astype(types | dict.fromkeys(float_columns, "float64"))
         chunk, is_first = list(islice(remaining, _ROWS_OF)), False
 
@@ -80,7 +81,7 @@ def _rows(line: dict[str, Any]) -> Iterator[tuple]:
         joint_values = [person[name] or [None] * len(joints) for name in ("confidence", "spread", "visible")]
         # a network that says nothing of its joints does not say this either
         is_known = any(person[name] for name in ("confidence", "spread", "visible"))
-        person_values = (person["person"], person["second_person"], person["score"], person["mounted"])
+        person_values = (person["person"], person["second_person"], person["score"], person["mounted"], line.get("coordinates", "sensor"))
         for j, name in enumerate(joints):
             in_range = name not in person["out_of_range"] if is_known else None
             values = (*(value[j] for value in joint_values), in_range, *person_values)
