@@ -49,11 +49,9 @@ for _side in ("left", "right"):
 
 def load_clip_positions(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
     """The motion of a clips file (`body.mocap.motion`); z is up unless `up` says otherwise."""
-    clips = load_clips(path)
-    return motion_from_joints(
-        path, clips.joints, clips.names, clips.length, fps=fps or clips.fps, up=up or "z", kind="joint positions",
-        unit_m=1.0,
-    )  # fmt: skip
+    joints, names, length, file_fps = load_clips(path)
+    fps = fps or file_fps
+    return motion_from_joints(path, joints, names, length, fps=fps, up=up or "z", kind="joint positions", unit_m=1.0)
 
 
 def motion_from_joints(
