@@ -316,13 +316,6 @@ def test_files_of_another_component_are_told(copy, name):
             everything(copy)
 
 
-def test_an_unknown_laser_is_told(tmp_path):
-    files.write_v2(tmp_path, wide=True)
-    rewritten(component(tmp_path, "lidar_calibration"), lambda rows: [row | {"key.laser_name": "ROOF"} for row in rows])
-    with pytest.raises(InputError, match="names the laser 'ROOF'; known are TOP, FRONT"):
-        everything(tmp_path)
-
-
 FIRST = files.START
 _KEYPOINT = "[LiDARHumanKeypointsComponent].lidar_keypoints[*]"
 _POSE = "[VehiclePoseComponent].world_from_vehicle.transform"

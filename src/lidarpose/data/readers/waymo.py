@@ -242,7 +242,7 @@ def table(
         names = [name for name in (*keys, *columns, *optional) if name in file.schema_arrow.names]
         values = file.read(columns=names, use_threads=False).to_pydict()
         if LASER in values:
-            values[LASER] = list(map(_laser, values[LASER]))
+            values[LASER] = list(map(int, values[LASER]))
         rows = (dict(zip(names, row, strict=True)) for row in zip(*(values[name] for name in names), strict=True))
         return [(tuple(row[name] for name in keys), dict.fromkeys(optional) | row) for row in rows]
 
@@ -279,15 +279,6 @@ def _image(values, shape) -> np.ndarray | None:
     if not frames.is_image(size, len(flat)):
         return np.zeros((0, 0, 0), np.float32)
     return flat.reshape(size)
-
-
-def _laser(name: int | str) -> int:
-    """A laser's number, from its number or its name."""
-    if isinstance(name, str) and not name.isdecimal():
-        if name not in frames.LASERS:
-            raise InputError(f"names the laser {name!r}; known are {', '.join(frames.LASERS)}")
-        return frames.LASERS[name]
-    return int(name)
 
 
 def _check(file, columns: tuple[str, ...]) -> None:

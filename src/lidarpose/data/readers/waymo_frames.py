@@ -18,8 +18,8 @@ from lidarpose.geometry import from_spherical, is_rotation, transform_points
 from lidarpose.sample import HIDDEN, SEEN, UNLABELED, Box, LabeledSample, within_reach
 from lidarpose.skeleton import WAYMO14
 
-LASERS = {"TOP": 1, "FRONT": 2, "SIDE_LEFT": 3, "SIDE_RIGHT": 4, "REAR": 5}
-TOP = LASERS["TOP"]
+# the number of the laser on the roof
+TOP = 1
 # how far outside the labeled box points are still taken, m on each side
 MARGIN = 0.2
 
