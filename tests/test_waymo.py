@@ -17,10 +17,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.data.prepare import prepare, reader
-from lidarpose.data.readers import waymo_v1
+from lidarpose.data.readers import waymo_frames, waymo_v1
 from lidarpose.data.readers.base import Skipped
 from lidarpose.data.readers.waymo import COMPONENTS, Waymo, images
-from lidarpose.data.readers.waymo_frames import MARGIN, Calibration, points_of_image
+from lidarpose.data.readers.waymo_frames import Calibration, points_of_image
 from lidarpose.data.shards import open_dataset
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
@@ -153,14 +153,15 @@ def test_rows_and_joins_are_of_one_segment(v2, tmp_path):
     check([item for item in items if item.sequence == SEGMENT])
 
 
-def test_the_margin_is_around_the_box(v2):
-    tight, _ = everything(v2, Waymo(margin=-0.1))
-    wide, _ = everything(v2, Waymo(margin=0.2))
+def test_the_margin_is_around_the_box(v2, monkeypatch):
+    wide, _ = everything(v2)
+    monkeypatch.setattr(waymo_frames, "MARGIN", -0.1)
+    tight, _ = everything(v2)
     for a, b in zip(tight, wide, strict=True):
         inside = b.box.contains(b.points, -0.1)
         np.testing.assert_array_equal(a.points, b.points[inside])
         assert 0 < inside.sum() < len(inside)
-    assert MARGIN == 0.2 and Waymo(margin=0.3).about["settings"] == {"box_margin_m": 0.3}
+    assert Waymo().about["settings"] == {"box_margin_m": -0.1}
 
 
 def test_prepare_writes_waymo_and_counts_a_corrupted_segment(v2, tmp_path):

@@ -177,7 +177,7 @@ class Frame:
     """A frame and the people labeled in it, to which range images are added one by one, in any order.
 
     sequence, timestamp (us) and start, that of the sequence's first frame; calibrations by laser; T_world_vehicle
-    (4, 4) or None where it is missing; margin m around the boxes.
+    (4, 4) or None where it is missing.
     """
 
     sequence: str
@@ -186,7 +186,6 @@ class Frame:
     people: list[LabeledPerson | Problem]
     calibrations: dict[int, Calibration]
     T_world_vehicle: np.ndarray | None = None
-    margin: float = MARGIN
     _problem: Problem | None = None
     # (laser, return) -> points and rings in the box of each person
     _crops: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray]]] = field(default_factory=dict)
@@ -218,7 +217,7 @@ class Frame:
         ring = len(image) - 1 - row if laser == TOP else np.full(len(row), -1)
         crops = self._crops[laser, which] = []
         for person in self.people:
-            selection = person.box.contains(points, self.margin) if isinstance(person, LabeledPerson) else slice(0)
+            selection = person.box.contains(points, MARGIN) if isinstance(person, LabeledPerson) else slice(0)
             crops.append((points[selection], ring[selection]))
 
     def samples(self) -> Iterator[LabeledSample | Skipped]:
