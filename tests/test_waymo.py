@@ -188,7 +188,7 @@ def top(T=None, **given):
 def test_pixel_poses_turn_about_x_then_y_then_z_and_end_in_the_frame():
     image = np.zeros((3, 4))
     image[1, 1] = 2.0
-    before, _ = points_of_image(image, top())
+    before, _ = points_of_image(image, top(), None, np.eye(4))
     poses = np.zeros((3, 4, 6))
     poses[1, 1] = 0.3, -0.2, 1.1, 5.0, 6.0, 7.0
     turned = rotation_about("z", 1.1) @ rotation_about("y", -0.2) @ rotation_about("x", 0.3)
@@ -200,7 +200,7 @@ def test_pixel_poses_turn_about_x_then_y_then_z_and_end_in_the_frame():
 
 def test_only_finite_positive_ranges_are_returns():
     image = np.array([[0.0, -1.0, np.nan, np.inf], [1.0, 2.0, 0.0, 3.0], [0.0] * 4])
-    points, row = points_of_image(image, top())
+    points, row = points_of_image(image, top(), None, np.eye(4))
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), [1, 2, 3])
     assert row.tolist() == [1, 1, 1]
 
@@ -216,7 +216,7 @@ def test_the_scene_tells_wrong_readings_apart():
         keep = near[image > 0]
         assert keep.sum() > 100
         wrong = [
-            points_of_image(image, of)[0],
+            points_of_image(image, of, None, frame.pose)[0],
             points_of_image(image, top(laser.E, inclinations=laser.beams[::-1]), frame.poses, frame.pose)[0],
             points_of_image(image[:, ::-1], of, frame.poses[:, ::-1], frame.pose)[0],
             points_of_image(image, top(files.rigid(*TOP, 0.0), inclinations=laser.beams), frame.poses, frame.pose)[0],

@@ -86,10 +86,7 @@ class Calibration:
 
 
 def points_of_image(
-    image: np.ndarray,
-    calibration: Calibration,
-    pixel_poses: np.ndarray | None = None,
-    T_world_vehicle: np.ndarray | None = None,
+    image: np.ndarray, calibration: Calibration, pixel_poses: np.ndarray | None, T_world_vehicle: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """A range image (H, W) m -> points (n, 3) float64 m in the vehicle's frame, and their rows (n,).
 
@@ -107,8 +104,6 @@ def points_of_image(
     points = transform_points(T, points)
     if pixel_poses is None:
         return points, row
-    if T_world_vehicle is None:
-        raise InputError("pixel poses move points to the frame's own pose: give T_world_vehicle too")
     if pixel_poses.shape != (height, width, 6):
         raise InputError(f"pixel poses are {pixel_poses.shape}, of a range image {height} x {width}")
     roll, pitch, yaw, *shift = pixel_poses[row, column].astype(float).T
