@@ -6,6 +6,7 @@ Every failure that the user can cause is an `InputError` of one line that names 
 import difflib
 import errno
 import hashlib
+import json
 import os
 import re
 import reprlib
@@ -18,6 +19,8 @@ from typing import Any
 
 from lidarpose.errors import InputError, MissingExtra
 
+# a frame's number, as files are named and lines begin
+FRAME_NUMBER = re.compile("[0-9]{1,12}")
 # bytes: a name may have 255 on the usual file systems, of which the temporary name needs some itself
 _MAX_KEPT_NAME = 100
 
@@ -135,6 +138,15 @@ def read_bytes(path: str | os.PathLike, *, expected: str, most: int | None = Non
     if not data:
         raise file_error(path, f"is empty; expected {expected}: was it copied completely?")
     return data
+
+
+def read_json(path: str | os.PathLike, *, expected: str) -> Any:
+    """The content of a JSON file. expected and errors: as of `read_bytes`; what is no JSON is an InputError too."""
+    data = read_bytes(path, expected=expected)
+    try:
+        return json.loads(data.decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise file_error(path, f"is not JSON ({error}); was it copied completely?") from None
 
 
 def check_unpacked(packed: int, unpacked: int) -> None:
