@@ -149,6 +149,20 @@ def read_json(path: str | os.PathLike, *, expected: str) -> Any:
         raise file_error(path, f"is not JSON ({error}); was it copied completely?") from None
 
 
+def lined_json(document: dict[str, Any], list_key: str, *inner_keys: str, indent: str = "") -> str:
+    """A document as JSON: a line for each key and for each entry of the list at `list_key`, which with an inner key is
+    itself such a document."""
+    lines = []
+    for key, value in document.items():
+        text = json.dumps(value)
+        if key == list_key and value:
+            inner_indent = indent + "  "
+            entries = [lined_json(v, *inner_keys, indent=inner_indent) if inner_keys else json.dumps(v) for v in value]
+            text = "[\n" + ",\n".join(inner_indent + entry for entry in entries) + f"\n{indent} ]"
+        lines.append(f"{indent} {json.dumps(key)}: {text}")
+    return "{\n" + ",\n".join(lines) + f"\n{indent}}}"
+
+
 def check_unpacked(packed: int, unpacked: int) -> None:
     """Raises FormatError where so many packed bytes would unpack to more than a file of real data does.
 
