@@ -20,7 +20,6 @@ from lidarpose.geometry import rotation_about
 from lidarpose.lidar.raycast import cast_ray_list
 from lidarpose.skeleton import BODY26, WAYMO14
 
-NAMES = {1: "TOP", 2: "FRONT", 3: "SIDE_LEFT", 4: "SIDE_RIGHT", 5: "REAR"}
 # of the 14 joints, in the skeleton's order
 TYPES = (1, 5, 13, 6, 14, 7, 15, 8, 16, 9, 17, 10, 18, 20)
 HIDDEN, SEEN = 1, 2
@@ -227,8 +226,8 @@ def scene():
 
 
 def write_v2(root, segment="10017090168044687777_6380_000_6400_000", split="training", *, frames=None, **kinds):
-    """A segment. wide: int32, double and lasers by name instead of int8 and float; index: pandas' column as well;
-    shuffled: rows in no order; group: rows a row group."""
+    """A segment. wide: int32 and double instead of int8 and float; index: pandas' column as well; shuffled: rows in no
+    order; group: rows a row group."""
     for name, (rows, schema) in v2_tables(frames or scene(), segment, **kinds).items():
         path = root / split / name / f"{segment}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -236,12 +235,11 @@ def write_v2(root, segment="10017090168044687777_6380_000_6400_000", split="trai
 
 
 def v2_tables(frames, segment, *, wide=False, index=True, shuffled=False, group=3):
-    small, real, laser = (pa.int32(), pa.float64(), pa.string()) if wide else (pa.int8(), pa.float32(), pa.int8())
+    small, real = (pa.int32(), pa.float64()) if wide else (pa.int8(), pa.float32())
     double, text = pa.float64(), pa.string()
     keys = {"segment_context_name": text, "frame_timestamp_micros": pa.int64()}
     matrix, image = pa.list_(double, 16), {"values": pa.list_(real), "shape": pa.list_(pa.int32(), 3)}
     key = {"segment_context_name": segment}
-    named = {number: NAMES[number] if wide else number for number in LASERS}
     found = {
         "lidar_hkp": ([], {**keys, "laser_object_id": text}, {
             "type": pa.list_(small), **{f"keypoint_3d.location_m.{x}": pa.list_(double) for x in "xyz"},
@@ -251,29 +249,29 @@ def v2_tables(frames, segment, *, wide=False, index=True, shuffled=False, group=
             **{f"box.{of}.{x}": double for of in ("center", "size") for x in "xyz"}, "box.heading": double,
             "type": small, "num_lidar_points_in_box": pa.int64(), "difficulty_level.detection": small,
         }, "[LiDARBoxComponent]."),
-        "lidar_calibration": ([], {"segment_context_name": text, "laser_name": laser}, {
+        "lidar_calibration": ([], {"segment_context_name": text, "laser_name": small}, {
             "extrinsic.transform": matrix, "beam_inclination.min": double, "beam_inclination.max": double,
             "beam_inclination.values": pa.list_(double),
         }, "[LiDARCalibrationComponent]."),
         "vehicle_pose": ([], keys, {"world_from_vehicle.transform": matrix}, "[VehiclePoseComponent]."),
-        "lidar": ([], {**keys, "laser_name": laser}, {
+        "lidar": ([], {**keys, "laser_name": small}, {
             f"range_image_return{k}.{name}": kind for k in (1, 2) for name, kind in image.items()
         }, "[LiDARComponent]."),
-        "lidar_pose": ([], {**keys, "laser_name": laser}, {
+        "lidar_pose": ([], {**keys, "laser_name": small}, {
             f"range_image_return1.{name}": kind for name, kind in image.items()
         }, "[LiDARPoseComponent]."),
     }  # fmt: skip
     for number, laser in LASERS.items():
         beams = laser.beams.tolist() if laser.table else None
         row = (laser.E.ravel().tolist(), laser.low, laser.high, beams)
-        found["lidar_calibration"][0].append(({**key, "laser_name": named[number]}, row))
+        found["lidar_calibration"][0].append(({**key, "laser_name": number}, row))
     for frame in frames:
         of = {**key, "frame_timestamp_micros": frame.time}
         found["vehicle_pose"][0].append((of, (frame.pose.ravel().tolist(),)))
-        found["lidar_pose"][0].append(({**of, "laser_name": named[1]}, flat(frame.poses)))
+        found["lidar_pose"][0].append(({**of, "laser_name": 1}, flat(frame.poses)))
         for number in LASERS:
             row = (*flat(frame.images[number, 1]), *flat(frame.images[number, 2]))
-            found["lidar"][0].append(({**of, "laser_name": named[number]}, row))
+            found["lidar"][0].append(({**of, "laser_name": number}, row))
         for one in frame.people:
             track = {**of, "laser_object_id": one.track}
             if one.box is not None:

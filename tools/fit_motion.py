@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidarpose.body.mocap.motion import load_clips
-from lidarpose.body.mocap.retarget import retarget_positions
+from lidarpose.body.mocap import load_motion
 from lidarpose.body.pose_prior.activities import (
     ANGLE_INDEX,
     EULER_FROM_ANGLES,
@@ -123,8 +122,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", required=True)
     args = parser.parse_args()
-    joints = load_clips(args.clips).of(args.subjects).joints
-    features = to_features(without_yaw(retarget_positions(joints)))
+    features = to_features(without_yaw(load_motion(args.clips).of(args.subjects).rotations))
     save_mixture(args.out, *fit_mixture(features, args.components, np.random.default_rng(args.seed)))
     print(f"{args.out}: {args.components} components from {len(features)} poses")
 

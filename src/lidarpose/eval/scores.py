@@ -13,7 +13,7 @@ from typing import Any
 
 from lidarpose._version import __version__
 from lidarpose.errors import InputError
-from lidarpose.io.files import file_error, listed, read_bytes
+from lidarpose.io.files import file_error, lined_json, listed, read_bytes
 
 SCHEMA = "lidarpose.scores/1"
 # keys of scores.json beside its results, and their types
@@ -131,20 +131,10 @@ class Scores:
 
     def to_json(self) -> str:
         """One line of text a row."""
-        head = {"schema": SCHEMA, "unit": {"mm": "millimeters", "%": "percent"}}
-        head |= {name: getattr(self, name) for name in _HEAD}
-        results = []
-        for result in self.results:
-            parts = {"setting": asdict(result.setting), "counts": result.counts, "skipped": result.skipped}
-            lines = ",\n".join(f"    {json.dumps(asdict(row))}" for row in result.lines)
-            keys = _json_lines(parts | {"notes": result.notes}, indent=3)
-            results.append(f'  {{\n{keys},\n   "lines": [\n{lines}\n   ]\n  }}')
-        content = ",\n".join(results)
-        return f'{{\n{_json_lines(head, indent=1)},\n "results": [\n{content}\n ]\n}}\n'
-
-
-def _json_lines(values: dict[str, Any], *, indent: int) -> str:
-    return ",\n".join(f"{' ' * indent}{json.dumps(key)}: {json.dumps(value)}" for key, value in values.items())
+        content: dict[str, Any] = {"schema": SCHEMA, "unit": {"mm": "millimeters", "%": "percent"}}
+        content |= {name: getattr(self, name) for name in _HEAD}
+        content["results"] = [asdict(result) for result in self.results]
+        return lined_json(content, "results", "lines") + "\n"
 
 
 def scores_path(path: str | PathLike) -> Path:

@@ -10,8 +10,7 @@ import numpy as np
 
 from lidarpose.errors import counted
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
-from lidarpose.io.boxes import people_json
-from lidarpose.io.files import check_suffix, encodable, write_atomic
+from lidarpose.io.files import check_suffix, encodable, lined_json, write_atomic
 from lidarpose.sample import JOINT_COLUMNS, PER_JOINT, Box, Pose, facing_yaw
 from lidarpose.skeleton import Skeleton
 
@@ -275,7 +274,7 @@ class Poses(Sequence[PersonPose]):
         """`to_dict` as JSON, people a line each."""
         document = self.to_dict()
         last_entries = {key: document.pop(key) for key in ("people", "timing_ms")}
-        return people_json(document | last_entries)
+        return lined_json(document | last_entries, "people") + "\n"
 
     def save(self, path: str | Path) -> None:
         """Writes `to_json` to a .json, or `to_dataframe` to a .csv, whole or not at all."""

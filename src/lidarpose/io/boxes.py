@@ -19,7 +19,7 @@ import numpy as np
 from lidarpose.arrays import to_numpy
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, rotation_from_up
-from lidarpose.io.files import FormatError, file_error, read_bytes, shorten, write_atomic
+from lidarpose.io.files import FormatError, file_error, lined_json, read_bytes, shorten, write_atomic
 from lidarpose.io.npz import load_array
 from lidarpose.sample import FARTHEST, Box, box_id
 
@@ -86,22 +86,11 @@ class Boxes(list[Box]):
 
     def to_json(self) -> str:
         """`to_dict` as JSON, people a line each."""
-        return people_json(self.to_dict())
+        return lined_json(self.to_dict(), "people") + "\n"
 
     def save(self, path: str | os.PathLike) -> None:
         """Writes `to_json` to a file, whole or not at all."""
         write_atomic(path, self.to_json())
-
-
-def people_json(document: dict) -> str:
-    """A document as JSON, its "people" a line each."""
-    lines = []
-    for key, value in document.items():
-        text = json.dumps(value)
-        if key == "people" and value:
-            text = "[\n" + ",\n".join("  " + json.dumps(person) for person in value) + "\n ]"
-        lines.append(f" {json.dumps(key)}: {text}")
-    return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
 def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike | None = None) -> Boxes:

@@ -6,6 +6,7 @@ Every failure that the user can cause is an `InputError` of one line that names 
 import difflib
 import errno
 import hashlib
+import json
 import os
 import re
 import reprlib
@@ -18,6 +19,8 @@ from typing import Any
 
 from lidarpose.errors import InputError, MissingExtra
 
+# a frame's number, as files are named and lines begin
+FRAME_NUMBER = re.compile("[0-9]{1,12}")
 # bytes: a name may have 255 on the usual file systems, of which the temporary name needs some itself
 _MAX_KEPT_NAME = 100
 
@@ -135,6 +138,29 @@ def read_bytes(path: str | os.PathLike, *, expected: str, most: int | None = Non
     if not data:
         raise file_error(path, f"is empty; expected {expected}: was it copied completely?")
     return data
+
+
+def read_json(path: str | os.PathLike, *, expected: str) -> Any:
+    """The content of a JSON file. expected and errors: as of `read_bytes`; what is no JSON is an InputError too."""
+    data = read_bytes(path, expected=expected)
+    try:
+        return json.loads(data.decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise file_error(path, f"is not JSON ({error}); was it copied completely?") from None
+
+
+def lined_json(document: dict[str, Any], list_key: str, *inner_keys: str, indent: str = "") -> str:
+    """A document as JSON: a line for each key and for each entry of the list at `list_key`, which with an inner key is
+    itself such a document."""
+    lines = []
+    for key, value in document.items():
+        text = json.dumps(value)
+        if key == list_key and value:
+            inner_indent = indent + "  "
+            entries = [lined_json(v, *inner_keys, indent=inner_indent) if inner_keys else json.dumps(v) for v in value]
+            text = "[\n" + ",\n".join(inner_indent + entry for entry in entries) + f"\n{indent} ]"
+        lines.append(f"{indent} {json.dumps(key)}: {text}")
+    return "{\n" + ",\n".join(lines) + f"\n{indent}}}"
 
 
 def check_unpacked(packed: int, unpacked: int) -> None:

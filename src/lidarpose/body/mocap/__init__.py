@@ -33,28 +33,20 @@ def load_npz(path: str | os.PathLike, *, up: str | None = None, fps: float | Non
     return (load_clip_positions if "joints" in names else load_amass)(path, up=up, fps=fps)
 
 
-# how a format is read, and the suffix of its files
-FORMATS: dict[str, tuple[Callable[..., Motion], str]] = {
-    "clips": (load_npz, ".npz"),
-    "amass": (load_npz, ".npz"),
-    "bvh": (load_bvh, ".bvh"),
-    "amc": (load_amc, ".amc"),
-    "sloper4d": (load_pkl, ".pkl"),
-    "corpus": (load_pkl, ".pkl"),
-    "lidarhuman26m": (load_lidarhuman26m, ".json"),
+# the suffix of a format's files, and how they are read
+FORMATS: dict[str, Callable[..., Motion]] = {
+    ".npz": load_npz,
+    ".bvh": load_bvh,
+    ".amc": load_amc,
+    ".pkl": load_pkl,
+    ".json": load_lidarhuman26m,
 }
-_SUFFIXES = tuple(dict.fromkeys(suffix for _, suffix in FORMATS.values()))
 # what lies beside the motion in AMASS's folders and holds none
 _NO_MOTION = ("shape.npz", "stagei.npz")
 
 
 def load_motion(
-    path: str | os.PathLike,
-    *,
-    format: str | None = None,
-    up: str | None = None,
-    fps: float | None = None,
-    hz: float | None = None,
+    path: str | os.PathLike, *, up: str | None = None, fps: float | None = None, hz: float | None = None
 ) -> Motion:
     """Reads the motion of a file, or of all files in a folder and its folders, as rotations of the shipped body.
 
@@ -64,7 +56,6 @@ def load_motion(
     Args:
         path: A folder's clips are named by their paths in it, and get the lowest rate among its files unless `hz` is
             given.
-        format: A name of `FORMATS`, by default after the file's suffix.
         up: The axis of the recording that is up, "x", "y" or "z", with a minus where it points down, by default the
             format's (BVH: the one people stand along).
         fps: The recording's frames a second, by default the file's.
@@ -73,8 +64,6 @@ def load_motion(
     Raises:
         InputError: Naming the file, for everything that cannot be read.
     """
-    if format is not None:
-        check_name("format of motion", format, FORMATS)
     if up is not None:
         check_name("up axis", up, UP_AXES)
     for name, rate in (("fps", fps), ("hz", hz)):
@@ -82,39 +71,37 @@ def load_motion(
             raise file_error(path, f"{name} must be frames a second, above 0, got {rate}")
     try:
         path = Path(path)
-        whole_folder = path.is_dir() and not (format == "lidarhuman26m" and pose_files(path))
+        whole_folder = path.is_dir()
     except (TypeError, ValueError) as error:
         raise file_error(repr(path), f"expected the path of a file or folder of motion ({error})") from None
-    sources = _sources(path, format) if whole_folder else [path]
+    sources = _sources(path) if whole_folder else [path]
     if not sources:
-        raise file_error(path, f"holds no file of motion; read are {', '.join(_SUFFIXES)} in it or its folders")
+        raise file_error(path, f"holds no file of motion; read are {', '.join(FORMATS)} in it or its folders")
     motions = []
     for source in sources:
-        motion = FORMATS[format or _format_of(source)][0](source, up=up, fps=fps)
+        motion = _loader(source)(source, up=up, fps=fps)
         motion = motion if hz is None else motion.resampled(hz)
         motions.append(replace(motion, names=tuple(_name_in_folder(name, source, path) for name in motion.names)))
     return join(motions, source=f"{len(motions)} files: {path}") if whole_folder else motions[0]
 
 
-def _format_of(path: Path) -> str:
+def _loader(path: Path) -> Callable[..., Motion]:
     suffix = ".json" if path.is_dir() else path.suffix.lower()
-    for format, (_, format_suffix) in FORMATS.items():
-        if suffix == format_suffix:
-            return format
-    expected = f"a file of motion, one of {', '.join(_SUFFIXES)}, or a folder of them"
-    # says whether there is such a file at all
-    read_bytes(path, expected=expected)
-    raise file_error(path, f"expected {expected}: convert it, or in Python give format=")
+    if suffix not in FORMATS:
+        expected = f"a file of motion, one of {', '.join(FORMATS)}, or a folder of them"
+        # says whether there is such a file at all
+        read_bytes(path, expected=expected)
+        raise file_error(path, f"expected {expected}: convert it, or give it the suffix of its format")
+    return FORMATS[suffix]
 
 
-def _sources(folder: Path, format: str | None) -> list[Path]:
+def _sources(folder: Path) -> list[Path]:
     """Files of motion in a folder and its folders, and its folders of pose files, in the order of their names."""
-    suffixes = {suffix for name, (_, suffix) in FORMATS.items() if format in (None, name)}
     sources = []
     for directory, _, names in os.walk(folder):
         files = [Path(directory, name) for name in names if not name.lower().endswith(_NO_MOTION)]
-        sources += [file for file in files if file.suffix.lower() in suffixes - {".json"}]
-        if ".json" in suffixes and pose_files(Path(directory)):
+        sources += [file for file in files if file.suffix.lower() in FORMATS.keys() - {".json"}]
+        if pose_files(Path(directory)):
             sources.append(Path(directory))
     return sorted(sources)
 
@@ -126,7 +113,7 @@ def digest(path: str | os.PathLike) -> str:
     if not path.is_dir():
         return content_digest(path, expected="motion")[:16]
     files = sorted(Path(directory, name) for directory, _, names in os.walk(path) for name in names)
-    files = [file for file in files if file.suffix.lower() in (*_SUFFIXES, ".asf")]
+    files = [file for file in files if file.suffix.lower() in (*FORMATS, ".asf")]
     lines = [f"{file.relative_to(path).as_posix()} {content_digest(file, expected='motion')}" for file in files]
     return hashlib.sha256("\n".join(lines).encode("utf-8", "surrogateescape")).hexdigest()[:16]
 

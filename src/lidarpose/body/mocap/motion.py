@@ -8,7 +8,7 @@ A file of clips is an npz with `joints` (F, 24, 3) m, z up, all clips one after 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
-from typing import Any, ClassVar, Self
+from typing import Any
 
 import numpy as np
 
@@ -29,24 +29,29 @@ _UPRIGHT = 0.7
 
 
 @dataclass(frozen=True, kw_only=True)
-class _ClipTable:
-    """F frames of several clips, one clip after the other: clip c is named names[c] and has length[c] frames, one every
-    1 / fps s."""
+class Motion:
+    """Captured motion as the body plays it: F frames of several clips, one clip after the other.
+
+    names and length (C,) of the clips; fps frames a second; rotations (F, 24, 3, 3) float32, local, in the rest frame
+    of `body.rig`, any heading; translation (F, 3) float32 m, the pelvis, z up; source: what it was read from; dropped:
+    frames that were left out because they could not be used.
+    """
 
     names: tuple[str, ...]
     length: np.ndarray
     fps: float
-
-    # the arrays with a row a frame, and the shape of a row
-    ROWS: ClassVar[dict[str, tuple[int, ...]]]
+    rotations: np.ndarray
+    translation: np.ndarray
+    source: str
+    dropped: int = 0
 
     def __post_init__(self):
         frames = int(self.length.sum())
-        for name, shape in self.ROWS.items():
+        for name, row_shape in (("rotations", (24, 3, 3)), ("translation", (3,))):
             array = getattr(self, name)
-            if array.shape != (frames, *shape):
-                row_shape = ", ".join(map(str, shape))
-                raise InputError(f"{name} must be (frames, {row_shape}), {frames} frames, got {array.shape}")
+            if array.shape != (frames, *row_shape):
+                expected = f"(frames, {', '.join(map(str, row_shape))}), {frames} frames"
+                raise InputError(f"{name} must be {expected}, got {array.shape}")
             if not np.isfinite(array).all():
                 raise InputError(f"{name} must be finite; drop the frames that are not")
         if not 0 < self.fps < np.inf:
@@ -64,7 +69,7 @@ class _ClipTable:
         """The frames of one clip, to cut the arrays with."""
         return slice(int(self.start[clip]), int(self.start[clip] + self.length[clip]))
 
-    def of(self, subjects: str | Iterable[str]) -> Self:
+    def of(self, subjects: str | Iterable[str]) -> "Motion":
         """The clips whose names start with one of `subjects`, such as "002", which "0021_03" does not. Raises
         InputError for one without."""
         subjects = (subjects,) if isinstance(subjects, str) else tuple(subjects)
@@ -74,34 +79,9 @@ class _ClipTable:
                 raise InputError(f"no clip starts with {subject!r}: there are {subject_list}")
         clip_mask = np.array([any(_is_of(name, subject) for subject in subjects) for name in self.names], bool)
         frame_mask = np.repeat(clip_mask, self.length)
-        arrays: dict[str, Any] = {name: getattr(self, name)[frame_mask] for name in self.ROWS}
+        arrays = {"rotations": self.rotations[frame_mask], "translation": self.translation[frame_mask]}
         names = tuple(name for name, is_selected in zip(self.names, clip_mask, strict=True) if is_selected)
         return replace(self, **arrays, names=names, length=self.length[clip_mask])
-
-
-@dataclass(frozen=True, kw_only=True)
-class Clips(_ClipTable):
-    """Captured positions: joints (F, 24, 3) float32 m, SMPL's joints, z up."""
-
-    joints: np.ndarray
-
-    ROWS = {"joints": (24, 3)}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Motion(_ClipTable):
-    """Captured motion as the body plays it.
-
-    rotations (F, 24, 3, 3) float32, local, in the rest frame of `body.rig`, any heading; translation (F, 3) float32 m,
-    the pelvis, z up; source: what it was read from; dropped: frames that were left out because they could not be used.
-    """
-
-    rotations: np.ndarray
-    translation: np.ndarray
-    source: str
-    dropped: int = 0
-
-    ROWS = {"rotations": (24, 3, 3), "translation": (3,)}
 
     def resampled(self, hz: float) -> "Motion":
         """The same clips with `hz` frames a second: a clip keeps its first frame and loses less than a frame at its
@@ -200,8 +180,9 @@ def facing_x(rotations: np.ndarray, translation: np.ndarray) -> tuple[np.ndarray
     return rotations, (inverse_yaw @ displacement[..., None])[..., 0].astype(np.float32)
 
 
-def load_clips(path: str | PathLike) -> Clips:
-    """Reads a clips file (its layout is at the top of this module). Raises InputError where it is another."""
+def load_clips(path: str | PathLike) -> tuple[np.ndarray, tuple[str, ...], np.ndarray, float]:
+    """The joints (F, 24, 3) float32 m, names and lengths (C,) of the clips, and frames a second, of a clips file (its
+    layout is at the top of this module). Raises InputError where it is another."""
     arrays, _ = read_npz(path, (*_KEYS, "joint_names"), expected="an npz file of clips")
     missing_keys = [key for key in _KEYS if key not in arrays]
     if missing_keys:
@@ -226,15 +207,13 @@ def load_clips(path: str | PathLike) -> Clips:
         raise file_error(path, f"clips must lie {expected}")
     spans = [np.arange(s, s + n) for s, n in zip(start, length, strict=True)]
     frames = np.concatenate([*spans, np.zeros(0, int)]).astype(int)
-    try:
-        return Clips(
-            joints=joints.astype(np.float32)[frames],
-            names=tuple(map(str, np.ravel(clip))),
-            length=length,
-            fps=float(fps.item()),
-        )
-    except InputError as error:
-        raise file_error(path, error) from None
+    joints = joints.astype(np.float32)[frames]
+    if not np.isfinite(joints).all():
+        raise file_error(path, "joints must be finite; drop the frames that are not")
+    rate = float(fps.item())
+    if not 0 < rate < np.inf:
+        raise file_error(path, f"fps must be frames a second, above 0, got {rate}")
+    return joints, tuple(map(str, np.ravel(clip))), length, rate
 
 
 def standing_axis(trunk: np.ndarray) -> str | None:

@@ -14,7 +14,6 @@ import numpy as np
 
 from lidarpose.body.mocap.motion import Motion, load_clips, standing_axis, usable_clips
 from lidarpose.body.rig import forward_kinematics, mean_adult_joints
-from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_between, rotation_from_up, rotation_vector, unit
 from lidarpose.io.files import file_error
 from lidarpose.skeleton import SMPL24
@@ -26,7 +25,7 @@ _KNEE_OVERSTRETCH, _ELBOW_OVERSTRETCH = 0.25, 0.07
 # collars nearer to each other than this share of the shoulders' distance are taken for a single point
 _LEAST_COLLAR_WIDTH = 0.15
 # bones under this have no direction, m
-SHORTEST_BONE = 1e-4
+_SHORTEST_BONE = 1e-4
 
 # how many meters a file's number is: meters, centimeters, millimeters, inches, and CMU's unit (inches / 0.45)
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "inch/0.45": 0.0254 / 0.45}
@@ -49,11 +48,9 @@ for _side in ("left", "right"):
 
 def load_clip_positions(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
     """The motion of a clips file (`body.mocap.motion`); z is up unless `up` says otherwise."""
-    clips = load_clips(path)
-    return motion_from_joints(
-        path, clips.joints, clips.names, clips.length, fps=fps or clips.fps, up=up or "z", kind="joint positions",
-        unit_m=1.0,
-    )  # fmt: skip
+    joints, names, length, file_fps = load_clips(path)
+    fps = fps or file_fps
+    return motion_from_joints(path, joints, names, length, fps=fps, up=up or "z", kind="joint positions", unit_m=1.0)
 
 
 def motion_from_joints(
@@ -88,7 +85,7 @@ def motion_from_joints(
     if not np.abs(joints[is_usable]).max() < _FARTHEST:
         raise file_error(path, "joints lie farther than 100 km from the origin; expected one unit throughout")
     joints = joints @ rotation_from_up(up or _up_axis(path, joints[is_usable])).T
-    is_usable[is_usable] = shortest_bone(joints[is_usable])[0] > SHORTEST_BONE
+    is_usable[is_usable] = _shortest_bone(joints[is_usable]) > _SHORTEST_BONE
     clips = usable_clips(path, names, length, is_usable, fps)
     joints = joints[is_usable]
     _check_speed(path, joints, clips["length"], fps)
@@ -157,23 +154,12 @@ def retarget_positions(joints: np.ndarray) -> np.ndarray:
     a straight limb cannot be seen in positions: they follow the parent (a straight leg follows its foot).
 
     Args:
-        joints: (n, 24, 3) m, SMPL's joints in SMPL's order, z up, any facing and any bone lengths.
+        joints: (n, 24, 3) m, SMPL's joints in SMPL's order, z up, any facing and any bone lengths above 0, finite.
 
     Returns:
         (n, 24, 3, 3) float32, in the rest frame of `body.rig`.
-
-    Raises:
-        InputError: For another shape, values that are not finite and limbs without length.
     """
     joints = np.asarray(joints, float)
-    if joints.ndim != 3 or joints.shape[1:] != (24, 3):
-        raise InputError(f"joints must be (n, 24, 3), SMPL's joints in meters, got {joints.shape}")
-    if not np.isfinite(joints).all():
-        raise InputError("joints must be finite numbers; drop or fill the missing ones before retargeting")
-    length, bone_names = shortest_bone(joints)
-    if (length <= SHORTEST_BONE).any():
-        frame = int(np.argmax(length <= SHORTEST_BONE))
-        raise InputError(f"{bone_names[frame]} has no length in frame {frame}: a bone without length has no direction")
     rest_joints = mean_adult_joints()[None]
 
     global_rotations = np.empty((len(joints), 24, 3, 3))  # G
@@ -201,11 +187,9 @@ def retarget_positions(joints: np.ndarray) -> np.ndarray:
     return local_rotations.astype(np.float32)
 
 
-def shortest_bone(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of joints (n, 24, 3): the length (n,) m of the shortest line that retargeting needs, and which (n,) it is."""
-    lengths = np.stack([np.linalg.norm(_bone(joints, a, b), axis=-1) for a, b in _LINES])
-    bone_index = lengths.argmin(0)
-    return lengths.min(0), np.array([f"{a} -> {b}" for a, b in _LINES])[bone_index]
+def _shortest_bone(joints: np.ndarray) -> np.ndarray:
+    """Of joints (n, 24, 3): the length (n,) m of the shortest line that retargeting needs."""
+    return np.min([np.linalg.norm(_bone(joints, a, b), axis=-1) for a, b in _LINES], axis=0)
 
 
 def _bone(joints: np.ndarray, start: str, end: str) -> np.ndarray:

@@ -12,7 +12,6 @@ Source: the format's description and CMU's database (mocap.cs.cmu.edu), its page
 """
 
 import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,7 +20,7 @@ import numpy as np
 from lidarpose.body.mocap.joint_tree import END, Joint, JointTree, tree_motion
 from lidarpose.body.mocap.motion import Motion
 from lidarpose.geometry import rotation_about
-from lidarpose.io.files import file_error, read_bytes
+from lidarpose.io.files import FRAME_NUMBER, file_error, read_bytes
 
 _BVH_CHANNELS = {
     f"{axis}{kind}": kind[0].replace("p", "t") + axis for axis in "xyz" for kind in ("position", "rotation")
@@ -40,7 +39,6 @@ _BONES = {"pelvis": "root", "neck": "thorax", "head": "upperneck"} | {
     )
 }  # fmt: skip
 _OPTIONAL = ("left_foot", "right_foot", "left_hand", "right_hand", "neck")
-_FRAME = re.compile("[0-9]{1,12}")
 
 
 def load_bvh(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
@@ -328,7 +326,7 @@ def _amc_frames(path: Path) -> dict[str, np.ndarray]:
     for words in _words_of_lines(path, "an AMC file"):
         if words[0].startswith(":"):
             continue
-        if len(words) == 1 and _FRAME.fullmatch(words[0]):
+        if len(words) == 1 and FRAME_NUMBER.fullmatch(words[0]):
             frames.append({})
         elif not frames:
             raise file_error(path, f"an AMC file has numbered frames of bones, got {' '.join(words)[:60]!r}")

@@ -23,9 +23,7 @@ rad, the middle one) and `T_1` or `trans` (3) m are taken, or LIPD's `gt_joint` 
 All entries of one `motion_id` or `seq_path`, in their order, are a clip.
 """
 
-import json
 import os
-import re
 import reprlib
 from pathlib import Path
 from typing import Any
@@ -35,7 +33,7 @@ import numpy as np
 from lidarpose.body.mocap.motion import Motion, join, standing_axis, usable_clips
 from lidarpose.body.mocap.retarget import motion_from_joints
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_from_up
-from lidarpose.io.files import file_error, read_bytes
+from lidarpose.io.files import FRAME_NUMBER, file_error, read_json
 from lidarpose.io.npz import read_npz
 from lidarpose.io.pickles import load_pickle
 
@@ -53,7 +51,7 @@ _PEOPLE = ("first_person", "second_person")
 _BETAS = 10
 # frames a second of the LiDAR that LiDARHuman26M's labels belong to
 LIDARHUMAN26M_FPS = 10.0
-_FRAME = re.compile("[0-9]{1,12}")
+_POSE_FILE = "a JSON file with pose and trans"
 
 
 def motion_from_smpl(
@@ -206,8 +204,8 @@ def load_betas(path: str | os.PathLike) -> np.ndarray:
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
     rows: list[np.ndarray] = []
     for file in files:
-        if file.suffix.lower() == ".json" and _FRAME.fullmatch(file.stem):
-            content = _json(file)
+        if file.suffix.lower() == ".json" and FRAME_NUMBER.fullmatch(file.stem):
+            content = read_json(file, expected=_POSE_FILE)
             rows.append(_first_betas(content.get("beta") if isinstance(content, dict) else None))
         elif file.suffix.lower() == ".npz":
             rows.append(_first_betas(read_npz(file, ("betas",), expected="an npz file of motion")[0].get("betas")))
@@ -235,7 +233,7 @@ def _frame_rate(path: object, rate: object, key: str) -> float:
 
 def pose_files(folder: Path) -> list[Path]:
     """The JSON files of a folder that are numbered as frames are, in the order of their numbers."""
-    return sorted((p for p in folder.glob("*.json") if _FRAME.fullmatch(p.stem)), key=lambda p: int(p.stem))
+    return sorted((p for p in folder.glob("*.json") if FRAME_NUMBER.fullmatch(p.stem)), key=lambda p: int(p.stem))
 
 
 def load_lidarhuman26m(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
@@ -250,7 +248,7 @@ def load_lidarhuman26m(path: str | os.PathLike, *, up: str | None = None, fps: f
 
 
 def _read_pose_file(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    content = _json(path)
+    content = read_json(path, expected=_POSE_FILE)
     try:
         pose, trans = (np.asarray(content[key], float).ravel() for key in ("pose", "trans"))
     except (TypeError, KeyError, IndexError, ValueError, OverflowError):
@@ -258,11 +256,3 @@ def _read_pose_file(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if len(pose) != _SMPL or len(trans) != 3:
         raise file_error(path, f"expected pose (72 numbers) and trans (3 numbers), got {reprlib.repr(content)}")
     return pose, trans
-
-
-def _json(path: Path) -> Any:
-    data = read_bytes(path, expected="a JSON file with pose and trans")
-    try:
-        return json.loads(data.decode("utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise file_error(path, f"is not JSON ({error}); was it copied completely?") from None

@@ -23,12 +23,11 @@ from lidarpose.body.smpl import load_body
 from lidarpose.data.clips import SCANS, static_points, window_points, without_person
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_vector
-from lidarpose.io.files import content_digest, file_error, read_bytes
+from lidarpose.io.files import FRAME_NUMBER, content_digest, file_error, read_json
 from lidarpose.io.point_cloud import read_points
 from lidarpose.sample import FARTHEST, SEEN, UNLABELED, Box, LabeledSample, Pose, center_of, within_reach
 from lidarpose.skeleton import SMPL24, Skeleton
 
-_NUMBER = re.compile("[0-9]{1,12}")
 # of people without a labeled box, it is that of their joints, this much larger on each side, m
 _BOX_MARGIN = 0.2
 # and their points are those in a box this much larger still, m: what a detector's box lets in
@@ -96,7 +95,7 @@ def numbered(folder: Path, suffix: str) -> dict[int, list[Path]]:
     """The files of a folder that are numbered, whatever the number of digits: number -> its files, in order."""
     files: dict[int, list[Path]] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-        if path.suffix.lower() == suffix and _NUMBER.fullmatch(path.stem):
+        if path.suffix.lower() == suffix and FRAME_NUMBER.fullmatch(path.stem):
             files.setdefault(int(path.stem), []).append(path)
     return dict(sorted(files.items()))
 
@@ -117,13 +116,9 @@ def paired(
             yield frame, paths[0][0], paths[1][0] if paths[1] else None
 
 
-def read_json(path: Path, expected: str) -> dict:
+def read_object(path: Path, expected: str) -> dict:
     """A JSON file that holds an object. Raises InputError where it does not."""
-    data = read_bytes(path, expected=expected)
-    try:
-        content = json.loads(data.decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        raise file_error(path, f"is not JSON ({error}); was it copied completely?") from None
+    content = read_json(path, expected=expected)
     if not isinstance(content, dict):
         raise file_error(path, f"expected {expected}, got {type(content).__name__}")
     return content

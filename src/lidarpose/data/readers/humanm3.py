@@ -11,7 +11,6 @@ made from the labeled joints, which the center "joints_box" tells, and crops the
 Sources: soullessrobot/Human-M3-Dataset lib/dataset/human_m3.py, guidodumont/SMPLify-3D datasets/humanm3.py.
 """
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,7 +19,7 @@ import numpy as np
 from lidarpose.data.readers import base
 from lidarpose.data.readers.base import Reader, Skipped
 from lidarpose.errors import InputError
-from lidarpose.io.files import file_error
+from lidarpose.io.files import FRAME_NUMBER, file_error
 from lidarpose.io.pickles import load_pickle
 from lidarpose.sample import LabeledSample
 from lidarpose.skeleton import HUMAN15
@@ -81,7 +80,7 @@ def _read_sequence(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
             continue
         frame, path, cloud = pair
         try:
-            bodies = base.read_json(path, "people's joints")
+            bodies = base.read_object(path, "people's joints")
         except InputError as error:
             yield Skipped("labels cannot be read", str(error))
             continue
@@ -113,7 +112,7 @@ def _read_database(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
             yield Skipped("labels without a cloud", f"{where}: {entry['pcd']}")
             continue
         sequence = path.relative_to(root).parent.parent.as_posix()
-        frame = int(path.stem) if re.fullmatch("[0-9]{1,12}", path.stem) else number
+        frame = int(path.stem) if FRAME_NUMBER.fullmatch(path.stem) else number
         yield from _people(path, people, sequence, frame, float("nan"))
 
 

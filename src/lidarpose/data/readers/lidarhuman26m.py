@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarpose.body.mocap.smpl_poses import LIDARHUMAN26M_FPS
 from lidarpose.data.readers import base
 from lidarpose.data.readers.base import Reader, Skipped, SmplJoints
 from lidarpose.errors import InputError
@@ -23,8 +24,6 @@ from lidarpose.io.files import file_error
 from lidarpose.sample import LabeledSample, within_reach
 from lidarpose.skeleton import SMPL24
 
-# frames a second of the LiDAR
-_FPS = 10.0
 POSE_FOLDER, _SEGMENT, _SCANS = "labels/3d/pose", "labels/3d/segment", "pointclouds"
 # fewer frames say too little
 LEAST_FRAMES = 100
@@ -95,7 +94,7 @@ class LidarHuman26M(Reader):
             elif cloud is None:
                 yield Skipped("labels without a cloud", f"{part}/{frame:06d}")
             else:
-                time = (frame - min(poses)) / _FPS
+                time = (frame - min(poses)) / LIDARHUMAN26M_FPS
                 R = np.eye(3) if turn is None else turn
                 clip = {"rotations": base.turned_pose(labels[frame][1], R)} | clouds.around(frame, R)
                 frame_fields = {"sequence": part, "frame": frame, "frame_id": f"{part}/{cloud.stem}", "time": time}
@@ -104,7 +103,7 @@ class LidarHuman26M(Reader):
 
 def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """betas (10,), pose (72,) rad and trans (3,) m."""
-    content = base.read_json(path, "SMPL's beta, pose and trans")
+    content = base.read_object(path, "SMPL's beta, pose and trans")
     missing_keys = [key for key in ("beta", "pose", "trans") if key not in content]
     if missing_keys:
         raise file_error(path, f"expected beta, pose and trans, got no {', '.join(missing_keys)}")

@@ -59,15 +59,14 @@ _PIXEL_POSES = "[LiDARPoseComponent].range_image_return1"
 
 
 class Waymo(Reader):
-    """Reads whichever version is there. margin: how far around the labeled box points are taken, m on each side."""
+    """Reads whichever version is there."""
 
     name = "waymo"
     skeleton = WAYMO14.name
 
-    def __init__(self, *, margin: float = frames.MARGIN):
-        super().__init__(box_margin_m=margin)
-        self.about["notes"] = [note.format(margin=margin) for note in self.about["notes"]]
-        self.margin = margin
+    def __init__(self):
+        super().__init__(box_margin_m=frames.MARGIN)
+        self.about["notes"] = [note.format(margin=frames.MARGIN) for note in self.about["notes"]]
 
     def parts(self, root: Path) -> list[str]:
         """Segments with keypoints of version 2 ("training/SEGMENT") or files of version 1 ("training/FILE.tfrecord").
@@ -90,8 +89,8 @@ class Waymo(Reader):
         """Everybody with keypoints in a part, in the order of time, then of track. Raises InputError where the labels
         cannot be read; where the range images cannot, everybody is skipped."""
         if part.endswith(".tfrecord"):
-            return waymo_v1.read(root, part, self.margin)
-        return _read_segment(root, part, self.margin)
+            return waymo_v1.read(root, part)
+        return _read_segment(root, part)
 
 
 def _components(folder: Path) -> list[str]:
@@ -128,7 +127,7 @@ def _segments(root: Path) -> list[str]:
     return sorted(parts)
 
 
-def _read_segment(root: Path, part: str, margin: float) -> Iterator[LabeledSample | Skipped]:
+def _read_segment(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
     split, _, segment = part.partition("/")
     files = {name: root / split / name / f"{segment}.parquet" for name in COMPONENTS}
     labels = []
@@ -138,7 +137,7 @@ def _read_segment(root: Path, part: str, margin: float) -> Iterator[LabeledSampl
             yield Skipped(frames.BAD_LABEL, where)
         else:
             labels.append((key, row))
-    frames_by_key = _frames(files, labels, margin)
+    frames_by_key = _frames(files, labels)
     try:
         _add_images(files, frames_by_key)
     except InputError as error:
@@ -148,7 +147,7 @@ def _read_segment(root: Path, part: str, margin: float) -> Iterator[LabeledSampl
         yield from frames_by_key[frame_key].samples()
 
 
-def _frames(files: dict[str, Path], labels: list[Row], margin: float) -> dict[FrameKey, frames.Frame]:
+def _frames(files: dict[str, Path], labels: list[Row]) -> dict[FrameKey, frames.Frame]:
     """The frames that have keypoints, with boxes, calibrations and poses joined to them."""
     boxes = dict(table(files["lidar_box"], (SEGMENT, TIME, OBJECT), (*_BOX_COLUMNS, _BOX_TYPE), (_BOX_COUNT,)))
     poses = dict(table(files["vehicle_pose"], (SEGMENT, TIME), (_VEHICLE_POSE,)))
@@ -168,7 +167,6 @@ def _frames(files: dict[str, Path], labels: list[Row], margin: float) -> dict[Fr
                 start=min((t for s, t in poses if s == segment and t is not None), default=time),
                 people=[],
                 calibrations=calibrations.get(segment, {}),
-                margin=margin,
             )
         frames_by_key[segment, time].people.append(_person(key[2], row, boxes.get(key)))
     for frame_key, frame in frames_by_key.items():
@@ -242,7 +240,7 @@ def table(
         names = [name for name in (*keys, *columns, *optional) if name in file.schema_arrow.names]
         values = file.read(columns=names, use_threads=False).to_pydict()
         if LASER in values:
-            values[LASER] = list(map(_laser, values[LASER]))
+            values[LASER] = list(map(int, values[LASER]))
         rows = (dict(zip(names, row, strict=True)) for row in zip(*(values[name] for name in names), strict=True))
         return [(tuple(row[name] for name in keys), dict.fromkeys(optional) | row) for row in rows]
 
@@ -279,15 +277,6 @@ def _image(values, shape) -> np.ndarray | None:
     if not frames.is_image(size, len(flat)):
         return np.zeros((0, 0, 0), np.float32)
     return flat.reshape(size)
-
-
-def _laser(name: int | str) -> int:
-    """A laser's number, from its number or its name."""
-    if isinstance(name, str) and not name.isdecimal():
-        if name not in frames.LASERS:
-            raise InputError(f"names the laser {name!r}; known are {', '.join(frames.LASERS)}")
-        return frames.LASERS[name]
-    return int(name)
 
 
 def _check(file, columns: tuple[str, ...]) -> None:

@@ -18,8 +18,8 @@ from lidarpose.geometry import from_spherical, is_rotation, transform_points
 from lidarpose.sample import HIDDEN, SEEN, UNLABELED, Box, LabeledSample, within_reach
 from lidarpose.skeleton import WAYMO14
 
-LASERS = {"TOP": 1, "FRONT": 2, "SIDE_LEFT": 3, "SIDE_RIGHT": 4, "REAR": 5}
-TOP = LASERS["TOP"]
+# the number of the laser on the roof
+TOP = 1
 # how far outside the labeled box points are still taken, m on each side
 MARGIN = 0.2
 
@@ -86,10 +86,7 @@ class Calibration:
 
 
 def points_of_image(
-    image: np.ndarray,
-    calibration: Calibration,
-    pixel_poses: np.ndarray | None = None,
-    T_world_vehicle: np.ndarray | None = None,
+    image: np.ndarray, calibration: Calibration, pixel_poses: np.ndarray | None, T_world_vehicle: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """A range image (H, W) m -> points (n, 3) float64 m in the vehicle's frame, and their rows (n,).
 
@@ -107,8 +104,6 @@ def points_of_image(
     points = transform_points(T, points)
     if pixel_poses is None:
         return points, row
-    if T_world_vehicle is None:
-        raise InputError("pixel poses move points to the frame's own pose: give T_world_vehicle too")
     if pixel_poses.shape != (height, width, 6):
         raise InputError(f"pixel poses are {pixel_poses.shape}, of a range image {height} x {width}")
     roll, pitch, yaw, *shift = pixel_poses[row, column].astype(float).T
@@ -177,7 +172,7 @@ class Frame:
     """A frame and the people labeled in it, to which range images are added one by one, in any order.
 
     sequence, timestamp (us) and start, that of the sequence's first frame; calibrations by laser; T_world_vehicle
-    (4, 4) or None where it is missing; margin m around the boxes.
+    (4, 4) or None where it is missing.
     """
 
     sequence: str
@@ -186,7 +181,6 @@ class Frame:
     people: list[LabeledPerson | Problem]
     calibrations: dict[int, Calibration]
     T_world_vehicle: np.ndarray | None = None
-    margin: float = MARGIN
     _problem: Problem | None = None
     # (laser, return) -> points and rings in the box of each person
     _crops: dict[tuple[int, int], list[tuple[np.ndarray, np.ndarray]]] = field(default_factory=dict)
@@ -218,7 +212,7 @@ class Frame:
         ring = len(image) - 1 - row if laser == TOP else np.full(len(row), -1)
         crops = self._crops[laser, which] = []
         for person in self.people:
-            selection = person.box.contains(points, self.margin) if isinstance(person, LabeledPerson) else slice(0)
+            selection = person.box.contains(points, MARGIN) if isinstance(person, LabeledPerson) else slice(0)
             crops.append((points[selection], ring[selection]))
 
     def samples(self) -> Iterator[LabeledSample | Skipped]:

@@ -99,13 +99,13 @@ def parts(root: Path) -> list[str]:
     return sorted(path.relative_to(root).as_posix() for path in paths)
 
 
-def read(root: Path, part: str, margin: float) -> Iterator[LabeledSample | Skipped]:
+def read(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
     """Everybody with keypoints in a file, frame by frame. After a damaged record the rest is given up."""
     start = None
     try:
         for number, data in enumerate(records(root / part)):
             try:
-                frame = _frame(parse("Frame", data, _LARGEST_FRAME), start, margin)
+                frame = _frame(parse("Frame", data, _LARGEST_FRAME), start)
             except InputError as error:
                 yield Skipped(frames.BAD_FRAME, f"{part}: record {number}: {error}")
                 continue
@@ -145,7 +145,7 @@ def _masked_checksum(data: bytes) -> int:
     return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF
 
 
-def _frame(message: Any, start: int | None, margin: float) -> frames.Frame:
+def _frame(message: Any, start: int | None) -> frames.Frame:
     """A frame with its range images. start: timestamp of the segment's first frame, None where it is this one.
 
     Raises InputError where its labels cannot be read.
@@ -159,7 +159,6 @@ def _frame(message: Any, start: int | None, margin: float) -> frames.Frame:
         start=message.timestamp_micros if start is None else start,
         people=[_person(label) for label in message.laser_labels if label.HasField("laser_keypoints")],
         calibrations={},
-        margin=margin,
     )
     if frame.people:
         frame.calibrations = {laser.name: _calibration(laser) for laser in message.context.laser_calibrations}
