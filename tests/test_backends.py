@@ -446,6 +446,9 @@ def test_the_base_install_predicts_and_informs(tmp_path):
         assert main(["info"]) == 0
         import lidarpose
         assert lidarpose.load().predict(np.load("crop.npy")).joints.shape == (24, 3)
+        # as help() and `import *` do
+        names = [name for name in dir(lidarpose) if getattr(lidarpose, name) is not None]
+        assert set(lidarpose.__all__) < set(names) and "export" not in names
         """
     done = program(EXTRAS, code, tmp_path)
     assert done.returncode == 0, done.stderr

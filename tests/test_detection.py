@@ -306,7 +306,15 @@ def test_nothing_to_find_is_no_error(model):
     rng = np.random.default_rng(0)
     floor = np.column_stack([rng.uniform(-20, 20, (20_000, 2)), rng.normal(-1.7, 0.01, 20_000)])
     line = np.column_stack([np.linspace(-30, 30, 500), np.zeros((500, 2))])
-    for points in (np.zeros((0, 3)), np.ones((3, 3)) * 9, np.zeros((50, 3)), floor, line, rng.normal(0, 30, (300, 3))):
+    for points in (
+        np.zeros((0, 3)),
+        np.ones((1, 3)),
+        np.ones((3, 3)) * 9,
+        np.zeros((50, 3)),
+        floor,
+        line,
+        rng.normal(0, 30, (300, 3)),
+    ):
         assert lidarpose.detect(points) == []
         assert len(model.predict(points, find=True)) == 0
 
@@ -431,6 +439,10 @@ def test_a_background_is_not_searched(scene, tmp_path, fake):
 def test_wrong_options_are_told(scene, options, words):
     with pytest.raises(InputError, match=words):
         lidarpose.detect(scene[0], **options)
+    # of one person, too, who is not searched for
+    if options.keys() & {"min_score", "max_range", "max_people", "background"}:
+        with pytest.raises(InputError, match=words):
+            lidarpose.predict(np.random.default_rng(0).uniform(0, 1, (50, 3)), **options, model="tiny")
 
 
 def test_boxes_and_crops_are_not_searched(model, file, fake, scene):
@@ -539,13 +551,15 @@ def test_who_cannot_reach_the_least_score_is_neither_verified_nor_posed(monkeypa
     assert verifier is not poser and set(posed) == set(np.flatnonzero(scores >= 0.6))
     # of those who are left whoever is near to a surer one
     assert all(backend is poser and 0 < len(rows) < len(posed) for rows, backend in again) and len(again) <= 1
-    best = [np.argmin(np.abs(scores - box.score)) for box in people.boxes]
-    np.testing.assert_allclose(people.logits, logits[best])
+    # several have a score of 1
+    own = [np.nanargmin(np.abs(logits - logit)) for logit in people.logits]
+    np.testing.assert_allclose(people.logits, logits[own])
+    np.testing.assert_allclose([box.score for box in people.boxes], scores[own])
     assert len(people.boxes) >= 2 and (np.diff([box.score for box in people.boxes]) <= 0).all()
     # nobody is most of somebody surer
     owned = set()
     for rows in people.rows:
-        assert len(owned & set(rows.tolist())) <= 0.75 * len(rows)
+        assert len(owned & set(rows.tolist())) <= verification._SHARED * len(rows)
         owned |= set(rows.tolist())
 
 

@@ -14,16 +14,23 @@ from lidarpose.progress import Progress
 def quick(monkeypatch):
     monkeypatch.setattr(progress, "LINE_EVERY", 0.02)
     monkeypatch.setattr(progress, "BAR_EVERY", 0.02)
+    # as commands of other tests leave it
+    monkeypatch.setattr(progress, "_quiet", False)
 
 
 def test_without_a_terminal_there_is_a_line_now_and_then(quick, capsys):
     with Progress(1200, unit="people", label="bench") as shown:
         # what was there before is not this run's speed
+        time.sleep(0.4)
         shown.update(1000)
+        time.sleep(0.1)
         shown.update(1100, "loss 1.5")
         time.sleep(0.2)
+        # nor is the time before it, where something is compiled
+        assert 100 / 0.5 < float(re.search(r"([\d.,]+)/s", shown.line())[1].replace(",", ""))
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) >= 2
+    # the same is not said again at once
+    assert len(lines) == len(set(lines)) >= 2
     pattern = r"lidarpose: bench: 1,100 of 1,200 people, [\d,.]+/s, 0:00:\d\d left, loss 1\.5"
     assert re.fullmatch(pattern, lines[-1])
 

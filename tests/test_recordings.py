@@ -630,3 +630,8 @@ def test_a_pose_of_the_sensor_that_cannot_be_costs_its_frame(clouds, model):
 def test_what_is_no_source_is_refused(source, model):
     with pytest.raises(InputError, match="expected (a path|paths)"):
         lidarpose.predict_recording(source, model=model)
+
+
+def test_an_option_that_is_none_is_refused_at_once():
+    with pytest.raises(TypeError, match="predict_recording.. got an unexpected keyword argument 'min_scor'"):
+        lidarpose.predict_recording("nowhere", min_scor=0.5)

@@ -228,11 +228,14 @@ def test_view_of_streets_shows_them_from_above(tmp_path, monkeypatch):
 def test_numbers_of_people_who_stand_together_do_not_cover_each_other():
     rng = np.random.default_rng(0)
     centers = np.concatenate([[[0.0, 0.0], [900.0, 0.0]], 300 + rng.uniform(-25, 25, (6, 2))])
-    offsets = label_offsets(centers)
+    tips = centers[1:2] + 20.0
+    offsets = label_offsets(centers, np.zeros((0, 2)))
+    # nor the arrow that shows the facing
+    assert np.linalg.norm(centers[1] + label_offsets(centers, tips)[1] - tips[0]) > 15
     # who is alone has it to the upper right, near
     assert (offsets[:2] > 0).all() and (np.linalg.norm(offsets[:2], axis=1) < 16).all()
     places = centers + offsets
     apart = np.linalg.norm(places[:, None] - places, axis=-1) + 99 * np.eye(len(places))
     plain = np.linalg.norm((centers + [11, 11])[:, None] - (centers + [11, 11]), axis=-1) + 99 * np.eye(len(centers))
     assert apart.min() > 12 > plain.min()
-    assert label_offsets(np.zeros((0, 2))).shape == (0, 2)
+    assert label_offsets(np.zeros((0, 2)), np.zeros((0, 2))).shape == (0, 2)

@@ -8,6 +8,7 @@ Names are loaded when first used: importing the package costs no torch and no nu
 """
 
 from importlib import import_module
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 from lidarpose import _renamed
@@ -80,7 +81,10 @@ _renamed.install()
 # modules of their own, for `lidarpose.metrics.mpjpe`
 _MODULES = ("metrics", "evaluation")
 
-__all__ = ["__version__", *_HOMES]
+# names that a base install lacks, and the module that they need: help() and `import *` ask for every name of `__all__`
+_NEEDS = {"export": "torch", "import_dapt": "torch", "cast_rays": "numba"}
+
+__all__ = ["__version__", *(name for name in _HOMES if name not in _NEEDS or find_spec(_NEEDS[name]))]
 
 
 def __getattr__(name: str):

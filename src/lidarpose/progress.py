@@ -7,8 +7,8 @@ import threading
 import time
 from types import TracebackType
 
-# seconds between two movements of the bar, and between two lines where stderr is no terminal
-BAR_EVERY, LINE_EVERY = 1.0, 10.0
+# seconds between two movements of the bar, between two lines where stderr is no terminal, and where nothing changes
+BAR_EVERY, LINE_EVERY, SAME_EVERY = 1.0, 10.0, 60.0
 _quiet = False
 
 
@@ -28,7 +28,8 @@ class Progress:
     Args:
         total: how much there is to do, None if unknown.
         unit: what is counted, in the plural.
-        done: what was there before, which is not this run's speed; None: the first update says it.
+        done: what was there before, which is not this run's speed; None: the first update says it, and the time
+            before it does not count.
         label: a name before the bar.
         shown: False shows nothing, as in all but one of several processes.
     """
@@ -68,7 +69,7 @@ class Progress:
         """done: in all so far; note: a few words behind it, as a loss."""
         self.done, self._note = done, note or self._note
         if self._first is None:
-            self._first = done
+            self._first, self._started = done, time.monotonic()
             if self._bar is not None:
                 self._bar.initial = self._bar.n = self._bar.last_print_n = done
         if self._bar is not None:
@@ -89,8 +90,10 @@ class Progress:
         return f"{name}{self.done:,}{total} {self.unit}{speed}{remaining}{f', {self._note}' if self._note else ''}"
 
     def _watch(self) -> None:
+        last_done, last_time = None, 0.0
         while not self._ended.wait(BAR_EVERY if self._bar is not None else LINE_EVERY):
             if self._bar is not None:
                 self._bar.refresh()
-            else:
+            elif self.done != last_done or time.monotonic() - last_time >= SAME_EVERY:
+                last_done, last_time = self.done, time.monotonic()
                 print(f"lidarpose: {self.line()}", file=sys.stderr, flush=True)

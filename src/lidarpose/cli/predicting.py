@@ -17,8 +17,8 @@ from lidarpose.models import DEFAULT, NAMES
 _FILES = ".pcd .ply .las .laz .npy .npz .csv .xyz .txt .bin"
 # what to try where somebody should have been found
 _NOBODY = (
-    "if somebody is there: points need meters and z up (--up), a lower --min-score finds more, and --crop takes all "
-    "points for one person"
+    "if somebody is there: points need meters and z up (--up), a lower --min-score finds more, and predict --crop "
+    "takes all points for one person"
 )
 # characters of an id in a warning
 _LONGEST_ID = 40

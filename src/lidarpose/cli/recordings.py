@@ -50,7 +50,9 @@ def _is_recording(options: argparse.Namespace) -> bool:
     """Whether the command is about many frames rather than one plain file."""
     from lidarpose.io.sources import is_single_scan
 
-    if any(getattr(options, name) not in (None, False) for name in option_names(_FRAMES)):
+    if any(
+        value is not None and value is not False for value in (getattr(options, name) for name in option_names(_FRAMES))
+    ):
         return True
     return not is_single_scan(options.source)
 

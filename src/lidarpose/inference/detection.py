@@ -141,6 +141,9 @@ def other_up_axis(places: "DetectedScan", search: Search) -> str | None:
     if detections is None or detections.has_ground and flat_axis(places.scan.points) == input_scan.upright_axis:
         # outdoors: the axis is right
         return None
+    if scan_unit_warning(places.level, len(input_scan.points)) and not flat_along_another_axis(places.scan):
+        # in other units nobody is found with any axis up
+        return None
     other_axes = [up for up in UP_AXES if up != input_scan.up]
     boxes = {up: find_people(replace(input_scan, up=up), search).boxes or [] for up in other_axes}
     best_axis = max(other_axes, key=lambda up: sum(box.score or 0.0 for box in boxes[up]))
@@ -310,7 +313,7 @@ def _distinct(points: np.ndarray) -> np.ndarray:
         # the upper bits are the ones that differ
         keys = (keys ^ axis ^ (axis >> np.uint64(29))) * np.uint64(factor)
     ordered = np.sort(keys)
-    if not len(points) or (ordered[1:] == ordered[:-1]).mean() < _FEW_COPIES:
+    if np.count_nonzero(ordered[1:] == ordered[:-1]) <= _FEW_COPIES * len(points):
         return points
     return points[np.sort(np.unique(keys, return_index=True)[1])]
 

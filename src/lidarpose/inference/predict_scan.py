@@ -84,9 +84,11 @@ def predict(
     if sensor_origin is None and (find or boxes is not None):
         scan = replace(scan, origin=np.zeros(3))
     read_end = time.perf_counter()
-    search = search_options(*options, columns) if find else None
+    search = search_options(*options, columns)
     # loaded once the input has proved readable
-    _, poses = predict_scan(scan, lambda: predictor_of(model), search=search, skeleton=skeleton, progress=progress)
+    _, poses = predict_scan(
+        scan, lambda: predictor_of(model), search=search if find else None, skeleton=skeleton, progress=progress
+    )
     return replace(poses, timing_ms={"read": (read_end - start) * 1e3} | poses.timing_ms)
 
 

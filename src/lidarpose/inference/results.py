@@ -111,6 +111,11 @@ class PersonPose:
         return None if self.box is None else self.box.score
 
     @property
+    def mounted(self) -> bool | None:
+        """Whether the person rides or sits in a wheelchair, as of the box; None where nobody says."""
+        return None if self.box is None else self.box.mounted
+
+    @property
     def num_points(self) -> int:
         return len(self.points)
 
@@ -120,7 +125,7 @@ class PersonPose:
             "id": self.id,
             "box": self.box and self.box.to_dict(),
             "score": None if self.score is None else round(self.score, 4),
-            "mounted": self.box and self.box.mounted,
+            "mounted": self.mounted,
             "num_points": self.num_points,
             "person": None if self.person is None else round(self.person, 4),
             "second_person": None if self.second_person is None else round(self.second_person, 4),
@@ -336,6 +341,7 @@ class Poses(Sequence[PersonPose]):
             points=points @ R_level_input.T,
             boxes=[box for person in people if (box := person.box or _box_around(person))],
             poses=Pose(joints=np.stack(joints), skeleton=self.skeleton) if joints else None,
+            names=[str(person.id) for person in people if person.pose is not None and person.id is not None],
             label=label,
             sensor=None if self.origin is None else tuple((R_level_input @ self.origin)[:2].tolist()),
         )

@@ -154,7 +154,9 @@ def _refuse_foreign(data: bytes, suffix: str) -> None:
         if re.match(pattern, data):
             raise FormatError(problem)
     if suffix in RECORDINGS:
-        raise FormatError("one scan", f"a recording ({suffix})", "lidarpose predict reads it, frame by frame")
+        raise FormatError(
+            "one scan", f"a recording ({suffix})", "lidarpose predict reads it, in Python predict_recording"
+        )
     if suffix not in SUFFIXES:
         raise FormatError(f"one of {' '.join(SUFFIXES)}", f"the suffix {suffix!r}", "convert or rename the file")
 

@@ -102,7 +102,8 @@ def predict_recording(
     Args:
         source: files, folders or recordings as `open_source` takes them, with columns, topic, meta, rate, start, end
             and every; or a source.
-        **posing: how frames are posed, see `PosingOptions`. boxes as of `FrameBoxes`; track: people are joined over
+        **posing: how frames are posed: boxes, calib, crop, find, min_score, max_range, max_people, background,
+            sensor_origin, skeleton, up, track, live and model. boxes as of `FrameBoxes`; track: people are joined over
             time, and people known need no verification; live: with tracks, whose poses are made steady by the past
             alone; the others as in `predict`. Whether the frames are crops of one person is decided by the first one.
 
@@ -112,6 +113,8 @@ def predict_recording(
     Raises:
         InputError: options that contradict each other, or a source that cannot be read at all.
     """
+    if unknown := set(posing) - set(PosingOptions.__annotations__):
+        raise TypeError(f"predict_recording() got an unexpected keyword argument {min(unknown)!r}")
     if not (hasattr(source, "frames") and hasattr(source, "name")):
         source_options: dict[str, Any] = {"topic": topic, "meta": meta, "rate": rate, "start": start, "end": end}
         source = open_source(source, columns=columns, every=every, **source_options)

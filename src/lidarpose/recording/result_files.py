@@ -81,7 +81,13 @@ def _rows(line: dict[str, Any]) -> Iterator[tuple]:
         joint_values = [person[name] or [None] * len(joints) for name in ("confidence", "spread", "visible")]
         # a network that says nothing of its joints does not say this either
         is_known = any(person[name] for name in ("confidence", "spread", "visible"))
-        person_values = (person["person"], person["second_person"], person["score"], person["mounted"], line.get("coordinates", "sensor"))
+        person_values = (
+            person["person"],
+            person["second_person"],
+            person["score"],
+            person["mounted"],
+            line.get("coordinates", "sensor"),
+        )
         for j, name in enumerate(joints):
             in_range = name not in person["out_of_range"] if is_known else None
             values = (*(value[j] for value in joint_values), in_range, *person_values)

@@ -107,8 +107,9 @@ def draw_scans(
         va="top",
         parse_math=False,
     )
-    tracks = "dotted: the way over the frames; " if any(panel.tracks for panel in panels) else ""
-    note = f"arrow: facing; {tracks}left limbs blue, right ones orange"
+    tracks = "; dotted: the way over the frames" if any(panel.tracks for panel in panels) else ""
+    limbs = "; left limbs blue, right ones orange" if any(is_known(panel.poses) for panel in panels) else ""
+    note = f"arrow: facing{tracks}{limbs}"
     figure.text(0.15 / width, 1 - 0.42 / height, note, fontsize=8, color=_FAINT, va="top")
     for number, panel in enumerate(panels):
         row, column = divmod(number, columns)
@@ -142,7 +143,8 @@ def _draw_panel(ax, panel: ScanPanel, size: np.ndarray) -> None:
     if panel.places is not None and len(panel.places):
         ax.plot(panel.places[:, 0], panel.places[:, 1], ls="", marker="o", ms=2.5, color=_BOX, alpha=0.5, zorder=4)
     centers = np.array([box.center[:2] for box in panel.boxes]).reshape(-1, 2)
-    offsets = label_offsets(centers * 72 / scale)
+    arrow_tips = np.array([_arrow_tip(box) for box in panel.boxes]).reshape(-1, 2)
+    offsets = label_offsets(centers * 72 / scale, arrow_tips * 72 / scale)
     for box, offset in zip(panel.boxes, offsets.tolist(), strict=True):
         _draw_box(ax, box, offset)
     if is_known(panel.poses):
@@ -190,19 +192,24 @@ def _draw_points(ax, points: np.ndarray, ground: Ground | None) -> None:
     bar.outline.set_visible(False)
 
 
-def label_offsets(centers: np.ndarray) -> np.ndarray:
-    """Where numbers are written, from the centers (B, 2) of their boxes, in points: away from other boxes and numbers
-    that are there already, else to the upper right."""
+def label_offsets(centers: np.ndarray, arrow_tips: np.ndarray) -> np.ndarray:
+    """Where numbers are written, from the centers (B, 2) of their boxes, in points: away from arrows, to tips (A, 2),
+    other boxes and numbers that are there already, else to the upper right."""
     angles = np.pi / 4 * (1 + np.arange(8))
     directions = np.stack([np.cos(angles), np.sin(angles)], -1)
     candidates = np.concatenate([radius * directions for radius in _LABEL_RADII])
     effort = np.repeat(np.array(_LABEL_RADII) / _LABEL_RADII[0], 8) * 0.05
     offsets = np.zeros((len(centers), 2))
     for i, center in enumerate(centers):
-        others = np.concatenate([np.delete(centers, i, 0), centers[:i] + offsets[:i]])
+        others = np.concatenate([np.delete(centers, i, 0), centers[:i] + offsets[:i], arrow_tips])
         distance = np.linalg.norm(others[:, None] - (center + candidates), axis=-1)
         offsets[i] = candidates[np.argmin(np.exp(-((distance / _LABEL_SIZE) ** 2)).sum(0).round(3) + effort)]
     return offsets
+
+
+def _arrow_tip(box: Box) -> np.ndarray:
+    """Where the arrow that shows the facing ends, (2,) m."""
+    return box.center[:2] + np.array([np.cos(box.yaw), np.sin(box.yaw)]) * (box.size[0] / 2 + 0.6)
 
 
 def _draw_box(ax, box: Box, offset: tuple[float, float]) -> None:
@@ -210,8 +217,9 @@ def _draw_box(ax, box: Box, offset: tuple[float, float]) -> None:
     from matplotlib.collections import LineCollection
 
     ax.add_collection(LineCollection(list(box_edges(box)[..., :2]), colors=_BOX, lw=1.1, zorder=5))
-    arrow_tip = box.center[:2] + np.array([np.cos(box.yaw), np.sin(box.yaw)]) * (box.size[0] / 2 + 0.6)
-    ax.annotate("", arrow_tip, box.center[:2], arrowprops={"arrowstyle": "->", "color": _BOX, "lw": 1.1}, zorder=5)
+    ax.annotate(
+        "", _arrow_tip(box), box.center[:2], arrowprops={"arrowstyle": "->", "color": _BOX, "lw": 1.1}, zorder=5
+    )
     if box.id is not None:
         ax.annotate(
             str(box.id), box.center[:2], offset, textcoords="offset points", fontsize=9, weight="bold", color=_BOX,

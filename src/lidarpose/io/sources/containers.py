@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, NamedTuple
 from lidarpose.io.files import FormatError, check_unpacked, shorten
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
-_CUT_OFF = "is cut off: what was recorded up to there is read"
+_CUT_OFF = "is cut off: what was recorded up to there is read, if there is anything"
 # bytes of a message in SQLite, packed or not
 _MAX_MESSAGE = 2**28
 

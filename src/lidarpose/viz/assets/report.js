@@ -316,7 +316,7 @@
   for (const view of views) { observer.observe(view.canvas); resized.observe(view.canvas); }
   // what nobody has needs no legend
   for (const words of document.querySelectorAll("[data-if]")) {
-    words.hidden = ![...data.people, ...data.scans].some((shown) => words.dataset.if.split(" ").some((key) => shown[key]));
+    words.hidden = ![...data.people, ...data.scans].some((shown) => words.dataset.if.split(" ").some((key) => shown[key] || shown[key] === 0));
   }
   readColors();
   views.forEach(draw);
