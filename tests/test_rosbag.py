@@ -263,6 +263,20 @@ def test_sensor_poses_come_from_transforms(tmp_path, suffix):
     assert [frame.index for frame in source.frames(7)] == [7, 8, 9]
 
 
+def test_a_recording_gone_on_with_stays_in_its_world(tmp_path):
+    """`odom` is known from cloud 15 on, when the first was given without a pose, and `map`, which is preferred, from 25."""
+    messages = clouds(".mcap", 40)
+    for k in range(15, 40):
+        time = START + k * 10**8
+        messages.append(("/tf", transform(time, "odom", "lidar", (k, 0, 0)), time))
+        if k >= 25:
+            messages.append(("/tf", transform(time, "map", "odom", (1000, 0, 0)), time))
+    path = write(tmp_path / "drive.mcap", sorted(messages, key=lambda message: message[2]))
+    for first in (15, 30):
+        places = [frame.T_world_sensor[0, 3] for frame in open_source(path).frames(first)]
+        assert places == list(range(first, 40))
+
+
 def test_a_pose_is_none_where_no_chain_is_known(tmp_path):
     gone = ("/tf", transform(START, "map", "base_link", (0, 0, 0)), START)
     far = [("/tf", transform(START + t, "odom", "lidar", (t / 1e9, 0, 0)), START + t) for t in (0, 10**8, 5 * 10**9)]

@@ -8,6 +8,7 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterator
 from functools import cache, partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -136,6 +137,10 @@ class BagRecording:
         return lines
 
     def lazy_frames(self, first: int = 0) -> Iterator[LazyFrame]:
+        # clouds before the first are placed too: the world is chosen by them
+        return islice(self._all_frames(), first, None)
+
+    def _all_frames(self) -> Iterator[LazyFrame]:
         self._num_frames = self._num_posed = 0
         transforms = TransformTree()
         # clouds that wait for the pose of their sensor
@@ -143,8 +148,7 @@ class BagRecording:
         index = 0
         for message in self._messages():
             if message.topic == self.topic:
-                if index >= first:
-                    pending_clouds.append(_Cloud(index, message, self._decode(message)))
+                pending_clouds.append(_Cloud(index, message, self._decode(message)))
                 index += 1
             else:
                 transforms.add(self._decode(message), is_static=message.topic.endswith("_static"))
