@@ -294,6 +294,11 @@ def test_a_pose_is_none_where_no_chain_is_known(tmp_path):
         assert [pose is not None for pose in poses] == [i < num_posed for i in range(6)]
         assert len(source.warnings) == (num_posed > 0)
 
+    # clouds that do not say in which frame they are
+    nameless = [("/p", cloud(points_of(k), stamp=START + k, frame=""), START + k) for k in range(2)]
+    source = open_source(write(tmp_path / "nameless.mcap", nameless))
+    assert [frame.T_world_sensor for frame in source] == [None, None] and not source.warnings
+
     # a cloud that is in the world already; where the sensor was is not known
     (frame,) = open_source(write(tmp_path / "map.mcap", [("/p", cloud(points_of(1), frame="/map"), START)]))
     assert np.array_equal(frame.T_world_sensor, np.eye(4)) and frame.origin is None

@@ -190,7 +190,7 @@ class BagRecording:
             available_worlds = [world for world in _WORLDS if world in poses]
             if available_worlds and (is_last or available_worlds[0] == _WORLDS[0]):
                 self._world = available_worlds[0]
-        return poses.get(self._world or "")
+        return None if self._world is None else poses.get(self._world)
 
     def _frame(self, cloud: "_Cloud", T_world_sensor: np.ndarray | None) -> LazyFrame:
         self._has_stamps &= cloud.has_stamp
