@@ -9,6 +9,7 @@ import pytest
 from walking_people import FRAMES, boxes_of, moving_source, places_in_world, walking_clouds, world_pose
 
 import lidarpose
+from lidarpose.body.rig import mean_adult_joints
 from lidarpose.cli import main
 from lidarpose.geometry import UP_AXES
 from lidarpose.inference.known_places import KnownPlaces
@@ -17,7 +18,9 @@ from lidarpose.recording import output, result_files
 from lidarpose.recording.coordinates import FixedFrame
 from lidarpose.recording.known_people import KnownPeople
 from lidarpose.recording.predict_recording import FramePredictor
-from lidarpose.sample import Box
+from lidarpose.recording.steady_tracks import smoothed_lines
+from lidarpose.sample import Box, Pose
+from lidarpose.skeleton import SMPL24
 
 
 @pytest.fixture(scope="module")
@@ -143,6 +146,40 @@ def test_times_that_stand_still_or_jump_back_cost_no_frame(model, tmp_path):
     lines = written(source, tmp_path / "a.jsonl", model, world=True, boxes=boxes_of(FRAMES), track=True)
     assert [line["time"] for line in lines] == times
     assert_where_people_are(lines)
+
+
+def walker(times, rng):
+    """Poses, one a time, of somebody who walks along x, each joint off by 3 cm on an axis."""
+    for time in times:
+        joints = mean_adult_joints() + [1.2 * time, 0, 0] + rng.normal(scale=0.03, size=(24, 3))
+        yield Pose(joints=joints, skeleton=SMPL24, spread=np.full(24, 0.05))
+
+
+def steady_rows(times, damaged=()):
+    """Which frames of somebody at those times smoothing changes."""
+    lines = [
+        {"time": time, "T_world_sensor": None, "error": None, "people": []}
+        | ({"error": "damaged"} if k in damaged else {"people": [{"track": 0} | person_values(pose)]})
+        for k, (time, pose) in enumerate(zip(times, walker(times, np.random.default_rng(0)), strict=True))
+    ]
+    people = [line["people"] for line in smoothed_lines(lambda: iter(lines), "z", SMPL24)]
+    return [k for k in range(len(times)) if people[k] and people[k][0]["joints"] != lines[k]["people"][0]["joints"]]
+
+
+def person_values(pose):
+    return {"joints": pose.joints.tolist(), "spread": pose.spread.tolist(), "visible": [], "confidence": []}
+
+
+def test_times_that_are_wrong_cost_the_smoothing_of_their_frames_alone():
+    times = (np.arange(20) / 10).tolist()
+    rows = list(range(20))
+    assert steady_rows(times) == rows
+    # a damaged frame whose time is another clock's, a good one's, and a clock that begins again
+    wrong = [*times[:9], 1.7e9, *times[10:]]
+    assert steady_rows(wrong, damaged=[9]) == rows[:9] + rows[10:]
+    assert steady_rows(wrong) == steady_rows(times[:10] * 2) == rows
+    # two frames that changed places: one of them stays as it is
+    assert steady_rows([*times[:9], times[10], times[9], *times[11:]]) == rows[:10] + rows[11:]
 
 
 # ---- what is known of people

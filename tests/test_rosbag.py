@@ -264,7 +264,7 @@ def test_sensor_poses_come_from_transforms(tmp_path, suffix):
 
 
 def test_a_recording_gone_on_with_stays_in_its_world(tmp_path):
-    """`odom` is known from cloud 15 on, when the first was given without a pose, and `map`, which is preferred, from 25."""
+    """`odom` is known from cloud 15 on, when the first was given without a pose; `map`, which is preferred, from 25."""
     messages = clouds(".mcap", 40)
     for k in range(15, 40):
         time = START + k * 10**8
@@ -359,6 +359,23 @@ def test_clouds_that_do_not_fit_their_layout_are_damaged_frames(tmp_path):
     *damaged, last = open_source(write(tmp_path / "a.db3", messages))
     assert all(isinstance(frame, DamagedFrame) and "\n" not in frame.error for frame in damaged) and len(damaged) == 5
     assert np.array_equal(last.points, points_of(0))
+
+
+def test_a_damaged_message_keeps_its_time_among_stamps_of_another_clock(tmp_path):
+    """Sensors whose clock began when they were switched on."""
+    boot = [("/points", cloud(points_of(k), stamp=5 * 10**9 + k * 10**8), START + k * 10**8) for k in range(8)]
+    path = write(tmp_path / "a.mcap", boot)
+    data = path.read_bytes()
+    at = -1
+    for _ in range(4):
+        at = data.index(b"lidar\0", at + 1)
+    # the length of the name of its frame
+    path.write_bytes(data[: at - 4] + b"\xff\xff\xff\x7f" + data[at:])
+    source = open_source(path, end=0.5)
+    frames = list(source)
+    assert [isinstance(frame, DamagedFrame) for frame in frames] == [k == 3 for k in range(6)]
+    np.testing.assert_allclose([frame.time for frame in frames], 5 + np.arange(6) / 10)
+    assert not source.warnings
 
 
 def test_a_chunk_that_would_unpack_to_more_than_it_may_is_left_out(tmp_path):

@@ -145,11 +145,11 @@ class BagRecording:
         transforms = TransformTree()
         # clouds that wait for the pose of their sensor
         pending_clouds: deque[_Cloud] = deque()
-        index = 0
+        index = delay = 0
         for message in self._messages():
             if message.topic == self.topic:
-                pending_clouds.append(_Cloud(index, message, self._decode(message)))
-                index += 1
+                pending_clouds.append(_Cloud(index, message, self._decode(message), delay))
+                index, delay = index + 1, pending_clouds[-1].recorded - pending_clouds[-1].stamp
             else:
                 transforms.add(self._decode(message), is_static=message.topic.endswith("_static"))
             while pending_clouds:
@@ -201,9 +201,9 @@ class BagRecording:
 
 class _Cloud:
     """A message with a cloud: recorded and stamp, ns, when it was recorded and when it was measured, as far as its
-    header tells."""
+    header tells; of a damaged message, `delay` ns before it was recorded, as the one before."""
 
-    def __init__(self, index: int, message: Message, content: Any):
+    def __init__(self, index: int, message: Message, content: Any, delay: int):
         self.index = index
         self.recorded = message.time
         self.content = content
@@ -211,7 +211,7 @@ class _Cloud:
         self.frame_id = header.frame_id.lstrip("/") if header else ""
         stamp = header.stamp.sec * 10**9 + header.stamp.nanosec if header else 0
         self.has_stamp = stamp > 0 or header is None
-        self.stamp = stamp if stamp > 0 else message.time
+        self.stamp = stamp if stamp > 0 else message.time - (0 if header else delay)
 
     def decode(self, T_world_sensor: np.ndarray | None) -> Sweep:
         if self.content is None:
