@@ -14,6 +14,8 @@ from lidarpose.cli import main
 from lidarpose.geometry import UP_AXES
 from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.predictor import Predictor
+from lidarpose.inference.results import PersonPose, Poses
+from lidarpose.inference.scan import Scan
 from lidarpose.recording import output, result_files
 from lidarpose.recording.coordinates import FixedFrame
 from lidarpose.recording.known_people import KnownPeople
@@ -180,6 +182,28 @@ def test_times_that_are_wrong_cost_the_smoothing_of_their_frames_alone():
     assert steady_rows(wrong) == steady_rows(times[:10] * 2) == rows
     # two frames that changed places: one of them stays as it is
     assert steady_rows([*times[:9], times[10], times[9], *times[11:]]) == rows[:10] + rows[11:]
+
+
+def test_a_late_frame_does_not_end_the_memory_of_live_poses():
+    def live_joints(times):
+        """Of the frames, by their times."""
+        known = KnownPeople(up="z", least_score=0.5, live=True)
+        joints = {}
+        for time, pose in zip(times, walker(times, np.random.default_rng(1)), strict=True):
+            person = PersonPose(pose=pose, skeleton=SMPL24, points=np.zeros((0, 3)), warnings=(), model={})
+            poses = Poses(people=(person,), skeleton=SMPL24, model={})
+            joints[time] = known.update(time, Scan(points=np.zeros((5, 3))), poses, np.eye(4))[0].pose.joints, pose
+        return joints
+
+    times = (np.arange(30) / 10).tolist()
+    joints = live_joints([*times[:20], times[21], times[20], *times[22:]])
+    steady, seen = joints[times[20]]
+    assert np.array_equal(steady, seen.joints)
+    errors = [
+        np.linalg.norm(steady - mean_adult_joints() - [1.2 * time, 0, 0], axis=-1).mean()
+        for time, (steady, _) in joints.items()
+    ]
+    assert np.mean(errors[22:]) < 0.7 * np.linalg.norm(np.full(3, 0.03))
 
 
 # ---- what is known of people
