@@ -155,7 +155,7 @@ def test_finished_lines_of_other_frames_are_an_error(drive, folder, monkeypatch,
     steps = FramePredictor(crop=True, model=lidarpose.load("tiny", tta=1))
     frame = Frame(points=np.ones((9, 3)), index=0, id="gone", time=0.0)
     with output.PartFile(tmp_path / "a.jsonl", {}) as part:
-        part.append(steps.predict(frame), steps.state())
+        part.append(steps.predict(frame), steps.state(), 0)
         written = part.path.read_bytes()
         # by another process, whatever its command is
         for command in ({}, {"min_score": 0.1}):
@@ -165,6 +165,29 @@ def test_finished_lines_of_other_frames_are_an_error(drive, folder, monkeypatch,
     recording = IndexedRecording(name="made", ids=["here"], times=None, read=lambda i: Sweep(points=np.ones((9, 3))))
     with pytest.raises(InputError, match=r"a.jsonl.part: was made of other frames, the last one gone: remove it"):
         output.write_recording(FrameSource(recording), steps, tmp_path / "a.jsonl", command={})
+
+
+def test_finished_lines_of_points_that_changed_are_an_error(tmp_path, model, monkeypatch):
+    """A folder may have been exported anew under the same names."""
+    crop, predict = np.random.default_rng(0).normal(scale=0.3, size=(99, 3)), FramePredictor._predicted
+
+    def write(points):
+        recording = IndexedRecording(name="made", ids=list("ab"), times=None, read=lambda i: Sweep(points=points))
+        steps = FramePredictor(crop=True, model=model)
+        output.write_recording(FrameSource(recording), steps, tmp_path / "a.jsonl", command={})
+
+    def stop_at_second(self, frame, prepared):
+        if frame.index:
+            raise KeyboardInterrupt
+        return predict(self, frame, prepared)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FramePredictor, "_predicted", stop_at_second)
+        with pytest.raises(KeyboardInterrupt):
+            write(crop)
+    with pytest.raises(InputError, match=r"a.jsonl.part: was made of other frames, the last one a: remove it"):
+        write(crop + 50)
+    write(crop)
 
 
 @pytest.fixture
@@ -601,7 +624,7 @@ def test_a_full_disk_is_an_error_of_the_file(tmp_path, monkeypatch):
 
         monkeypatch.setattr(output.os, "replace", full)
         with pytest.raises(InputError, match=r"a.jsonl.part: cannot write .*No space left"):
-            part.append(poses, steps.state())
+            part.append(poses, steps.state(), 0)
     assert not list(tmp_path.glob("*.new"))
 
 
