@@ -137,6 +137,22 @@ def test_a_killed_command_goes_on_and_ends_the_same(flag, drive, folder, tracked
     assert not list(folder.glob("killed*.part*"))
 
 
+def test_a_command_stopped_before_its_frames_leaves_nothing_and_after_them_says_what_it_leaves(
+    drive, tmp_path, monkeypatch, capsys
+):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    words = (drive, "--end", 0.1, "--track", "--out", tmp_path / "a.jsonl")
+    for owner, name, is_kept in ((FramePredictor, "_predicted", False), (output, "smoothed_lines", True)):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, stop)
+            run(*words, status=130)
+        assert ("a.jsonl.part, and the same command goes on" in capsys.readouterr().err) is is_kept
+        assert bool(list(tmp_path.iterdir())) is is_kept
+    assert len(run(*words)) == 2
+
+
 def test_lines_of_another_command_are_not_gone_on_with(drive, folder, monkeypatch, capsys):
     def stop(self, *of):
         raise KeyboardInterrupt

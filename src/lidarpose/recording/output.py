@@ -233,25 +233,27 @@ def write_recording(
             tell(f"{part.frames:,} frames are in {part.path}: going on")
         try:
             _add_frames(source, predictor, part)
+            if not any(line["error"] is None for line in part.lines()):
+                error = next((line["error"] for line in part.lines()), None)
+                part.remove()
+                raise nothing_read(source.name, part.frames, error)
+            is_smoothed = predictor.is_tracked and not predictor.live
+            lines = smoothed_lines(part.lines, predictor.up, predictor.wanted) if is_smoothed else part.lines()
+
+            def final() -> Iterator[dict[str, Any]]:
+                for line in lines:
+                    line = in_world(line, predictor.up) if world else line
+                    summary.add(line)
+                    if on_line is not None:
+                        on_line(line)
+                    yield line
+
+            write_result(result, final())
         except KeyboardInterrupt:
+            if not part.frames:
+                part.remove()
             place = f"the finished frames are in {part.path}, and the same command goes on"
             raise KeyboardInterrupt(f"stopped: {place}" if part.frames else "stopped") from None
-        if not any(line["error"] is None for line in part.lines()):
-            error = next((line["error"] for line in part.lines()), None)
-            part.remove()
-            raise nothing_read(source.name, part.frames, error)
-        is_smoothed = predictor.is_tracked and not predictor.live
-        lines = smoothed_lines(part.lines, predictor.up, predictor.wanted) if is_smoothed else part.lines()
-
-        def final() -> Iterator[dict[str, Any]]:
-            for line in lines:
-                line = in_world(line, predictor.up) if world else line
-                summary.add(line)
-                if on_line is not None:
-                    on_line(line)
-                yield line
-
-        write_result(result, final())
         part.remove()
     return summary
 
