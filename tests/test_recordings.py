@@ -479,6 +479,13 @@ def test_the_command_line(drive, folder, tmp_path, monkeypatch, capsys):
     assert (tmp_path / "drive.poses.html").is_file()
 
 
+def test_what_is_wrong_with_a_source_is_said_after_pictures_too(clouds, tmp_path, monkeypatch, capsys):
+    source = moving_source(clouds, times=[0.0, 0.2, 0.1, *np.arange(3, FRAMES) / 10])
+    monkeypatch.setattr("lidarpose.io.sources.open_source", lambda *_, **__: source)
+    assert main(["predict", "made", "--track", "--picture", "--out", str(tmp_path / "a.jsonl")]) == 0
+    assert "warning: moving: time jumps back 1 times" in capsys.readouterr().err
+
+
 def test_a_folder_without_one_readable_scan_is_an_error(tmp_path, capsys):
     for name in "ab":
         (tmp_path / f"{name}.pcd").write_bytes(b"garbage")

@@ -105,12 +105,14 @@ def _predict_recording(
             on_line=on_line,
             tell=lambda text: tell(f"lidarpose: {text}"),
         )
+    # before views read single frames, which count anew
+    source_warnings = [f"{source.name}: {line}" for line in source.warnings]
     if tracks_picture is not None and picture is not None:
         write_atomic(picture, tracks_picture.draw(source, predictor.wanted, title=Path(source.name).name))
     if frames_page is not None and page is not None:
         write_atomic(page, frames_page.render(source, predictor.wanted, title=Path(source.name).name))
     outputs = [str(path) for path in (result, picture, page) if path is not None]
-    _report(options, source, summary, f" -> {' and '.join(outputs)}" if outputs else "")
+    _report(options, source_warnings, summary, f" -> {' and '.join(outputs)}" if outputs else "")
 
 
 def _print_lines(options: argparse.Namespace, source, predictor, on_line: Callable[[dict[str, Any]], None]):
@@ -136,8 +138,7 @@ def _print_lines(options: argparse.Namespace, source, predictor, on_line: Callab
     return summary
 
 
-def _report(options: argparse.Namespace, source, summary, outputs: str) -> None:
-    source_warnings = [f"{source.name}: {line}" for line in source.warnings]
+def _report(options: argparse.Namespace, source_warnings: list[str], summary, outputs: str) -> None:
     if options.world and (num_others := summary.frames - summary.in_world):
         source_warnings.append(
             f"in {num_others:,} of {counted(summary.frames, 'frame')} the sensor's place in the world is not known: "
