@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 from hostile_files import with_changed_bytes
 
+from lidarpose.cli import main
 from lidarpose.errors import InputError
+from lidarpose.inference.background import is_static, learn_background
 from lidarpose.io.sources import DamagedFrame, open_source
 from lidarpose.io.sources.rosbag import decode_cloud
+from lidarpose.recording.predict_recording import predict_recording
 
 rosbags = pytest.importorskip("rosbags", reason="the extra recordings is not installed")
 from rosbags.rosbag1 import Writer as Writer1  # noqa: E402
@@ -239,6 +242,17 @@ def test_topics_are_chosen_and_named(tmp_path, suffix):
     with pytest.raises(InputError, match="no point clouds.*/chatter .*String.*/other") as error:
         open_source(path)
     assert "\n" not in str(error.value)
+
+
+def test_a_background_is_learned_of_the_topic_that_is_read(tmp_path, capsys):
+    messages = clouds(".mcap") + [("/rear", cloud(points_of(9) + 90), START + k * 10**8) for k in range(3)]
+    path = str(write(tmp_path / "two.mcap", messages))
+    assert is_static(points_of(9) + 90, learn_background(path, topic="/rear")).all()
+    frame = next(predict_recording(path, topic="/rear", background=path))
+    assert "all points lie on the background" in str(frame.poses.warnings)
+    words = ["--topic", "/rear", "--background", path, "--out", str(tmp_path / "a.jsonl")]
+    assert main(["predict", path, *words]) == 0
+    assert "all points lie on the background" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".bag"])

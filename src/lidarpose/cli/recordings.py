@@ -84,7 +84,14 @@ def _predict_recording(
         raise InputError(f"expected one folder, or files, got {len(options.source)}: run the command for each folder")
     frames = {name: getattr(options, name) for name in ("columns", "topic", "meta", "rate", "start", "end")}
     source = open_source(options.source, every=1 if options.every is None else options.every, **frames)
-    predictor = FramePredictor(name=source.name, track=options.track, live=options.live, **posing_options)
+    predictor = FramePredictor(
+        name=source.name,
+        topic=options.topic,
+        meta=options.meta,
+        track=options.track,
+        live=options.live,
+        **posing_options,
+    )
     tracks_picture = None if picture is None else TrajectoryPicture(predictor.up)
     frames_page = None if page is None else RecordingPage(predictor.up)
     views = [view for view in (tracks_picture, frames_page) if view is not None]

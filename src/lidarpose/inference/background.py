@@ -29,7 +29,11 @@ _SPAN = 1 << 20
 
 
 def learn_background(
-    scans: "str | os.PathLike | Sequence[str | os.PathLike | ArrayLike]", *, columns: int | None = None
+    scans: "str | os.PathLike | Sequence[str | os.PathLike | ArrayLike]",
+    *,
+    columns: int | None = None,
+    topic: str | None = None,
+    meta: str | os.PathLike | None = None,
 ) -> np.ndarray:
     """The static points of a recording by a sensor that stays where it is, for `background` of `detect` and `predict`.
 
@@ -37,6 +41,7 @@ def learn_background(
         scans: point files or arrays (n, 3) m, in the order of time, or anything that `open_source` takes; of more than
             60 an even choice is read.
         columns: values a row of .bin files, see `read_points`.
+        topic, meta: of recordings, as of `open_source`.
 
     Returns:
         (n, 3) m, in the scans' own frame, where most scans hold points; of one scan, where it does.
@@ -44,7 +49,7 @@ def learn_background(
     Raises:
         InputError: no scans, or one that cannot be read.
     """
-    sources = _sources(scans, columns)
+    sources = _sources(scans, columns, topic, meta)
     grid: _Grid | None = None
     static_voxels, eighths = None, np.zeros(0, np.int64)
     for rows in np.array_split(np.arange(len(sources)), min(_PARTS, len(sources))):
@@ -65,11 +70,13 @@ def learn_background(
     return grid.middles(eighths[np.isin(_packed(_unpacked(eighths) // 2), static_voxels)])
 
 
-def read_background(source: Any, *, columns: int | None = None) -> np.ndarray:
+def read_background(
+    source: Any, *, columns: int | None = None, topic: str | None = None, meta: str | os.PathLike | None = None
+) -> np.ndarray:
     """Static points (n, 3) m of a file or an array of them, or learned from a recording or several scans."""
     if hasattr(source, "shape") or isinstance(source, str | os.PathLike) and is_single_scan(source):
         return _points(source, columns)
-    return learn_background(source, columns=columns)
+    return learn_background(source, columns=columns, topic=topic, meta=meta)
 
 
 def is_static(points: np.ndarray, background: np.ndarray) -> np.ndarray:
@@ -132,14 +139,14 @@ def _unpacked(number: np.ndarray) -> np.ndarray:
     return np.stack([number >> 42, number >> 21 & 0x1FFFFF, number & 0x1FFFFF], -1)
 
 
-def _sources(scans: Any, columns: int | None) -> list:
+def _sources(scans: Any, columns: int | None, topic: str | None, meta: str | os.PathLike | None) -> list:
     """An even choice of scans that `_points` reads."""
     sources = listed(scans)
     if not sources:
         raise InputError("background: expected a file of static points or scans of one recording, got none")
     if not any(isinstance(source, str | os.PathLike) and not is_single_scan(source) for source in sources):
         return [sources[row] for row in evenly_spaced(len(sources), _MOST_SCANS)]
-    recording = open_source(sources, columns=columns).recording
+    recording = open_source(sources, columns=columns, topic=topic, meta=meta).recording
     count = sum(1 for _ in recording.lazy_frames()) if recording.count is None else recording.count
     rows = set(evenly_spaced(count, _MOST_SCANS).tolist())
     return [frame for row, frame in enumerate(recording.lazy_frames()) if row in rows]
