@@ -291,6 +291,31 @@ def test_a_recording_gone_on_with_stays_in_its_world(tmp_path):
         assert places == list(range(first, 40))
 
 
+@pytest.mark.parametrize(
+    "names", [("drive_0.mcap", "drive_1.mcap"), ("a_2024-05-01-10-00-00_0.bag", "a_2024-05-01-10-00-02_1.bag")]
+)
+def test_a_split_recording_without_its_metadata_is_one(tmp_path, names):
+    """Where the sensor is on the vehicle is only in the first file."""
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    for part, name in enumerate(names):
+        suffix = Path(name).suffix
+        messages = clouds(suffix, 20)[10 * part : 10 * part + 10]
+        for k in range(10 * part, 10 * part + 10):
+            time = START + k * 10**8
+            messages.append(("/tf", transform(time, "odom", "base", (k, 0, 0), store=store_of(suffix)), time))
+        if not part:
+            placed = transform(START, "base", "lidar", (0, 0, 2), store=store_of(suffix))
+            messages.append(("/tf_static", placed, START - 1))
+        write(tmp_path / f"{part}{suffix}", sorted(messages, key=lambda message: message[2])).rename(folder / name)
+    for source in (open_source(folder), open_source(str(folder / "*"))):
+        assert [frame.T_world_sensor[0, 3] for frame in source] == list(range(20)) and not source.warnings
+    # an empty part is left out
+    (folder / names[1]).write_bytes(b"")
+    source = open_source(folder)
+    assert len(list(source)) == 10 and "left out: " in source.warnings[0]
+
+
 def test_a_pose_is_none_where_no_chain_is_known(tmp_path):
     gone = ("/tf", transform(START, "map", "base_link", (0, 0, 0)), START)
     far = [("/tf", transform(START + t, "odom", "lidar", (t / 1e9, 0, 0)), START + t) for t in (0, 10**8, 5 * 10**9)]

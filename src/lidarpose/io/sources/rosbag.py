@@ -54,7 +54,6 @@ def open_recording(path: Path, options: ReadingOptions) -> "BagRecording":
         InputError: No such recording, no point clouds in it, or no such topic.
         MissingExtra: Without the library that decodes messages.
     """
-    _decoders()
     files = [path]
     if path.is_dir():
         files = sorted((file for file in path.iterdir() if file.suffix.lower() in _FILES), key=natural_key)
@@ -62,7 +61,13 @@ def open_recording(path: Path, options: ReadingOptions) -> "BagRecording":
             packed_file = next(path.glob("*.zstd"), None)
             remedy = f"; unpack {packed_file.name} first (unzstd)" if packed_file else "; was it copied completely?"
             raise file_error(path, f"expected a recording's {' or '.join(_FILES)} files in this folder{remedy}")
-    return BagRecording(str(path), [_open_file(file) for file in files], options.topic)
+    return open_parts(str(path), files, options)
+
+
+def open_parts(name: str, files: list[Path], options: ReadingOptions) -> "BagRecording":
+    """Opens the files of one recording, which follow each other. Errors are those of `open_recording`."""
+    _decoders()
+    return BagRecording(name, [_open_file(file) for file in files], options.topic)
 
 
 def _open_file(path: Path) -> RecordFile | SqliteFile:
