@@ -9,15 +9,20 @@ import pytest
 from walking_people import FRAMES, boxes_of, moving_source, places_in_world, walking_clouds, world_pose
 
 import lidarpose
+from lidarpose.body.rig import mean_adult_joints
 from lidarpose.cli import main
 from lidarpose.geometry import UP_AXES
 from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.predictor import Predictor
+from lidarpose.inference.results import PersonPose, Poses
+from lidarpose.inference.scan import Scan
 from lidarpose.recording import output, result_files
 from lidarpose.recording.coordinates import FixedFrame
 from lidarpose.recording.known_people import KnownPeople
 from lidarpose.recording.predict_recording import FramePredictor
-from lidarpose.sample import Box
+from lidarpose.recording.steady_tracks import smoothed_lines
+from lidarpose.sample import Box, Pose
+from lidarpose.skeleton import SMPL24
 
 
 @pytest.fixture(scope="module")
@@ -143,6 +148,62 @@ def test_times_that_stand_still_or_jump_back_cost_no_frame(model, tmp_path):
     lines = written(source, tmp_path / "a.jsonl", model, world=True, boxes=boxes_of(FRAMES), track=True)
     assert [line["time"] for line in lines] == times
     assert_where_people_are(lines)
+
+
+def walker(times, rng):
+    """Poses, one a time, of somebody who walks along x, each joint off by 3 cm on an axis."""
+    for time in times:
+        joints = mean_adult_joints() + [1.2 * time, 0, 0] + rng.normal(scale=0.03, size=(24, 3))
+        yield Pose(joints=joints, skeleton=SMPL24, spread=np.full(24, 0.05))
+
+
+def steady_rows(times, damaged=()):
+    """Which frames of somebody at those times smoothing changes."""
+    lines = [
+        {"time": time, "T_world_sensor": None, "error": None, "people": []}
+        | ({"error": "damaged"} if k in damaged else {"people": [{"track": 0} | person_values(pose)]})
+        for k, (time, pose) in enumerate(zip(times, walker(times, np.random.default_rng(0)), strict=True))
+    ]
+    people = [line["people"] for line in smoothed_lines(lambda: iter(lines), "z", SMPL24)]
+    return [k for k in range(len(times)) if people[k] and people[k][0]["joints"] != lines[k]["people"][0]["joints"]]
+
+
+def person_values(pose):
+    return {"joints": pose.joints.tolist(), "spread": pose.spread.tolist(), "visible": [], "confidence": []}
+
+
+def test_times_that_are_wrong_cost_the_smoothing_of_their_frames_alone():
+    times = (np.arange(20) / 10).tolist()
+    rows = list(range(20))
+    assert steady_rows(times) == rows
+    # a damaged frame whose time is another clock's, a good one's, and a clock that begins again
+    wrong = [*times[:9], 1.7e9, *times[10:]]
+    assert steady_rows(wrong, damaged=[9]) == rows[:9] + rows[10:]
+    assert steady_rows(wrong) == steady_rows(times[:10] * 2) == rows
+    # two frames that changed places: one of them stays as it is
+    assert steady_rows([*times[:9], times[10], times[9], *times[11:]]) == rows[:10] + rows[11:]
+
+
+def test_a_late_frame_does_not_end_the_memory_of_live_poses():
+    def live_joints(times):
+        """Of the frames, by their times."""
+        known = KnownPeople(up="z", least_score=0.5, live=True)
+        joints = {}
+        for time, pose in zip(times, walker(times, np.random.default_rng(1)), strict=True):
+            person = PersonPose(pose=pose, skeleton=SMPL24, points=np.zeros((0, 3)), warnings=(), model={})
+            poses = Poses(people=(person,), skeleton=SMPL24, model={})
+            joints[time] = known.update(time, Scan(points=np.zeros((5, 3))), poses, np.eye(4))[0].pose.joints, pose
+        return joints
+
+    times = (np.arange(30) / 10).tolist()
+    joints = live_joints([*times[:20], times[21], times[20], *times[22:]])
+    steady, seen = joints[times[20]]
+    assert np.array_equal(steady, seen.joints)
+    errors = [
+        np.linalg.norm(steady - mean_adult_joints() - [1.2 * time, 0, 0], axis=-1).mean()
+        for time, (steady, _) in joints.items()
+    ]
+    assert np.mean(errors[22:]) < 0.7 * np.linalg.norm(np.full(3, 0.03))
 
 
 # ---- what is known of people

@@ -137,6 +137,22 @@ def test_a_killed_command_goes_on_and_ends_the_same(flag, drive, folder, tracked
     assert not list(folder.glob("killed*.part*"))
 
 
+def test_a_command_stopped_before_its_frames_leaves_nothing_and_after_them_says_what_it_leaves(
+    drive, tmp_path, monkeypatch, capsys
+):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    words = (drive, "--end", 0.1, "--track", "--out", tmp_path / "a.jsonl")
+    for owner, name, is_kept in ((FramePredictor, "_predicted", False), (output, "smoothed_lines", True)):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, stop)
+            run(*words, status=130)
+        assert ("a.jsonl.part, and the same command goes on" in capsys.readouterr().err) is is_kept
+        assert bool(list(tmp_path.iterdir())) is is_kept
+    assert len(run(*words)) == 2
+
+
 def test_lines_of_another_command_are_not_gone_on_with(drive, folder, monkeypatch, capsys):
     def stop(self, *of):
         raise KeyboardInterrupt
@@ -155,7 +171,7 @@ def test_finished_lines_of_other_frames_are_an_error(drive, folder, monkeypatch,
     steps = FramePredictor(crop=True, model=lidarpose.load("tiny", tta=1))
     frame = Frame(points=np.ones((9, 3)), index=0, id="gone", time=0.0)
     with output.PartFile(tmp_path / "a.jsonl", {}) as part:
-        part.append(steps.predict(frame), steps.state())
+        part.append(steps.predict(frame), steps.state(), 0)
         written = part.path.read_bytes()
         # by another process, whatever its command is
         for command in ({}, {"min_score": 0.1}):
@@ -165,6 +181,29 @@ def test_finished_lines_of_other_frames_are_an_error(drive, folder, monkeypatch,
     recording = IndexedRecording(name="made", ids=["here"], times=None, read=lambda i: Sweep(points=np.ones((9, 3))))
     with pytest.raises(InputError, match=r"a.jsonl.part: was made of other frames, the last one gone: remove it"):
         output.write_recording(FrameSource(recording), steps, tmp_path / "a.jsonl", command={})
+
+
+def test_finished_lines_of_points_that_changed_are_an_error(tmp_path, model, monkeypatch):
+    """A folder may have been exported anew under the same names."""
+    crop, predict = np.random.default_rng(0).normal(scale=0.3, size=(99, 3)), FramePredictor._predicted
+
+    def write(points):
+        recording = IndexedRecording(name="made", ids=list("ab"), times=None, read=lambda i: Sweep(points=points))
+        steps = FramePredictor(crop=True, model=model)
+        output.write_recording(FrameSource(recording), steps, tmp_path / "a.jsonl", command={})
+
+    def stop_at_second(self, frame, prepared):
+        if frame.index:
+            raise KeyboardInterrupt
+        return predict(self, frame, prepared)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FramePredictor, "_predicted", stop_at_second)
+        with pytest.raises(KeyboardInterrupt):
+            write(crop)
+    with pytest.raises(InputError, match=r"a.jsonl.part: was made of other frames, the last one a: remove it"):
+        write(crop + 50)
+    write(crop)
 
 
 @pytest.fixture
@@ -446,6 +485,13 @@ def test_the_command_line(drive, folder, tmp_path, monkeypatch, capsys):
     assert (tmp_path / "drive.poses.html").is_file()
 
 
+def test_what_is_wrong_with_a_source_is_said_after_pictures_too(clouds, tmp_path, monkeypatch, capsys):
+    source = moving_source(clouds, times=[0.0, 0.2, 0.1, *np.arange(3, FRAMES) / 10])
+    monkeypatch.setattr("lidarpose.io.sources.open_source", lambda *_, **__: source)
+    assert main(["predict", "made", "--track", "--picture", "--out", str(tmp_path / "a.jsonl")]) == 0
+    assert "warning: moving: time jumps back 1 times" in capsys.readouterr().err
+
+
 def test_a_folder_without_one_readable_scan_is_an_error(tmp_path, capsys):
     for name in "ab":
         (tmp_path / f"{name}.pcd").write_bytes(b"garbage")
@@ -607,7 +653,7 @@ def test_a_full_disk_is_an_error_of_the_file(tmp_path, monkeypatch):
 
         monkeypatch.setattr(output.os, "replace", full)
         with pytest.raises(InputError, match=r"a.jsonl.part: cannot write .*No space left"):
-            part.append(poses, steps.state())
+            part.append(poses, steps.state(), 0)
     assert not list(tmp_path.glob("*.new"))
 
 

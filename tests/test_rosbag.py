@@ -8,9 +8,12 @@ import numpy as np
 import pytest
 from hostile_files import with_changed_bytes
 
+from lidarpose.cli import main
 from lidarpose.errors import InputError
+from lidarpose.inference.background import is_static, learn_background
 from lidarpose.io.sources import DamagedFrame, open_source
 from lidarpose.io.sources.rosbag import decode_cloud
+from lidarpose.recording.predict_recording import predict_recording
 
 rosbags = pytest.importorskip("rosbags", reason="the extra recordings is not installed")
 from rosbags.rosbag1 import Writer as Writer1  # noqa: E402
@@ -241,6 +244,17 @@ def test_topics_are_chosen_and_named(tmp_path, suffix):
     assert "\n" not in str(error.value)
 
 
+def test_a_background_is_learned_of_the_topic_that_is_read(tmp_path, capsys):
+    messages = clouds(".mcap") + [("/rear", cloud(points_of(9) + 90), START + k * 10**8) for k in range(3)]
+    path = str(write(tmp_path / "two.mcap", messages))
+    assert is_static(points_of(9) + 90, learn_background(path, topic="/rear")).all()
+    frame = next(predict_recording(path, topic="/rear", background=path))
+    assert "all points lie on the background" in str(frame.poses.warnings)
+    words = ["--topic", "/rear", "--background", path, "--out", str(tmp_path / "a.jsonl")]
+    assert main(["predict", path, *words]) == 0
+    assert "all points lie on the background" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("suffix", [".mcap", ".bag"])
 def test_sensor_poses_come_from_transforms(tmp_path, suffix):
     """A vehicle that drives along a line and turns; its transforms are recorded after the clouds that they place."""
@@ -263,6 +277,45 @@ def test_sensor_poses_come_from_transforms(tmp_path, suffix):
     assert [frame.index for frame in source.frames(7)] == [7, 8, 9]
 
 
+def test_a_recording_gone_on_with_stays_in_its_world(tmp_path):
+    """`odom` is known from cloud 15 on, when the first was given without a pose; `map`, which is preferred, from 25."""
+    messages = clouds(".mcap", 40)
+    for k in range(15, 40):
+        time = START + k * 10**8
+        messages.append(("/tf", transform(time, "odom", "lidar", (k, 0, 0)), time))
+        if k >= 25:
+            messages.append(("/tf", transform(time, "map", "odom", (1000, 0, 0)), time))
+    path = write(tmp_path / "drive.mcap", sorted(messages, key=lambda message: message[2]))
+    for first in (15, 30):
+        places = [frame.T_world_sensor[0, 3] for frame in open_source(path).frames(first)]
+        assert places == list(range(first, 40))
+
+
+@pytest.mark.parametrize(
+    "names", [("drive_0.mcap", "drive_1.mcap"), ("a_2024-05-01-10-00-00_0.bag", "a_2024-05-01-10-00-02_1.bag")]
+)
+def test_a_split_recording_without_its_metadata_is_one(tmp_path, names):
+    """Where the sensor is on the vehicle is only in the first file."""
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    for part, name in enumerate(names):
+        suffix = Path(name).suffix
+        messages = clouds(suffix, 20)[10 * part : 10 * part + 10]
+        for k in range(10 * part, 10 * part + 10):
+            time = START + k * 10**8
+            messages.append(("/tf", transform(time, "odom", "base", (k, 0, 0), store=store_of(suffix)), time))
+        if not part:
+            placed = transform(START, "base", "lidar", (0, 0, 2), store=store_of(suffix))
+            messages.append(("/tf_static", placed, START - 1))
+        write(tmp_path / f"{part}{suffix}", sorted(messages, key=lambda message: message[2])).rename(folder / name)
+    for source in (open_source(folder), open_source(str(folder / "*"))):
+        assert [frame.T_world_sensor[0, 3] for frame in source] == list(range(20)) and not source.warnings
+    # an empty part is left out
+    (folder / names[1]).write_bytes(b"")
+    source = open_source(folder)
+    assert len(list(source)) == 10 and "left out: " in source.warnings[0]
+
+
 def test_a_pose_is_none_where_no_chain_is_known(tmp_path):
     gone = ("/tf", transform(START, "map", "base_link", (0, 0, 0)), START)
     far = [("/tf", transform(START + t, "odom", "lidar", (t / 1e9, 0, 0)), START + t) for t in (0, 10**8, 5 * 10**9)]
@@ -279,6 +332,11 @@ def test_a_pose_is_none_where_no_chain_is_known(tmp_path):
         poses = [frame.T_world_sensor for frame in source]
         assert [pose is not None for pose in poses] == [i < num_posed for i in range(6)]
         assert len(source.warnings) == (num_posed > 0)
+
+    # clouds that do not say in which frame they are
+    nameless = [("/p", cloud(points_of(k), stamp=START + k, frame=""), START + k) for k in range(2)]
+    source = open_source(write(tmp_path / "nameless.mcap", nameless))
+    assert [frame.T_world_sensor for frame in source] == [None, None] and not source.warnings
 
     # a cloud that is in the world already; where the sensor was is not known
     (frame,) = open_source(write(tmp_path / "map.mcap", [("/p", cloud(points_of(1), frame="/map"), START)]))
@@ -340,6 +398,23 @@ def test_clouds_that_do_not_fit_their_layout_are_damaged_frames(tmp_path):
     *damaged, last = open_source(write(tmp_path / "a.db3", messages))
     assert all(isinstance(frame, DamagedFrame) and "\n" not in frame.error for frame in damaged) and len(damaged) == 5
     assert np.array_equal(last.points, points_of(0))
+
+
+def test_a_damaged_message_keeps_its_time_among_stamps_of_another_clock(tmp_path):
+    """Sensors whose clock began when they were switched on."""
+    boot = [("/points", cloud(points_of(k), stamp=5 * 10**9 + k * 10**8), START + k * 10**8) for k in range(8)]
+    path = write(tmp_path / "a.mcap", boot)
+    data = path.read_bytes()
+    at = -1
+    for _ in range(4):
+        at = data.index(b"lidar\0", at + 1)
+    # the length of the name of its frame
+    path.write_bytes(data[: at - 4] + b"\xff\xff\xff\x7f" + data[at:])
+    source = open_source(path, end=0.5)
+    frames = list(source)
+    assert [isinstance(frame, DamagedFrame) for frame in frames] == [k == 3 for k in range(6)]
+    np.testing.assert_allclose([frame.time for frame in frames], 5 + np.arange(6) / 10)
+    assert not source.warnings
 
 
 def test_a_chunk_that_would_unpack_to_more_than_it_may_is_left_out(tmp_path):

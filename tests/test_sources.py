@@ -336,6 +336,33 @@ def test_background_is_learned_of_any_source(tmp_path, monkeypatch):
     assert np.array_equal(read_background(tmp_path), some) and not np.array_equal(some, expected)
 
 
+def test_a_background_is_learned_without_what_is_damaged(tmp_path, monkeypatch):
+    wall = np.random.default_rng(0).uniform((5, -3, 0), (5.01, 3, 3), (4000, 3))
+    for k in range(5):
+        np.save(tmp_path / f"{k}.npy", wall)
+    (tmp_path / "3.npy").write_bytes(b"damaged")
+    whole = learn_background([tmp_path / f"{k}.npy" for k in (0, 1, 2, 4)])
+    with pytest.warns(UserWarning, match=r"background: 1 of 5 scans left out, the first: .*3.npy: "):
+        assert np.array_equal(read_background(tmp_path), whole)
+
+    class Cut(IndexedRecording):
+        count = None
+
+        def lazy_frames(self, first=0):
+            yield from super().lazy_frames(first)
+            raise InputError("a.pcap: is cut off")
+
+    cut = FrameSource(Cut(name="a.pcap", ids=["0", "1"], times=None, read=lambda i: Sweep(points=wall)))
+    monkeypatch.setattr("lidarpose.inference.background.open_source", lambda *_, **__: cut)
+    with pytest.warns(UserWarning, match="1 of 3 scans left out, the first: a.pcap: is cut off"):
+        assert np.array_equal(read_background("a.pcap"), whole)
+    monkeypatch.undo()
+    for k in range(5):
+        (tmp_path / f"{k}.npy").write_bytes(b"damaged")
+    with pytest.raises(InputError, match="background: of 5 scans none can be read, the first: .*0.npy: "):
+        read_background(tmp_path)
+
+
 # ---- datasets
 
 LANDMARKS = np.random.default_rng(3).uniform(-30, 30, (200, 3)) * (1, 1, 0.1)

@@ -86,7 +86,14 @@ def _predict_recording(
         raise InputError(f"expected one folder, or files, got {len(options.source)}: run the command for each folder")
     frames = {name: getattr(options, name) for name in ("columns", "topic", "meta", "rate", "start", "end")}
     source = open_source(options.source, every=1 if options.every is None else options.every, **frames)
-    predictor = FramePredictor(name=source.name, track=options.track, live=options.live, **posing_options)
+    predictor = FramePredictor(
+        name=source.name,
+        topic=options.topic,
+        meta=options.meta,
+        track=options.track,
+        live=options.live,
+        **posing_options,
+    )
     tracks_picture = None if picture is None else TrajectoryPicture(predictor.up)
     frames_page = None if page is None else RecordingPage(predictor.up)
     views = [view for view in (tracks_picture, frames_page) if view is not None]
@@ -107,12 +114,14 @@ def _predict_recording(
             on_line=on_line,
             tell=lambda text: tell(f"lidarpose: {text}"),
         )
+    # before views read single frames, which count anew
+    source_warnings = [f"{source.name}: {line}" for line in source.warnings]
     if tracks_picture is not None and picture is not None:
         write_atomic(picture, tracks_picture.draw(source, predictor.wanted, title=Path(source.name).name))
     if frames_page is not None and page is not None:
         write_atomic(page, frames_page.render(source, predictor.wanted, title=Path(source.name).name))
     outputs = [str(path) for path in (result, picture, page) if path is not None]
-    _report(options, source, summary, f" -> {' and '.join(outputs)}" if outputs else "")
+    _report(options, source_warnings, summary, f" -> {' and '.join(outputs)}" if outputs else "")
 
 
 def _print_lines(options: argparse.Namespace, source, predictor, on_line: Callable[[dict[str, Any]], None]):
@@ -138,8 +147,7 @@ def _print_lines(options: argparse.Namespace, source, predictor, on_line: Callab
     return summary
 
 
-def _report(options: argparse.Namespace, source, summary, outputs: str) -> None:
-    source_warnings = [f"{source.name}: {line}" for line in source.warnings]
+def _report(options: argparse.Namespace, source_warnings: list[str], summary, outputs: str) -> None:
     if options.world and (num_others := summary.frames - summary.in_world):
         source_warnings.append(
             f"in {num_others:,} of {counted(summary.frames, 'frame')} the sensor's place in the world is not known: "

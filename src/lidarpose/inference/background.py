@@ -1,18 +1,19 @@
 """What stands still about a sensor that stays where it is, learned from a recording, so that it is not searched."""
 
 import os
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lidarpose.arrays import evenly_spaced
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, counted
 from lidarpose.inference.inputs import as_points, only_returns
 from lidarpose.io.files import FormatError, file_error, listed
 from lidarpose.io.point_cloud import read_points
 from lidarpose.io.sources import is_single_scan, open_source
-from lidarpose.io.sources.frame import LazyFrame
+from lidarpose.io.sources.frame import ChainedRecording, LazyFrame
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -29,47 +30,71 @@ _SPAN = 1 << 20
 
 
 def learn_background(
-    scans: "str | os.PathLike | Sequence[str | os.PathLike | ArrayLike]", *, columns: int | None = None
+    scans: "str | os.PathLike | Sequence[str | os.PathLike | ArrayLike]",
+    *,
+    columns: int | None = None,
+    topic: str | None = None,
+    meta: str | os.PathLike | None = None,
 ) -> np.ndarray:
     """The static points of a recording by a sensor that stays where it is, for `background` of `detect` and `predict`.
+
+    Damaged scans of a recording or folder are left out, with a warning.
 
     Args:
         scans: point files or arrays (n, 3) m, in the order of time, or anything that `open_source` takes; of more than
             60 an even choice is read.
         columns: values a row of .bin files, see `read_points`.
+        topic, meta: of recordings, as of `open_source`.
 
     Returns:
         (n, 3) m, in the scans' own frame, where most scans hold points; of one scan, where it does.
 
     Raises:
-        InputError: no scans, or one that cannot be read.
+        InputError: no scans, none that can be read, or a file among several that cannot.
     """
-    sources = _sources(scans, columns)
+    sources = _sources(scans, columns, topic, meta)
     grid: _Grid | None = None
+    problems: list[InputError] = []
     static_voxels, eighths = None, np.zeros(0, np.int64)
     for rows in np.array_split(np.arange(len(sources)), min(_PARTS, len(sources))):
-        voxels, counts = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        voxels, counts, num_read = np.zeros(0, np.int64), np.zeros(0, np.int64), 0
         for row in rows:
-            points = _points(sources[row], columns)
+            try:
+                points = _points(sources[row], columns)
+            except InputError as problem:
+                # what is given scan by scan has to be right
+                if not isinstance(sources[row], LazyFrame):
+                    raise
+                problems.append(problem)
+                continue
+            num_read += 1
             grid = grid or _Grid(points)
             scan_eighths = grid.eighths(points)
             eighths = _ascending(np.concatenate([eighths, scan_eighths]))
             voxels, counts = _counted(voxels, counts, grid.voxels(scan_eighths))
-        frequent_voxels = voxels[counts >= _SHARE * len(rows)]
+        if not num_read:
+            continue
+        frequent_voxels = voxels[counts >= _SHARE * num_read]
         static_voxels = (
             frequent_voxels
             if static_voxels is None
             else np.intersect1d(static_voxels, frequent_voxels, assume_unique=True)
         )
-    assert grid is not None and static_voxels is not None
+    if grid is None or static_voxels is None:
+        raise InputError(f"background: of {counted(len(sources), 'scan')} none can be read, the first: {problems[0]}")
+    if problems:
+        left_out = f"{len(problems)} of {counted(len(sources), 'scan')} left out"
+        warnings.warn(f"background: {left_out}, the first: {problems[0]}", stacklevel=2)
     return grid.middles(eighths[np.isin(_packed(_unpacked(eighths) // 2), static_voxels)])
 
 
-def read_background(source: Any, *, columns: int | None = None) -> np.ndarray:
+def read_background(
+    source: Any, *, columns: int | None = None, topic: str | None = None, meta: str | os.PathLike | None = None
+) -> np.ndarray:
     """Static points (n, 3) m of a file or an array of them, or learned from a recording or several scans."""
     if hasattr(source, "shape") or isinstance(source, str | os.PathLike) and is_single_scan(source):
         return _points(source, columns)
-    return learn_background(source, columns=columns)
+    return learn_background(source, columns=columns, topic=topic, meta=meta)
 
 
 def is_static(points: np.ndarray, background: np.ndarray) -> np.ndarray:
@@ -132,14 +157,16 @@ def _unpacked(number: np.ndarray) -> np.ndarray:
     return np.stack([number >> 42, number >> 21 & 0x1FFFFF, number & 0x1FFFFF], -1)
 
 
-def _sources(scans: Any, columns: int | None) -> list:
+def _sources(scans: Any, columns: int | None, topic: str | None, meta: str | os.PathLike | None) -> list:
     """An even choice of scans that `_points` reads."""
     sources = listed(scans)
     if not sources:
         raise InputError("background: expected a file of static points or scans of one recording, got none")
     if not any(isinstance(source, str | os.PathLike) and not is_single_scan(source) for source in sources):
         return [sources[row] for row in evenly_spaced(len(sources), _MOST_SCANS)]
-    recording = open_source(sources, columns=columns).recording
+    recording = open_source(sources, columns=columns, topic=topic, meta=meta).recording
+    # which makes a damaged frame of where it is cut off
+    recording = ChainedRecording(recording.name, [recording])
     count = sum(1 for _ in recording.lazy_frames()) if recording.count is None else recording.count
     rows = set(evenly_spaced(count, _MOST_SCANS).tolist())
     return [frame for row, frame in enumerate(recording.lazy_frames()) if row in rows]

@@ -111,12 +111,20 @@ def detect(
 
 
 def search_options(
-    min_score: float | None, max_range: float | None, max_people: int | None, background: Any, columns: int | None
+    min_score: float | None,
+    max_range: float | None,
+    max_people: int | None,
+    background: Any,
+    columns: int | None,
+    topic: str | None = None,
+    meta: str | os.PathLike | None = None,
 ) -> Search:
     """A search with its background read; max_range None: the default. Raises InputError."""
     max_range = MAX_RANGE if max_range is None else max_range
     search = Search(max_range=max_range, min_score=min_score, max_people=max_people)
-    return search if background is None else replace(search, background=read_background(background, columns=columns))
+    if background is None:
+        return search
+    return replace(search, background=read_background(background, columns=columns, topic=topic, meta=meta))
 
 
 def find_people(scan: Scan, search: Search) -> Scan:

@@ -12,6 +12,7 @@ from lidarpose.inference.scan import Scan
 from lidarpose.recording.coordinates import FixedFrame, moved_yaw
 from lidarpose.sample import Box, Pose
 from lidarpose.tracking.live import LiveFilter
+from lidarpose.tracking.smoothing import MAX_LATE
 from lidarpose.tracking.tracker import Tracker, TrackState
 
 # a known person is verified anew after so many seconds, and a place that held nobody looked at: between the two, so
@@ -137,15 +138,17 @@ class KnownPeople:
         """Poses by the past of their tracks."""
         T_sensor_fixed = inverse_transform(T_fixed_sensor)
         gap = self._tracker.max_gap
-        self._filters = {id: entry for id, entry in self._filters.items() if 0 <= time - entry[0] <= gap}
+        self._filters = {id: entry for id, entry in self._filters.items() if -MAX_LATE <= time - entry[0] <= gap}
         steady_people = []
         for person in people:
             if person.pose is not None and isinstance(person.id, int):
-                _, live_filter = self._filters.get(person.id) or (time, LiveFilter(person.skeleton))
-                joints = transform_points(T_fixed_sensor, person.pose.joints)
-                pose = cast(Pose, live_filter.update(time, replace(person.pose, joints=joints)))
-                self._filters[person.id] = time, live_filter
-                person = replace(person, pose=replace(pose, joints=transform_points(T_sensor_fixed, pose.joints)))
+                latest_time, live_filter = self._filters.get(person.id) or (time, LiveFilter(person.skeleton))
+                # a frame that comes late stays as it is
+                if time >= latest_time:
+                    joints = transform_points(T_fixed_sensor, person.pose.joints)
+                    pose = cast(Pose, live_filter.update(time, replace(person.pose, joints=joints)))
+                    self._filters[person.id] = time, live_filter
+                    person = replace(person, pose=replace(pose, joints=transform_points(T_sensor_fixed, pose.joints)))
             steady_people.append(person)
         return tuple(steady_people)
 

@@ -13,10 +13,11 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
+from zlib import crc32
 
 from lidarpose.errors import InputError, counted
 from lidarpose.io.files import check_writable, file_error, write_error
-from lidarpose.io.sources import Source
+from lidarpose.io.sources import DamagedFrame, Frame, Source
 from lidarpose.progress import Progress
 from lidarpose.recording.coordinates import in_world
 from lidarpose.recording.predict_recording import FramePoses, FramePredictor
@@ -42,10 +43,10 @@ class PartFile:
         self.path = result.with_name(result.name + ".part")
         self.state_path = result.with_name(result.name + ".part.json")
         self.command = json.loads(json.dumps(command))
-        # what was found: frames that are finished, the last one's index and id, the predictor's state, and, where it is
-        # of another command, what differs
+        # what was found: frames that are finished, the last one's index, id and digest, the predictor's state, and,
+        # where it is of another command, what differs
         self.frames = 0
-        self.last: tuple[int, str] | None = None
+        self.last: tuple[int, str, int] | None = None
         self.state: dict[str, Any] | None = None
         self.other: list[str] = []
         check_writable(self.path)
@@ -66,7 +67,7 @@ class PartFile:
         try:
             content = json.loads(self.state_path.read_bytes())
             command, size, frames, state = (content[name] for name in ("command", "bytes", "frames", "state"))
-            index, id = content["last"]
+            index, id, digest = content["last"]
             # a power cut may leave the state of lines that are not there
             is_whole = self._last_line(size) == (frames, index, id)
             if not (is_whole and isinstance(command, dict) and isinstance(state, dict)):
@@ -77,7 +78,7 @@ class PartFile:
             names = [*self.command, *command]
             self.other = sorted({name for name in names if command.get(name) != self.command.get(name)})
             return 0
-        self.frames, self.last, self.state = frames, (index, id), state
+        self.frames, self.last, self.state = frames, (index, id, digest), state
         return size
 
     def _last_line(self, size: int) -> tuple[int, int, str]:
@@ -98,9 +99,10 @@ class PartFile:
     def __exit__(self, *_: object) -> None:
         self._file.close()
 
-    def append(self, frame: FramePoses, state: dict[str, Any]) -> None:
-        """One more finished frame. A kill in between costs this frame: lines without their state are cut off."""
-        self.frames, self.last, self.state = self.frames + 1, (frame.index, frame.id), state
+    def append(self, frame: FramePoses, state: dict[str, Any], digest: int) -> None:
+        """One more finished frame; digest: of its points. A kill in between costs this frame: lines without their state
+        are cut off."""
+        self.frames, self.last, self.state = self.frames + 1, (frame.index, frame.id, digest), state
         temporary = self.state_path.with_name(self.state_path.name + ".new")
         try:
             self._file.write(json.dumps(frame.to_dict()).encode() + b"\n")
@@ -231,25 +233,27 @@ def write_recording(
             tell(f"{part.frames:,} frames are in {part.path}: going on")
         try:
             _add_frames(source, predictor, part)
+            if not any(line["error"] is None for line in part.lines()):
+                error = next((line["error"] for line in part.lines()), None)
+                part.remove()
+                raise nothing_read(source.name, part.frames, error)
+            is_smoothed = predictor.is_tracked and not predictor.live
+            lines = smoothed_lines(part.lines, predictor.up, predictor.wanted) if is_smoothed else part.lines()
+
+            def final() -> Iterator[dict[str, Any]]:
+                for line in lines:
+                    line = in_world(line, predictor.up) if world else line
+                    summary.add(line)
+                    if on_line is not None:
+                        on_line(line)
+                    yield line
+
+            write_result(result, final())
         except KeyboardInterrupt:
+            if not part.frames:
+                part.remove()
             place = f"the finished frames are in {part.path}, and the same command goes on"
             raise KeyboardInterrupt(f"stopped: {place}" if part.frames else "stopped") from None
-        if not any(line["error"] is None for line in part.lines()):
-            error = next((line["error"] for line in part.lines()), None)
-            part.remove()
-            raise nothing_read(source.name, part.frames, error)
-        is_smoothed = predictor.is_tracked and not predictor.live
-        lines = smoothed_lines(part.lines, predictor.up, predictor.wanted) if is_smoothed else part.lines()
-
-        def final() -> Iterator[dict[str, Any]]:
-            for line in lines:
-                line = in_world(line, predictor.up) if world else line
-                summary.add(line)
-                if on_line is not None:
-                    on_line(line)
-                yield line
-
-        write_result(result, final())
         part.remove()
     return summary
 
@@ -264,16 +268,27 @@ def nothing_read(name: str, frames: int, first_error: str | None) -> InputError:
 def _add_frames(source: Source, predictor: FramePredictor, part: PartFile) -> None:
     """Poses the frames that are not in the part yet."""
     frames = source.frames()
-    frame = None
     if part.state is not None and part.last is not None:
         predictor.restore(part.state)
-        index, id = part.last
+        index, id, digest = part.last
         frames = source.frames(index)
         frame = next(frames, None)
-        if frame is None or (frame.index, frame.id) != (index, id):
+        if frame is None or (frame.index, frame.id, _digest(frame)) != (index, id, digest):
             raise file_error(part.path, f"was made of other frames, the last one {id}: remove it to begin anew")
+    digests: dict[int, int] = {}
+
+    def noted_frames() -> Iterator[Frame | DamagedFrame]:
+        for frame in frames:
+            digests[frame.index] = _digest(frame)
+            yield frame
+
     with Progress(source.count, unit="frames", done=part.frames) as bar:
-        for frame_poses in predictor.predict_all(frames):
-            part.append(frame_poses, predictor.state())
+        for frame_poses in predictor.predict_all(noted_frames()):
+            part.append(frame_poses, predictor.state(), digests.pop(frame_poses.index))
             bar.update(part.frames)
-    predictor.check_boxes(part.last)
+    predictor.check_boxes(part.last and part.last[:2])
+
+
+def _digest(frame: Frame | DamagedFrame) -> int:
+    """By which a frame is known again; 0 of a damaged one."""
+    return crc32(frame.points.tobytes()) if isinstance(frame, Frame) else 0

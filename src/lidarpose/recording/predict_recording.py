@@ -118,7 +118,8 @@ def predict_recording(
     if not (hasattr(source, "frames") and hasattr(source, "name")):
         source_options: dict[str, Any] = {"topic": topic, "meta": meta, "rate": rate, "start": start, "end": end}
         source = open_source(source, columns=columns, every=every, **source_options)
-    return FramePredictor(columns=columns, name=source.name, **posing).predict_all(source.frames())
+    predictor = FramePredictor(columns=columns, topic=topic, meta=meta, name=source.name, **posing)
+    return predictor.predict_all(source.frames())
 
 
 class FramePredictor:
@@ -144,6 +145,8 @@ class FramePredictor:
         skeleton: str | None = None,
         up: str | Sequence[float] = "z",
         columns: int | None = None,
+        topic: str | None = None,
+        meta: str | os.PathLike | None = None,
         track: bool = False,
         live: bool = False,
         model: "Predictor | str | os.PathLike | Callable[[], Predictor]" = DEFAULT,
@@ -160,7 +163,7 @@ class FramePredictor:
         self._is_crop = True if crop else False if is_searched or boxes is not None else None
         # whether any frame was searched
         self._was_searched = False
-        self._search = search_options(*search_arguments, columns)
+        self._search = search_options(*search_arguments, columns, topic, meta)
         self._model = model
         self._loaded: Predictor | None = None
         self.live, self.people = live, None

@@ -10,7 +10,7 @@ from lidarpose.recording.coordinates import FixedFrame, rounded_points
 from lidarpose.sample import Pose
 from lidarpose.skeleton import Skeleton
 from lidarpose.tracking.clip import TrackPoses
-from lidarpose.tracking.smoothing import smooth
+from lidarpose.tracking.smoothing import MAX_LATE, smooth
 
 # what is smoothed besides the joints, and its decimals
 _SMOOTHED = {"spread": 4, "visible": 3, "confidence": 3}
@@ -28,14 +28,13 @@ def smoothed_lines(
     """
     times: list[float] = []
     to_fixed: list[np.ndarray] = []
-    is_damaged: list[bool] = []
     # by track and row of the lines, in the fixed frame
     tracks: dict[int, dict[int, Pose]] = {}
     fixed = FixedFrame(up)
     for row, line in enumerate(lines()):
         to_fixed.append(fixed.from_sensor(line["T_world_sensor"]))
-        times.append(np.nan if line["time"] is None else line["time"])
-        is_damaged.append(line["error"] is not None)
+        # nobody is in a damaged frame, nor is its time always right
+        times.append(np.nan if line["time"] is None or line["error"] is not None else line["time"])
         for person in line["people"]:
             if person["joints"] is not None:
                 joints = transform_points(to_fixed[-1], np.array(person["joints"]))
@@ -47,8 +46,7 @@ def smoothed_lines(
     steady_poses: list[dict[int, tuple[Pose, bool]]] = [{} for _ in times]
     for id in list(tracks):
         for row, pose, is_filled in _steady(tracks.pop(id), np.array(times)):
-            if not is_damaged[row]:
-                steady_poses[row][id] = pose, is_filled
+            steady_poses[row][id] = pose, is_filled
     for line, people, T_fixed_sensor in zip(lines(), steady_poses, to_fixed, strict=True):
         T_sensor_fixed = inverse_transform(T_fixed_sensor)
         entries = {id: _entry(pose, T_sensor_fixed) | {"filled": is_filled} for id, (pose, is_filled) in people.items()}
@@ -59,14 +57,16 @@ def smoothed_lines(
 def _steady(poses: dict[int, Pose], times: np.ndarray) -> Iterator[tuple[int, Pose, bool]]:
     """The smoothed poses of a track by row, first to last, and whether each was filled in. times: s, of all rows."""
     rows = np.arange(min(poses), max(poses) + 1)
-    # time that stands still or jumps back cannot be smoothed over: such frames stay as they are
-    latest_times = np.maximum.accumulate(np.concatenate([[-np.inf], np.nan_to_num(times[rows], nan=-np.inf)]))[:-1]
-    rows = rows[times[rows] > latest_times]
+    rows = rows[np.isfinite(times[rows])]
     skeleton = next(iter(poses.values())).skeleton
-    track = smooth(TrackPoses.of_poses(times[rows], [poses.get(row) for row in rows.tolist()], skeleton))
-    for i, row in enumerate(rows.tolist()):
-        if (pose := track.pose(i)) is not None:
-            yield row, pose, row not in poses
+    # where the clock was set back, what follows is smoothed by itself
+    for run in np.split(rows, np.flatnonzero(np.diff(times[rows]) < -MAX_LATE) + 1):
+        # frames that come late, or at the time of another, stay as they are
+        run = run[times[run] > np.maximum.accumulate(np.concatenate([[-np.inf], times[run]]))[:-1]]
+        track = smooth(TrackPoses.of_poses(times[run], [poses.get(row) for row in run.tolist()], skeleton))
+        for i, row in enumerate(run.tolist()):
+            if (pose := track.pose(i)) is not None:
+                yield row, pose, row not in poses
 
 
 def _entry(pose: Pose, T_sensor_fixed: np.ndarray) -> dict[str, Any]:

@@ -27,6 +27,8 @@ _PATH, _COMMON = 2.5, 0.8
 LEAST_FRAMES = 3
 # longer gaps, and what is before and after a track, are filled in next to seen frames only, s
 MAX_GAP, _MAX_BEYOND = 2.0, 0.5
+# a frame up to so much earlier than the one before, s, comes late; earlier ones say that the clock was set back
+MAX_LATE = 0.3
 # after so long, s, nothing is known of the motion before; variances of longer steps are beyond what floats resolve
 _LONGEST_STEP = 60.0
 

@@ -6,7 +6,9 @@ one at a time when a `FrameSource` asks for them.
 
 import glob
 import os
+import re
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 
@@ -30,6 +32,8 @@ __all__ = ["RECORDINGS", "DamagedFrame", "Frame", "FrameSource", "Source", "is_s
 
 # of `RECORDINGS`, the module whose `open_recording(path, options)` reads it
 _READERS = {".mcap": "rosbag", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "ouster", ".pcapng": "ouster"}
+# when a part of a ROS 1 recording began
+_DATE = re.compile(r"_\d{4}(-\d\d){5}(?=_\d+\.bag$)")
 
 
 def open_source(
@@ -109,7 +113,12 @@ def _open_all(name: str, paths: Sequence[Path], options: ReadingOptions) -> Reco
     files = [path for path in paths if path.is_file() and path.suffix.lower() not in RECORDINGS]
     parts: list[Recording] = [open_files(name, files, options)] if files else []
     problems: list[InputError] = []
-    for path in sorted(set(paths) - set(files), key=natural_key):
+    recordings = sorted(set(paths) - set(files), key=natural_key)
+    if not files and _are_parts(recordings):
+        # a part that is damaged is left out below
+        with suppress(InputError):
+            return import_module("lidarpose.io.sources.rosbag").open_parts(name, recordings, options)
+    for path in recordings:
         try:
             parts.append(_open_folder(path, options) if path.is_dir() else _open_recording(path, options))
         except InputError as problem:
@@ -119,6 +128,15 @@ def _open_all(name: str, paths: Sequence[Path], options: ReadingOptions) -> Reco
     if len(parts) == 1 and not problems:
         return parts[0]
     return ChainedRecording(name, parts, [f"left out: {problem}" for problem in problems])
+
+
+def _are_parts(paths: Sequence[Path]) -> bool:
+    """Whether they are one ROS recording that its recorder split: NAME_0, NAME_1, and so on."""
+    if len(paths) < 2 or _READERS.get(suffix := paths[0].suffix) != "rosbag":
+        return False
+    names = [_DATE.sub("", str(path)) for path in paths]
+    first_name = names[0].removesuffix(f"_0{suffix}")
+    return names == [f"{first_name}_{k}{suffix}" for k in range(len(names))]
 
 
 def _open_folder(folder: Path, options: ReadingOptions) -> Recording:

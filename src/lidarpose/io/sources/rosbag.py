@@ -8,6 +8,7 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterator
 from functools import cache, partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,6 @@ def open_recording(path: Path, options: ReadingOptions) -> "BagRecording":
         InputError: No such recording, no point clouds in it, or no such topic.
         MissingExtra: Without the library that decodes messages.
     """
-    _decoders()
     files = [path]
     if path.is_dir():
         files = sorted((file for file in path.iterdir() if file.suffix.lower() in _FILES), key=natural_key)
@@ -61,7 +61,13 @@ def open_recording(path: Path, options: ReadingOptions) -> "BagRecording":
             packed_file = next(path.glob("*.zstd"), None)
             remedy = f"; unpack {packed_file.name} first (unzstd)" if packed_file else "; was it copied completely?"
             raise file_error(path, f"expected a recording's {' or '.join(_FILES)} files in this folder{remedy}")
-    return BagRecording(str(path), [_open_file(file) for file in files], options.topic)
+    return open_parts(str(path), files, options)
+
+
+def open_parts(name: str, files: list[Path], options: ReadingOptions) -> "BagRecording":
+    """Opens the files of one recording, which follow each other. Errors are those of `open_recording`."""
+    _decoders()
+    return BagRecording(name, [_open_file(file) for file in files], options.topic)
 
 
 def _open_file(path: Path) -> RecordFile | SqliteFile:
@@ -136,16 +142,19 @@ class BagRecording:
         return lines
 
     def lazy_frames(self, first: int = 0) -> Iterator[LazyFrame]:
+        # clouds before the first are placed too: the world is chosen by them
+        return islice(self._all_frames(), first, None)
+
+    def _all_frames(self) -> Iterator[LazyFrame]:
         self._num_frames = self._num_posed = 0
         transforms = TransformTree()
         # clouds that wait for the pose of their sensor
         pending_clouds: deque[_Cloud] = deque()
-        index = 0
+        index = delay = 0
         for message in self._messages():
             if message.topic == self.topic:
-                if index >= first:
-                    pending_clouds.append(_Cloud(index, message, self._decode(message)))
-                index += 1
+                pending_clouds.append(_Cloud(index, message, self._decode(message), delay))
+                index, delay = index + 1, pending_clouds[-1].recorded - pending_clouds[-1].stamp
             else:
                 transforms.add(self._decode(message), is_static=message.topic.endswith("_static"))
             while pending_clouds:
@@ -186,7 +195,7 @@ class BagRecording:
             available_worlds = [world for world in _WORLDS if world in poses]
             if available_worlds and (is_last or available_worlds[0] == _WORLDS[0]):
                 self._world = available_worlds[0]
-        return poses.get(self._world or "")
+        return None if self._world is None else poses.get(self._world)
 
     def _frame(self, cloud: "_Cloud", T_world_sensor: np.ndarray | None) -> LazyFrame:
         self._has_stamps &= cloud.has_stamp
@@ -197,9 +206,9 @@ class BagRecording:
 
 class _Cloud:
     """A message with a cloud: recorded and stamp, ns, when it was recorded and when it was measured, as far as its
-    header tells."""
+    header tells; of a damaged message, `delay` ns before it was recorded, as the one before."""
 
-    def __init__(self, index: int, message: Message, content: Any):
+    def __init__(self, index: int, message: Message, content: Any, delay: int):
         self.index = index
         self.recorded = message.time
         self.content = content
@@ -207,7 +216,7 @@ class _Cloud:
         self.frame_id = header.frame_id.lstrip("/") if header else ""
         stamp = header.stamp.sec * 10**9 + header.stamp.nanosec if header else 0
         self.has_stamp = stamp > 0 or header is None
-        self.stamp = stamp if stamp > 0 else message.time
+        self.stamp = stamp if stamp > 0 else message.time - (0 if header else delay)
 
     def decode(self, T_world_sensor: np.ndarray | None) -> Sweep:
         if self.content is None:
