@@ -365,6 +365,22 @@ def test_missed_people_are_drawn(tmp_path, monkeypatch):
     assert {row["value"] for row in rows if row["figure"] == "recall"} <= {0, None}
 
 
+def test_labels_are_taken_by_their_whole_names(tmp_path):
+    on_foot = "PEDESTRIAN human.pedestrian.police_officer TYPE_PEDESTRIAN Person_sitting OFFICIAL_SIGNALER".split()
+    mounted = ["BICYCLIST", "WHEELED_RIDER", "human.pedestrian.wheelchair", "Cyclist"]
+    neither = ["STROLLER", "human.pedestrian.stroller", "vehicle.bicycle", "MOTORCYCLE", "static_object.bicycle_rack"]
+    absent = ["MOBILE_PEDESTRIAN_CROSSING_SIGN", "vehicle.car", "BOLLARD", "bus driver"]
+    names = [*absent, *on_foot, *mounted, *neither]
+    people = [{"center": [3 * k, 0, 0], "size": SIZE, "category": name} for k, name in enumerate(names)]
+    np.save(tmp_path / "a.npy", np.zeros((1, 3), np.float32))
+    (tmp_path / "a.json").write_text(json.dumps({"people": people}))
+    own = labeled_scans(tmp_path).loaders[0]()
+    assert [box.center[0] / 3 for box in own.boxes] == list(range(len(absent), len(names)))
+    shares = len(on_foot), len(mounted), len(neither)
+    assert own.is_person.tolist() == np.repeat([True, True, False], shares).tolist()
+    assert own.mounted.tolist() == np.repeat([False, True, False], shares).tolist()
+
+
 @pytest.mark.parametrize(
     "arguments, message",
     [
