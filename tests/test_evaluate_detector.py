@@ -256,6 +256,19 @@ def test_poses_in_found_boxes_are_compared_with_those_in_labeled_boxes():
     assert [row["value"] for row in values] == pytest.approx([30, 0, 30]) and values[0]["count"] == 1
 
 
+def test_poses_are_not_told_where_an_unknown_sensor_stands():
+    origins = []
+
+    def predict(points, *, boxes, sensor_origin, skeleton):
+        origins.append(sensor_origin)
+        return [SimpleNamespace(has_pose=True, joints=np.zeros((15, 3))) for _ in boxes]
+
+    scans = scan_set([scan([5], joints=np.zeros((1, 26, 3)))])
+    predictor = SimpleNamespace(predict=predict)
+    score_detector(answers([(5, 0.9)]), scans, predictor=predictor, sensor_unknown=True)
+    assert origins == ["unknown"] * 2
+
+
 def test_nobody_to_find_is_an_error():
     with pytest.raises(InputError, match="made has nobody of 10 points and more within 3 m"):
         score_detector(answers([]), scan_set([scan([5])]), max_range=3.0)

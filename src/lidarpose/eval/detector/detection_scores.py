@@ -184,10 +184,11 @@ def score_detector(
     progress(0, len(scans.loaders))
     for number, load in enumerate(scans.loaders):
         scan = load()
-        boxes, scores = detect(scan.points, None if sensor_unknown else scan.origin)
+        origin = None if sensor_unknown else scan.origin
+        boxes, scores = detect(scan.points, origin)
         people, detections = score_scan(number, scan, boxes, np.asarray(scores, float), max_range=max_range)
         if predictor is not None and scan.joints is not None:
-            people = people.assign(**_pose_errors(people, scan, boxes, predictor))
+            people = people.assign(**_pose_errors(people, scan, boxes, predictor, origin))
         scan_info = {name: getattr(scan, name) for name in (*OF_SCAN, "changed")}
         scan_results.append((people, detections, boxes, scan_info))
         progress(number + 1, len(scans.loaders))
@@ -337,7 +338,7 @@ def _false_rows(at: str, false_people: pd.DataFrame, scans: pd.DataFrame) -> Ite
 
 
 def _pose_errors(
-    people: pd.DataFrame, scan: LabeledScan, boxes: Sequence[Box], predictor: Predictor
+    people: pd.DataFrame, scan: LabeledScan, boxes: Sequence[Box], predictor: Predictor, origin: np.ndarray | None
 ) -> dict[str, np.ndarray]:
     """Errors of poses in found and in labeled boxes, mm, NaN without a pose."""
     assert scan.joints is not None
@@ -347,11 +348,11 @@ def _pose_errors(
         "mpjpe_given": [scan.boxes[k] for k in matched_people.person],
     }
     true = scan.joints[matched_people.person][:, BODY26.map_to(HUMAN15)]
-    origin = "unknown" if scan.origin is None else scan.origin
     errors = {name: np.full(len(people), np.nan) for name in sources}
     for name, source_boxes in sources.items():
         crops = [replace(box, id=None) for box in source_boxes]
-        poses = predictor.predict(scan.points, boxes=crops, sensor_origin=origin, skeleton=HUMAN15.name)
+        sensor_origin = "unknown" if origin is None else origin
+        poses = predictor.predict(scan.points, boxes=crops, sensor_origin=sensor_origin, skeleton=HUMAN15.name)
         errors[name][people.detection >= 0] = [
             joint_errors(person.joints[None], joints[None]).mean() if person.has_pose else np.nan
             for person, joints in zip(poses, true, strict=True)
