@@ -208,9 +208,13 @@ def test_who_is_said_to_ride_is_counted_of_those_who_do_and_of_the_others():
 
 def test_calibration_is_of_people_and_false_ones():
     scans = scan_set([scan([5, 10, {"x": 15, "points": 2}])])
-    result = score_detector(answers([(5, 0.75), (30, 0.75), (10, 1.0), (15, 0.4)]), scans, default_score=1.0)
+    found = [(5, 0.75), (30, 0.75), (10, 1.0), (15, 0.4), (35, 0.0), (38, 0.0)]
+    result = score_detector(answers(found), scans, default_score=1.0)
+    # those of no score are not counted
     assert result.row("calibration_error")["value"] == pytest.approx(100 * (2 * 0.25) / 3, abs=0.01)
+    assert result.row("calibration_error")["count"] == 3
     assert result.reliability == [
+        {"score": 0.0, "people": 0.0, "detections": 2},
         {"score": 0.75, "people": 0.5, "detections": 2},
         {"score": 1.0, "people": 1.0, "detections": 1},
     ]

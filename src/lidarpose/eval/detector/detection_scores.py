@@ -35,6 +35,8 @@ CONDITIONS = ("person within 1 m", "thing within 0.3 m", "under 1.4 m tall", "no
 OF_SCAN = ("sensor", "kind", "height", "tilt")
 INDOORS = ("room", "corridor", "hall")
 _REPEATS, _BINS = 1000, 10
+# the calibration error is of scores from here on: most candidates have one of about 0, and would hide it
+_LEAST_SCORE = 0.1
 # what a detection is of
 PERSON, FALSE, NEITHER = "person", "false", "neither"
 
@@ -202,8 +204,9 @@ def score_detector(
     for at in (f"{REFERENCE:g}", "default"):
         rows += _pose_rows(people, at, thresholds[at], rng) if at in thresholds else []
     counted_detections = detections[detections.status != NEITHER].assign(people=lambda table: table.status == PERSON)
-    error = aggregate.calibration_error(counted_detections.score, counted_detections.people)
-    rows.append(_row("calibration_error", value=100 * error, unit="%", count=len(counted_detections)))
+    likely = counted_detections[counted_detections.score >= _LEAST_SCORE]
+    error = 100 * aggregate.calibration_error(likely.score, likely.people) if len(likely) else None
+    rows.append(_row("calibration_error", value=error, unit="%", count=len(likely)))
     bins = counted_detections.groupby(np.minimum((counted_detections.score * _BINS).astype(int), _BINS - 1))
     reliability = bins.agg(score=("score", "mean"), people=("people", "mean"), detections=("people", "size"))
     false_people = detections[(detections.status == FALSE) & (detections.score >= thresholds[f"{REFERENCE:g}"])]
