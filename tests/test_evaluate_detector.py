@@ -176,6 +176,9 @@ def test_recall_at_so_many_false_people_is_what_counting_says():
     assert result.row("false_people", "1", "worst", "scan")["value"] == 1
     row = result.row("recall", "1", "points", "10 to 20")
     assert row["low"] == 0 and 10 <= row["high"] <= 50 and row["count"] == 10
+    # where nobody is found in any draw, or everybody, there is no interval
+    row = result.row("recall", "0.3", "points", "10 to 20")
+    assert row["low"] is None and row["high"] is None
     # of the detections at a recall of k / 20, k of 2 k - 1 are people
     expected = sum(k / (2 * k - 1) for k in range(1, 11)) / 20 + (11 / 21) / 20
     assert result.row("average_precision")["value"] == pytest.approx(100 * expected, abs=0.01)

@@ -140,16 +140,17 @@ def test_a_doubling_of_people(changed):
 
 
 def test_recall_of_people_in_scans_is_a_table(results, monkeypatch):
+    recall = {"figure": "recall", "count": 1200}
     rows = [
-        {"figure": "recall", "at": at, "group": group, "of": of, "value": value, "low": low, "high": low, "count": 1200}
-        for at, value, low in (("1", 91.26, 90.0), ("default", None, None))
+        recall | {"at": at, "group": group, "of": of, "value": value, "low": low, "high": value}
+        for at, value, low in (("1", 91.26, 90.0), ("3", 100.0, 100.0), ("default", None, None))
         for group, of in (("all", "all"), ("points", "50 and more"), ("kind", "room"))
     ]
-    document = {"results": [{"dataset": "heldout", "thresholds": {"1": 0.5, "default": 0.6}, "rows": rows}]}
+    document = {"results": [{"dataset": "heldout", "thresholds": {"1": 0.5, "3": 0.4, "default": 0.6}, "rows": rows}]}
     monkeypatch.setattr(results, "_read", lambda name: {"detector": document}[name])
     assert results.detector("heldout", "all", "points").splitlines() == [
-        "| recall, % (false people a scan) | people | 1 | default |",
-        "| --- | --- | --- | --- |",
-        "| all | 1,200 | 91.3 [90, 90] |  |",
-        "| points: 50 and more | 1,200 | 91.3 [90, 90] |  |",
+        "| recall, % (false people a scan) | people | 1 | 3 | default |",
+        "| --- | --- | --- | --- | --- |",
+        "| all | 1,200 | 91.3 [90, 91] | 100.0 |  |",
+        "| points: 50 and more | 1,200 | 91.3 [90, 91] | 100.0 |  |",
     ]

@@ -299,10 +299,11 @@ def average_precision(detections: pd.DataFrame, people: pd.DataFrame, weights: n
 
 
 def _with_interval(draws: np.ndarray, units: int) -> dict[str, Any]:
-    """The value, which comes first, and the ends of its interval; None of nobody and of too few scans."""
+    """The value, which comes first, and the ends of its interval; None of nobody, and see `Interval.stated`."""
     if np.isnan(draws[0]):
         return {"value": None}
-    ends = np.nanquantile(draws[1:], (0.025, 0.975)) if units >= aggregate.LEAST_UNITS else (None, None)
+    low, high = np.nanquantile(draws[1:], (0.025, 0.975))
+    ends = aggregate.Interval(low=low, high=high, level=0.95, units=units, repeats=_REPEATS).stated
     return {"value": draws[0], "low": ends[0], "high": ends[1]}
 
 
