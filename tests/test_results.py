@@ -3,6 +3,7 @@
 import importlib
 import json
 import re
+from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
@@ -137,6 +138,11 @@ def test_runs_are_added_to_those_known(changed, tmp_path):
 def test_a_doubling_of_people(changed):
     _, rows = changed.scaling([run("base", 1, 200.0), run("base", 1, 180.0, 200), run("base", 1, 150.0, 800)])
     assert [row[2] for row in rows] == ["", "-20.0", "-15.0"]
+
+
+def test_errors_of_who_is_kept_are_rounded_once():
+    predictions = Namespace(confidence=np.ones((1, 1)), errors=lambda: np.array([[47.249]]))
+    assert benchmark("test_time").rejection(predictions)[0] == {"kept": 100, "people": 47.249, "joints": 47.249}
 
 
 def test_recall_of_people_in_scans_is_a_table(results, monkeypatch):
