@@ -36,6 +36,7 @@ from ablation_objectives import (
     with_point_joints,
 )
 from ablation_tables import figures
+from stored import digest, is_stored, write_note
 from torch import nn
 
 from lidarpose import evaluation
@@ -268,15 +269,21 @@ def record(name: str, seed: int, people: int, **more) -> dict:
 
 
 def each(names: Iterable[str], options: argparse.Namespace, scored: Callable[[str, int, Path], dict]) -> None:
-    """Runs every name with every seed whose scores.json is not there yet: scored(name, seed, folder) -> `record`."""
+    """Runs every name with every seed whose scores.json is not there yet: scored(name, seed, folder) -> `record`.
+
+    Those of other motion, subjects or weights end the program.
+    """
     torch.set_num_threads(1)
+    init = getattr(options, "init", "")
+    of = {"motion": options.motion, "subjects": options.subjects, "init": digest(Path(init)) if init else ""}
     for seed in map(int, options.seeds.split(",")):
         for name in names:
             folder = Path(options.out) / f"{name.replace(' ', '-')}-{options.people}-{seed}"
-            if (folder / "scores.json").is_file():
+            if is_stored(folder / "scores.json", of):
                 continue
             shutil.rmtree(folder, ignore_errors=True)
             scores = scored(name, seed, folder)
+            write_note(folder / "scores.json", of)
             write_atomic(folder / "scores.json", json.dumps(scores, indent=1) + os.linesep)
             summary = "  ".join(f"{key} {value['value']:.1f}" for key, value in scores["figures"].items())
             print(f"{name} {seed}: {summary}  ({scores['processor_seconds']:.0f} s)", flush=True)

@@ -19,11 +19,12 @@ import time
 from pathlib import Path
 
 import numpy as np
+from stored import digest, is_stored, write_note
 
 from lidarpose.inference.predictor import TTA, load
 from lidarpose.io.files import write_atomic
 from lidarpose.metrics import acceleration_errors, aligned_errors, interval, joint_errors
-from lidarpose.models import DEFAULT
+from lidarpose.models import DEFAULT, weights_path
 from lidarpose.skeleton import BODY26, HUMAN15
 from lidarpose.synth.bodies import CLIP_HZ, PoseBank
 from lidarpose.synth.generator import Generator
@@ -189,17 +190,20 @@ def main() -> None:
     parser.add_argument("--weights", default=DEFAULT)
     parser.add_argument("--clips", type=int, default=120)
     parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--store", help="npz of predicted clips: read where it is there, else written")
+    parser.add_argument("--store", type=Path, help="npz of predicted clips: read where it is there, else written")
     parser.add_argument("--hide", type=int, nargs="+", default=[], metavar="N", help="also hide N frames in the middle")
     parser.add_argument("--json", help="also write the figures to this file")
     options = parser.parse_args()
 
-    if options.store and Path(options.store).exists():
+    of = {name: getattr(options, name) for name in ("motion", "clips", "seed", "looks")}
+    of["weights"] = digest(weights_path(options.weights))
+    if options.store and is_stored(options.store, of):
         with np.load(options.store) as archive:
             clips = dict(archive)
     else:
         clips = make_clips(options.motion, options.clips, options.seed, options.weights, options.looks)
         if options.store:
+            write_note(options.store, of)
             np.savez_compressed(options.store, **clips)
     report = run(clips)
     for name, row in report["ways"].items():

@@ -336,7 +336,8 @@ def detector(dataset: str, *groups: str) -> str:
     rows = [row for row in result["rows"] if row["figure"] == "recall" and row["group"] in groups]
     cells: dict[tuple[str, str], dict[str, str]] = {}
     for row in rows:
-        ends = "" if row["low"] is None else f" [{row['low']:.0f}, {row['high']:.0f}]"
+        # of older scores, those without width
+        ends = "" if row["low"] == row["high"] else f" [{row['low']:.0f}, {row['high']:.0f}]"
         value = "" if row["value"] is None else f"{row['value']:.1f}{ends}"
         name = row["group"] if row["of"] == "all" else f"{row['group']}: {row['of']}"
         cells.setdefault((name, f"{row['count']:,}"), {})[row["at"]] = value

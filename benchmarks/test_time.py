@@ -75,7 +75,7 @@ def rejection(predictions) -> list[dict]:
         rows += [value[order[: max(round(share * len(order)), 1)]].mean() for share in (1.0, 0.9, 0.8, 0.7, 0.5)]
     kept_percent = (100, 90, 80, 70, 50)
     levels = zip(kept_percent, people, joints, strict=True)
-    return [{"kept": k, "people": round(float(p), 2), "joints": round(float(j), 2)} for k, p, j in levels]
+    return [{"kept": k, "people": float(p), "joints": float(j)} for k, p, j in levels]
 
 
 def main() -> None:
@@ -92,7 +92,7 @@ def main() -> None:
         if setting is USUAL:
             rejection_rows = rejection(run_result.evaluations[0].predictions)
         ms = shown.seconds / shown.people * 1e3
-        results.append({"what": setting.what, "usual": setting is USUAL, "ms": round(ms, 2)})
+        results.append({"what": setting.what, "usual": setting is USUAL, "ms": ms})
         results[-1]["figures"] = figures(run_result.scores.results[0])
         print(f"{setting.what:<52} {results[-1]['figures']['all']['value']:.1f} mm  {ms:.1f} ms", flush=True)
     stored_results = json.loads(options.out.read_text()) if options.out.is_file() else {}

@@ -16,12 +16,14 @@ from pathlib import Path
 
 import numpy as np
 import trackeval
+from stored import digest, is_stored, write_note
 
 from lidarpose.eval.detector.detection_scores import LEAST_POINTS, MATCH_RADIUS
 from lidarpose.geometry import rotation_about
 from lidarpose.inference.detection import detect
 from lidarpose.io.files import write_atomic
 from lidarpose.lidar.presets import sensor as named_sensor
+from lidarpose.models import DEFAULT, VERIFIER, weights_file
 from lidarpose.models.detector.detector import Detector
 from lidarpose.sample import Box
 from lidarpose.synth import street as streets
@@ -36,6 +38,8 @@ APART, CLEAR, NEAR = 0.5, 1.2, 18.0
 SENSORS = ("os1-128", "os1-64", "vlp-32c", "hdl-64e", "os0-128")
 # the least score of boxes that are stored, and of those that may continue a track
 LEAST_SCORE, WEAK_SCORE = 0.02, 0.1
+# what finds people
+_WEIGHTS = ("detector.onnx", "proposals.npz", f"{VERIFIER}.onnx", f"{DEFAULT}.onnx")
 # who counts is so near, m
 RANGE = 40.0
 
@@ -118,7 +122,8 @@ def to_sensor(boxes, pose):
 def stored(seed, index, cache):
     """Frames of a street in the world's frame: the people, how many points each has, and the boxes found."""
     path = cache / f"{seed}-{index}.json"
-    if not path.exists():
+    of = {name: digest(weights_file(name)) for name in _WEIGHTS}
+    if not is_stored(path, of):
         frames = []
         for frame, pose in recording(seed, index):
             detected_boxes = detect(frame.points, min_score=LEAST_SCORE)
@@ -128,6 +133,7 @@ def stored(seed, index, cache):
                 for group in (frame.boxes, detected_boxes)
             )
             frames.append({"people": people, "points": points, "boxes": boxes, "sensor": list(map(float, pose))})
+        write_note(path, of)
         write_atomic(path, json.dumps(frames))
     return json.loads(path.read_text())
 

@@ -1,4 +1,8 @@
-"""The losses and the choices of people that benchmarks/ablations.py tries."""
+"""The losses and the choices of people that benchmarks/ablations.py tries; results that benchmarks store."""
+
+import sys
+from argparse import Namespace
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -152,3 +156,53 @@ def test_hard_activities_come_more_often_than_they_are_drawn(ablations):
     shown = [job.source.chosen(k) for k in range(256)]
     assert all(k // 2 == index for index, k in enumerate(shown))
     assert np.mean([weights[k] for k in shown]) > np.mean(list(weights.values()))
+
+
+# ---- stored results
+
+
+def test_a_run_of_other_motion_or_weights_is_not_taken_for_this_one(ablations, tmp_path):
+    options = Namespace(seeds="1", out=tmp_path, people=64, motion="a.npz", subjects="002", init="")
+    runs = []
+
+    def scored(name, seed, folder):
+        runs.append(name)
+        return {"figures": {}, "processor_seconds": 0.0}
+
+    ablations.each(["base"], options, scored)
+    ablations.each(["base"], options, scored)
+    assert runs == ["base"]
+    (tmp_path / "weights").write_bytes(b"trained")
+    for other in ({"motion": "b.npz"}, {"subjects": "005"}, {"init": str(tmp_path / "weights")}):
+        with pytest.raises(SystemExit, match=r"base-64-1/scores\.json is of \{.*: delete it$"):
+            ablations.each(["base"], Namespace(**vars(options) | other), scored)
+    # nor one of before, of which nothing says what it is of
+    (tmp_path / "base-64-1" / "scores.json.of.json").unlink()
+    with pytest.raises(SystemExit, match="unknown options"):
+        ablations.each(["base"], options, scored)
+
+
+def test_stored_clips_are_of_the_options_and_weights(tmp_path, monkeypatch):
+    clips = benchmark("clips")
+    made = []
+    monkeypatch.setattr(clips, "make_clips", lambda *arguments: made.append(arguments) or {"true": np.zeros(1)})
+    monkeypatch.setattr(clips, "run", lambda clips: {"ways": {}, "spread_over_error": 1.0})
+    command = ["clips.py", "--store", str(tmp_path / "clips.npz"), "--weights"]
+    for words in (["tiny"], ["tiny"]):
+        monkeypatch.setattr(sys, "argv", [*command, *words])
+        clips.main()
+    assert len(made) == 1
+    for words in (["small"], ["tiny", "--seed", "5"], ["tiny", "--clips", "9"], ["tiny", "--motion", "prior"]):
+        monkeypatch.setattr(sys, "argv", [*command, *words])
+        with pytest.raises(SystemExit, match=r"clips\.npz is of \{.*: delete it$"):
+            clips.main()
+
+
+def test_stored_boxes_are_of_the_networks_that_found_them(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "trackeval", ModuleType("trackeval"))
+    tracks = benchmark("tracks")
+    monkeypatch.setattr(tracks, "recording", lambda seed, index: [])
+    assert tracks.stored(2, 0, tmp_path) == tracks.stored(2, 0, tmp_path) == []
+    monkeypatch.setattr(tracks, "digest", lambda weights: "another")
+    with pytest.raises(SystemExit, match=r"2-0\.json is of \{.*: delete it$"):
+        tracks.stored(2, 0, tmp_path)

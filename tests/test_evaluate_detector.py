@@ -176,6 +176,9 @@ def test_recall_at_so_many_false_people_is_what_counting_says():
     assert result.row("false_people", "1", "worst", "scan")["value"] == 1
     row = result.row("recall", "1", "points", "10 to 20")
     assert row["low"] == 0 and 10 <= row["high"] <= 50 and row["count"] == 10
+    # where nobody is found in any draw, or everybody, there is no interval
+    row = result.row("recall", "0.3", "points", "10 to 20")
+    assert row["low"] is None and row["high"] is None
     # of the detections at a recall of k / 20, k of 2 k - 1 are people
     expected = sum(k / (2 * k - 1) for k in range(1, 11)) / 20 + (11 / 21) / 20
     assert result.row("average_precision")["value"] == pytest.approx(100 * expected, abs=0.01)
@@ -208,9 +211,13 @@ def test_who_is_said_to_ride_is_counted_of_those_who_do_and_of_the_others():
 
 def test_calibration_is_of_people_and_false_ones():
     scans = scan_set([scan([5, 10, {"x": 15, "points": 2}])])
-    result = score_detector(answers([(5, 0.75), (30, 0.75), (10, 1.0), (15, 0.4)]), scans, default_score=1.0)
+    found = [(5, 0.75), (30, 0.75), (10, 1.0), (15, 0.4), (35, 0.0), (38, 0.0)]
+    result = score_detector(answers(found), scans, default_score=1.0)
+    # those of no score are not counted
     assert result.row("calibration_error")["value"] == pytest.approx(100 * (2 * 0.25) / 3, abs=0.01)
+    assert result.row("calibration_error")["count"] == 3
     assert result.reliability == [
+        {"score": 0.0, "people": 0.0, "detections": 2},
         {"score": 0.75, "people": 0.5, "detections": 2},
         {"score": 1.0, "people": 1.0, "detections": 1},
     ]
@@ -254,6 +261,19 @@ def test_poses_in_found_boxes_are_compared_with_those_in_labeled_boxes():
     result = score_detector(answers([(5.03, 0.9), (10.0, 0.8)]), scans, predictor=predictor)
     values = [result.row(name, "1") for name in ("mpjpe_found", "mpjpe_given", "mpjpe_difference")]
     assert [row["value"] for row in values] == pytest.approx([30, 0, 30]) and values[0]["count"] == 1
+
+
+def test_poses_are_not_told_where_an_unknown_sensor_stands():
+    origins = []
+
+    def predict(points, *, boxes, sensor_origin, skeleton):
+        origins.append(sensor_origin)
+        return [SimpleNamespace(has_pose=True, joints=np.zeros((15, 3))) for _ in boxes]
+
+    scans = scan_set([scan([5], joints=np.zeros((1, 26, 3)))])
+    predictor = SimpleNamespace(predict=predict)
+    score_detector(answers([(5, 0.9)]), scans, predictor=predictor, sensor_unknown=True)
+    assert origins == ["unknown"] * 2
 
 
 def test_nobody_to_find_is_an_error():
@@ -363,6 +383,22 @@ def test_missed_people_are_drawn(tmp_path, monkeypatch):
     assert [path.name for path in (tmp_path / "look").iterdir()] == ["labeled-missed.png"]
     rows = json.loads((tmp_path / "out" / "detector.json").read_text())["results"][0]["rows"]
     assert {row["value"] for row in rows if row["figure"] == "recall"} <= {0, None}
+
+
+def test_labels_are_taken_by_their_whole_names(tmp_path):
+    on_foot = "PEDESTRIAN human.pedestrian.police_officer TYPE_PEDESTRIAN Person_sitting OFFICIAL_SIGNALER".split()
+    mounted = ["BICYCLIST", "WHEELED_RIDER", "human.pedestrian.wheelchair", "Cyclist"]
+    neither = ["STROLLER", "human.pedestrian.stroller", "vehicle.bicycle", "MOTORCYCLE", "static_object.bicycle_rack"]
+    absent = ["MOBILE_PEDESTRIAN_CROSSING_SIGN", "vehicle.car", "BOLLARD", "bus driver"]
+    names = [*absent, *on_foot, *mounted, *neither]
+    people = [{"center": [3 * k, 0, 0], "size": SIZE, "category": name} for k, name in enumerate(names)]
+    np.save(tmp_path / "a.npy", np.zeros((1, 3), np.float32))
+    (tmp_path / "a.json").write_text(json.dumps({"people": people}))
+    own = labeled_scans(tmp_path).loaders[0]()
+    assert [box.center[0] / 3 for box in own.boxes] == list(range(len(absent), len(names)))
+    shares = len(on_foot), len(mounted), len(neither)
+    assert own.is_person.tolist() == np.repeat([True, True, False], shares).tolist()
+    assert own.mounted.tolist() == np.repeat([False, True, False], shares).tolist()
 
 
 @pytest.mark.parametrize(

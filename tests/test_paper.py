@@ -265,6 +265,22 @@ def test_the_mean_pose_is_about_the_center_that_the_protocol_gives(tmp_path, smp
     assert found == pytest.approx(wanted, abs=0.1)
 
 
+def test_the_mean_pose_is_of_what_is_learned_from_and_of_people_who_have_a_pose(tmp_path, monkeypatch):
+    def person(height, points):
+        joints = np.full((15, 3), (0.0, 0.0, height))
+        sample = SimpleNamespace(skeleton=HUMAN15, joint_labels=np.ones(15), joints=joints)
+        return SimpleNamespace(sample=sample, points=np.zeros((points, 3)))
+
+    first, second, test = (Step(("synth", name)) for name in ("first", "second", "test"))
+    people = {first: [person(0, 9)], second: [person(1, 9)], test: [person(0, 5), person(9, 4)]}
+    datasets = {str(step.product(tmp_path)): own for step, own in people.items()}
+    monkeypatch.setattr(report, "open_eval_dataset", lambda folder, **_: datasets[folder])
+    setting = SimpleNamespace(dataset="test", kind="synth", joints=HUMAN15.joints, protocol="clean")
+    target = replace(cells(TABLES["table1"], Options())[0].target, test=test)
+    for train, error in ((first, 0.0), (second, 1000.0)):
+        assert mean_pose_error(replace(target, train=train), SimpleNamespace(setting=setting), tmp_path) == error
+
+
 def test_a_set_that_the_protocol_refuses_is_refused_before_anything_is_trained(tmp_path, smpl):
     write_sloper4d(tmp_path / "raw", smpl)
     prepare("sloper4d", tmp_path / "raw", tmp_path / "set", smpl=smpl)

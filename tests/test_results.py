@@ -3,6 +3,7 @@
 import importlib
 import json
 import re
+from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
@@ -139,17 +140,23 @@ def test_a_doubling_of_people(changed):
     assert [row[2] for row in rows] == ["", "-20.0", "-15.0"]
 
 
+def test_errors_of_who_is_kept_are_rounded_once():
+    predictions = Namespace(confidence=np.ones((1, 1)), errors=lambda: np.array([[47.249]]))
+    assert benchmark("test_time").rejection(predictions)[0] == {"kept": 100, "people": 47.249, "joints": 47.249}
+
+
 def test_recall_of_people_in_scans_is_a_table(results, monkeypatch):
+    recall = {"figure": "recall", "count": 1200}
     rows = [
-        {"figure": "recall", "at": at, "group": group, "of": of, "value": value, "low": low, "high": low, "count": 1200}
-        for at, value, low in (("1", 91.26, 90.0), ("default", None, None))
+        recall | {"at": at, "group": group, "of": of, "value": value, "low": low, "high": value}
+        for at, value, low in (("1", 91.26, 90.0), ("3", 100.0, 100.0), ("default", None, None))
         for group, of in (("all", "all"), ("points", "50 and more"), ("kind", "room"))
     ]
-    document = {"results": [{"dataset": "heldout", "thresholds": {"1": 0.5, "default": 0.6}, "rows": rows}]}
+    document = {"results": [{"dataset": "heldout", "thresholds": {"1": 0.5, "3": 0.4, "default": 0.6}, "rows": rows}]}
     monkeypatch.setattr(results, "_read", lambda name: {"detector": document}[name])
     assert results.detector("heldout", "all", "points").splitlines() == [
-        "| recall, % (false people a scan) | people | 1 | default |",
-        "| --- | --- | --- | --- |",
-        "| all | 1,200 | 91.3 [90, 90] |  |",
-        "| points: 50 and more | 1,200 | 91.3 [90, 90] |  |",
+        "| recall, % (false people a scan) | people | 1 | 3 | default |",
+        "| --- | --- | --- | --- | --- |",
+        "| all | 1,200 | 91.3 [90, 91] | 100.0 |  |",
+        "| points: 50 and more | 1,200 | 91.3 [90, 91] | 100.0 |  |",
     ]

@@ -202,6 +202,14 @@ def test_how_often_intervals_of_few_hold_the_truth(units, least, most):
     assert least < held / 4 < most
 
 
+def test_an_interval_without_width_is_not_stated():
+    for value in (0.0, 100.0):
+        found = metrics.interval(np.full(30, value), np.random.default_rng(0))
+        assert found.low == found.high == value and found.stated == (None, None)
+    found = metrics.interval(np.append(np.full(29, 100.0), 0.0), np.random.default_rng(0))
+    assert found.stated == (found.low, found.high)
+
+
 def test_sequences_make_intervals_wider():
     rng = np.random.default_rng(0)
     sequence = np.repeat(np.arange(20), 50)

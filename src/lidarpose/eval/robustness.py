@@ -32,7 +32,7 @@ ENDS = ("head", "wrists", "hands", "ankles", "feet")
 # of the bench these alone are perturbed: the others have something wrong already
 _CLEAN = "clean"
 _REPEATS = 1000
-# sensors that people are simulated for, with few beams first; seeds that neither training nor the bench uses
+# sensors that people are simulated for, with few beams first; of a seed that no training uses, bench-2 does
 SENSORS = (
     *("vlp-16", "hdl-32e", "vlp-32c", "os1-64", "hdl-64e", "os1-128", "pandar64", "waymo-top", "av2"),
     *("livox-mid360", "livox-avia"),
@@ -371,8 +371,8 @@ def _point(predictions: Predictions, base_errors: np.ndarray, amount: float, lab
 
 
 def _sensor_curve(setup: EvalSetup, advance: Callable[[int], None]) -> Curve:
-    """The same bodies in the same poses at the same places before each sensor, however little it sees of them, nothing
-    around them."""
+    """The same bodies in the same poses at the same distances from each sensor, however little it sees of them, nothing
+    around them. Sensors are of other heights, and people in other directions."""
     from lidarpose.synth.generator import Generator
     from lidarpose.synth.scene import scene_config
 
@@ -391,7 +391,7 @@ def _sensor_curve(setup: EvalSetup, advance: Callable[[int], None]) -> Curve:
         points.append(replace(point, increase=None, increase_low=None, increase_high=None))
         advance(len(samples))
     says = f"{CAST} people of the procedural prior, {_DISTANCE[0]:g} to {_DISTANCE[1]:g} m away, cast anew for each "
-    says += "sensor: the same bodies, poses and places, nothing around them"
+    says += "sensor: the same bodies, poses and distances, nothing around them"
     return Curve(name="sensors", title="other sensors", says=says, points=tuple(points))
 
 

@@ -18,7 +18,7 @@ from lidarpose.io.files import content_digest, write_atomic
 from lidarpose.models.checkpoint import load_checkpoint, runs_of
 from lidarpose.paper.steps import CELLS, Execute, Step, StepFailed, begin_out, is_done, last_entry, length_of, run_steps
 from lidarpose.paper.tables import PROTOCOL, Cell, Options, Table, Target, cells, row_key
-from lidarpose.sample import center_of
+from lidarpose.sample import MIN_POINTS, center_of
 
 SCHEMA = "lidarpose.paper/1"
 # a network that is not so much better than the mean pose, as a share of its error, has not learned enough to compare
@@ -154,14 +154,16 @@ def mean_pose_error(target: Target, result: Result, out: Path) -> float:
     card_digest = (
         None if isinstance(target.test, Step) else content_digest(Path(folders[1]) / CARD, expected="a dataset")[:8]
     )
-    name = filter(None, (result.setting.dataset, str(len(result.setting.joints)), card_digest))
+    # trainings of several budgets are scored on the same people
+    learned = target.train.name if isinstance(target.train, Step) else None
+    name = filter(None, (result.setting.dataset, str(len(result.setting.joints)), card_digest, learned))
     path = out / CELLS / f"mean-pose-{'-'.join(name)}.json"
     if not path.is_file():
         split = None if isinstance(target.train, Step) else "train"
         train_offsets = [
             _offset(person, result) for person in open_eval_dataset(folders[0], split=split, limit=_MEAN_POSE)
         ]
-        least = DAPT[result.setting.kind].least if result.setting.protocol == PROTOCOL else 1
+        least = DAPT[result.setting.kind].least if result.setting.protocol == PROTOCOL else MIN_POINTS
         test_people = (person for person in open_eval_dataset(folders[1], split=None) if len(person.points) >= least)
         test_offsets = [_offset(person, result) for person in test_people]
         mean = np.nanmean(train_offsets, 0)

@@ -35,6 +35,8 @@ CONDITIONS = ("person within 1 m", "thing within 0.3 m", "under 1.4 m tall", "no
 OF_SCAN = ("sensor", "kind", "height", "tilt")
 INDOORS = ("room", "corridor", "hall")
 _REPEATS, _BINS = 1000, 10
+# the calibration error is of scores from here on: most candidates have one of about 0, and would hide it
+_LEAST_SCORE = 0.1
 # what a detection is of
 PERSON, FALSE, NEITHER = "person", "false", "neither"
 
@@ -184,10 +186,11 @@ def score_detector(
     progress(0, len(scans.loaders))
     for number, load in enumerate(scans.loaders):
         scan = load()
-        boxes, scores = detect(scan.points, None if sensor_unknown else scan.origin)
+        origin = None if sensor_unknown else scan.origin
+        boxes, scores = detect(scan.points, origin)
         people, detections = score_scan(number, scan, boxes, np.asarray(scores, float), max_range=max_range)
         if predictor is not None and scan.joints is not None:
-            people = people.assign(**_pose_errors(people, scan, boxes, predictor))
+            people = people.assign(**_pose_errors(people, scan, boxes, predictor, origin))
         scan_info = {name: getattr(scan, name) for name in (*OF_SCAN, "changed")}
         scan_results.append((people, detections, boxes, scan_info))
         progress(number + 1, len(scans.loaders))
@@ -201,8 +204,9 @@ def score_detector(
     for at in (f"{REFERENCE:g}", "default"):
         rows += _pose_rows(people, at, thresholds[at], rng) if at in thresholds else []
     counted_detections = detections[detections.status != NEITHER].assign(people=lambda table: table.status == PERSON)
-    error = aggregate.calibration_error(counted_detections.score, counted_detections.people)
-    rows.append(_row("calibration_error", value=100 * error, unit="%", count=len(counted_detections)))
+    likely = counted_detections[counted_detections.score >= _LEAST_SCORE]
+    error = 100 * aggregate.calibration_error(likely.score, likely.people) if len(likely) else None
+    rows.append(_row("calibration_error", value=error, unit="%", count=len(likely)))
     bins = counted_detections.groupby(np.minimum((counted_detections.score * _BINS).astype(int), _BINS - 1))
     reliability = bins.agg(score=("score", "mean"), people=("people", "mean"), detections=("people", "size"))
     false_people = detections[(detections.status == FALSE) & (detections.score >= thresholds[f"{REFERENCE:g}"])]
@@ -295,10 +299,11 @@ def average_precision(detections: pd.DataFrame, people: pd.DataFrame, weights: n
 
 
 def _with_interval(draws: np.ndarray, units: int) -> dict[str, Any]:
-    """The value, which comes first, and the ends of its interval; None of nobody and of too few scans."""
+    """The value, which comes first, and the ends of its interval; None of nobody, and see `Interval.stated`."""
     if np.isnan(draws[0]):
         return {"value": None}
-    ends = np.nanquantile(draws[1:], (0.025, 0.975)) if units >= aggregate.LEAST_UNITS else (None, None)
+    low, high = np.nanquantile(draws[1:], (0.025, 0.975))
+    ends = aggregate.Interval(low=low, high=high, level=0.95, units=units, repeats=_REPEATS).stated
     return {"value": draws[0], "low": ends[0], "high": ends[1]}
 
 
@@ -337,7 +342,7 @@ def _false_rows(at: str, false_people: pd.DataFrame, scans: pd.DataFrame) -> Ite
 
 
 def _pose_errors(
-    people: pd.DataFrame, scan: LabeledScan, boxes: Sequence[Box], predictor: Predictor
+    people: pd.DataFrame, scan: LabeledScan, boxes: Sequence[Box], predictor: Predictor, origin: np.ndarray | None
 ) -> dict[str, np.ndarray]:
     """Errors of poses in found and in labeled boxes, mm, NaN without a pose."""
     assert scan.joints is not None
@@ -347,11 +352,11 @@ def _pose_errors(
         "mpjpe_given": [scan.boxes[k] for k in matched_people.person],
     }
     true = scan.joints[matched_people.person][:, BODY26.map_to(HUMAN15)]
-    origin = "unknown" if scan.origin is None else scan.origin
     errors = {name: np.full(len(people), np.nan) for name in sources}
     for name, source_boxes in sources.items():
         crops = [replace(box, id=None) for box in source_boxes]
-        poses = predictor.predict(scan.points, boxes=crops, sensor_origin=origin, skeleton=HUMAN15.name)
+        sensor_origin = "unknown" if origin is None else origin
+        poses = predictor.predict(scan.points, boxes=crops, sensor_origin=sensor_origin, skeleton=HUMAN15.name)
         errors[name][people.detection >= 0] = [
             joint_errors(person.joints[None], joints[None]).mean() if person.has_pose else np.nan
             for person, joints in zip(poses, true, strict=True)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -24,9 +25,13 @@ HELDOUT = "heldout"
 _HELDOUT_FILE = "detector-heldout-1.json"
 # edges of the groups of sensors by height, m, and by tilt, degrees
 _HEIGHTS, _TILTS = (1.0, 2.2), (3.0, 10.0)
-# what labels call people on foot, and people with wheels; other things, as strollers and dogs, are no people
-_ON_FOOT = ("pedestrian", "person", "people", "signaler", "human", "adult", "child")
-_MOUNTED = ("cycl", "rider", "wheelchair", "mounted")
+# what nuScenes, Argoverse 2, Waymo and KITTI call people on foot, people with wheels, and what may pass for a person
+_ON_FOOT = set(
+    "pedestrian person people human adult child construction_worker police_officer personal_mobility official_signaler "
+    "person_sitting".split()
+)
+_MOUNTED = set("bicyclist cyclist motorcyclist wheeled_rider rider wheelchair mounted".split())
+_LIKE_PEOPLE = set("stroller bicycle motorcycle bicycle_rack wheeled_device animal dog mannequin".split())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,9 +111,9 @@ def labeled_scans(folder: str | os.PathLike, limit: int | None = None) -> ScanSe
     """The scans of a folder: SCAN.json of people beside SCAN.pcd, .bin, .ply, .npy or another format.
 
     SCAN.json holds what `read_boxes` takes, and of each of its "people" a `category` ("PEDESTRIAN" where it is
-    missing; riders and wheelchairs are mounted, as is who has `mounted`; strollers and animals are no people) and
-    `num_points`, else the points in the box are counted; beside "people" `sensor`, `kind` of scene and `sensor_origin`
-    (0, 0, 0 where it is missing).
+    missing; riders and wheelchairs are mounted, as is who has `mounted`; strollers, riderless two-wheelers, animals and
+    mannequins are no people; other things are left out) and `num_points`, else the points in the box are counted;
+    beside "people" `sensor`, `kind` of scene and `sensor_origin` (0, 0, 0 where it is missing).
     Raises InputError where the folder has none, or labels have no scan.
     """
     folder = Path(folder)
@@ -125,16 +130,19 @@ def labeled_scans(folder: str | os.PathLike, limit: int | None = None) -> ScanSe
 
 
 def _read_scan(labels: Path, cloud: Path) -> LabeledScan:
-    boxes = read_boxes(labels)
+    labeled_boxes = read_boxes(labels)
     content = json.loads(read_bytes(labels, expected="labels of people"))
     document: dict[str, Any] = content if isinstance(content, dict) else {"people": content}
-    people = [entry if isinstance(entry, dict) else {} for entry in document["people"]]
-    category = [str(entry.get("category", "pedestrian")).lower() for entry in people]
-    is_rider = [any(word in name for word in _MOUNTED) for name in category]
-    is_mounted = np.array(
-        [is_riding or bool(box.mounted) for is_riding, box in zip(is_rider, boxes, strict=True)], bool
-    )
-    is_on_foot = np.array([any(word in name for word in _ON_FOOT) for name in category], bool)
+    boxes, people, kinds = [], [], []
+    for box, entry in zip(labeled_boxes, document["people"], strict=True):
+        entry = entry if isinstance(entry, dict) else {}
+        kind = _kind(str(entry.get("category", "pedestrian")))
+        if box.mounted or kind in _ON_FOOT | _MOUNTED | _LIKE_PEOPLE:
+            boxes.append(box)
+            people.append(entry)
+            kinds.append(kind)
+    is_mounted = np.array([kind in _MOUNTED or bool(box.mounted) for kind, box in zip(kinds, boxes, strict=True)], bool)
+    is_on_foot = np.array([kind in _ON_FOOT for kind in kinds], bool)
     points = only_returns(read_points(cloud).points)[0]
     point_counts = [len(rows) for rows in rows_inside(boxes, points)]
     try:
@@ -156,3 +164,9 @@ def _read_scan(labels: Path, cloud: Path) -> LabeledScan:
         sensor=str(document.get("sensor", "")),
         kind=str(document.get("kind", "")),
     )
+
+
+def _kind(category: str) -> str:
+    """The last part of a label's name: of human.pedestrian.adult, TYPE_CYCLIST and "Person sitting" adult, cyclist and
+    person_sitting."""
+    return re.sub(r"[\s-]+", "_", category.lower().rpartition(".")[2].strip()).removeprefix("type_")

@@ -164,8 +164,9 @@ class Interval:
 
     @property
     def stated(self) -> tuple[float, float] | tuple[None, None]:
-        """low and high as an evaluation states them: None of fewer than `LEAST_UNITS`."""
-        return (self.low, self.high) if self.units >= LEAST_UNITS else (None, None)
+        """low and high as an evaluation states them: None of fewer than `LEAST_UNITS`, and where all draws are alike,
+        as of 100 %: the interval would have no width."""
+        return (self.low, self.high) if self.units >= LEAST_UNITS and self.low < self.high else (None, None)
 
 
 def interval(

@@ -1,0 +1,32 @@
+"""Stored results answer only for the options and weights that they are of; RESULT.of.json beside them says which."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from lidarpose.io.files import content_digest, write_atomic
+
+
+def digest(weights: Path) -> str:
+    return content_digest(weights, expected="weights")[:8]
+
+
+def is_stored(result: Path, of: dict[str, Any]) -> bool:
+    """Whether the result is there; ends the program where it is of something else, or nothing says of what."""
+    if not result.is_file():
+        return False
+    note = _note(result)
+    stored_of = json.loads(note.read_text()) if note.is_file() else "unknown options"
+    if stored_of != of:
+        sys.exit(f"{result} is of {stored_of}, asked for {of}: delete it")
+    return True
+
+
+def write_note(result: Path, of: dict[str, Any]) -> None:
+    """Says what a result that is about to be stored is of."""
+    write_atomic(_note(result), json.dumps(of) + "\n")
+
+
+def _note(result: Path) -> Path:
+    return result.with_name(f"{result.name}.of.json")
