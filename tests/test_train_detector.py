@@ -29,9 +29,9 @@ from lidarpose.train.detector import candidate_source
 from lidarpose.train.detector.candidate_source import (
     IGNORE,
     NOBODY,
-    CandidateSource,
     DetectorExample,
     Labels,
+    SceneSource,
     labels_of,
     moved,
 )
@@ -85,7 +85,8 @@ def quick_scans(monkeypatch):
     def scan(seed, number, *, family="train"):
         return an_example(number + 1000 * (family == "heldout"))
 
-    monkeypatch.setattr(candidate_source, "scan_example", scan)
+    for module in (candidate_source, setup):
+        monkeypatch.setattr(module, "scan_example", scan)
     monkeypatch.setattr(candidate_source, "VALIDATION", 3)
     monkeypatch.setattr(setup, "DetectorConfig", lambda: SMALL)
 
@@ -210,13 +211,13 @@ def test_labels_move_with_the_points():
 
 def test_each_scan_is_shown_so_often_whoever_makes_it(quick_scans, monkeypatch):
     shown = []
-    real = CandidateSource._scan
-    monkeypatch.setattr(CandidateSource, "_scan", lambda self, n, newest: shown.append(n) or real(self, n, newest))
-    source = CandidateSource(seed=1, uses=3, lag=4)
+    real = SceneSource._scan
+    monkeypatch.setattr(SceneSource, "_scan", lambda self, n, newest: shown.append(n) or real(self, n, newest))
+    source = replace(setup.make_setup(replace(RECIPE, uses=3)).source, lag=4)
     examples = [source.example(index) for index in range(60)]
     assert all(shown.count(number) == 3 for number in range(8, 12)) and len(source._kept) <= 3 * 4 + 1
     # another process begins in the middle
-    again = CandidateSource(seed=1, uses=3, lag=4).example(37)
+    again = replace(source).example(37)
     objective = DetectorObjective(config=SMALL)
     for name, array in objective.collate([examples[37]]).items():
         np.testing.assert_array_equal(array, objective.collate([again])[name])

@@ -25,7 +25,7 @@ from lidarpose.train.augment import (
     second_person_label,
     seen,
 )
-from lidarpose.train.detector.candidate_source import SceneSource, scene_to_search
+from lidarpose.train.detector.candidate_source import scene_to_search
 
 # how a person is cut out: by a box about a pose, by the column about a detection, or by a labeled box
 _CUTS, _CHANCES = ("pose box", "column", "labeled box"), (0.6, 0.15, 0.25)
@@ -62,18 +62,18 @@ class ScanPeople:
     origin: np.ndarray | None
 
 
-class ScanPeopleSource(SceneSource[ScanPeople, Example]):
-    """One person of a scan at a time, changed a little."""
+def populated_scan(seed: int, number: int) -> ScanPeople:
+    """The people of a scene; of another one where that has nobody."""
+    for attempt in range(_TRIES):
+        people = scan_people(seed, number + attempt * _STRIDE)
+        if people.boxes:
+            break
+    return people
 
-    def load_scene(self, number: int) -> ScanPeople:
-        for attempt in range(_TRIES):
-            people = scan_people(self.seed, number + attempt * _STRIDE)
-            if people.boxes:
-                break
-        return people
 
-    def draw_example(self, scan: ScanPeople, rng: np.random.Generator) -> Example:
-        return person_example(scan, int(rng.integers(len(scan.boxes))), rng)
+def draw_person(scan: ScanPeople, rng: np.random.Generator) -> Example:
+    """Somebody of a scan, changed a little."""
+    return person_example(scan, int(rng.integers(len(scan.boxes))), rng)
 
 
 def scan_people(seed: int, number: int, *, family: str = "train") -> ScanPeople:
