@@ -48,13 +48,14 @@ def learn_background(
     grid: _Grid | None = None
     static_voxels, eighths = None, np.zeros(0, np.int64)
     for rows in np.array_split(np.arange(len(sources)), min(_PARTS, len(sources))):
-        voxels, counts = np.zeros(0, np.int64), np.zeros(0, np.int64)
+        scan_voxels = []
         for row in rows:
             points = _points(sources[row], columns)
             grid = grid or _Grid(points)
             scan_eighths = grid.eighths(points)
             eighths = _ascending(np.concatenate([eighths, scan_eighths]))
-            voxels, counts = _counted(voxels, counts, grid.voxels(scan_eighths))
+            scan_voxels.append(grid.voxels(scan_eighths))
+        voxels, counts = np.unique(np.concatenate(scan_voxels), return_counts=True)
         frequent_voxels = voxels[counts >= _SHARE * len(rows)]
         static_voxels = (
             frequent_voxels
@@ -106,15 +107,6 @@ class _Grid:
     def middles(self, eighths: np.ndarray) -> np.ndarray:
         """(n, 3) m."""
         return (_unpacked(eighths) + 0.5) * (_VOXEL / 2) + self.corner
-
-
-def _counted(numbers: np.ndarray, counts: np.ndarray, new_numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ascending numbers with their counts, each of `new_numbers` counted once more."""
-    all_numbers = _ascending(np.concatenate([numbers, new_numbers]))
-    totals = np.zeros(len(all_numbers), np.int64)
-    totals[np.searchsorted(all_numbers, numbers)] = counts
-    totals[np.searchsorted(all_numbers, new_numbers)] += 1
-    return all_numbers, totals
 
 
 def _ascending(numbers: np.ndarray) -> np.ndarray:
