@@ -237,9 +237,6 @@ class Chunks(IterableDataset):
     rank: int = 0
     ranks: int = 1
 
-    def __post_init__(self):
-        lanes_of(self.batch, self.ranks)
-
     def __iter__(self) -> Iterator[list[Any]]:
         worker = get_worker_info()
         offset, stride = (0, 1) if worker is None else (worker.id, worker.num_workers)
@@ -248,20 +245,18 @@ class Chunks(IterableDataset):
 
     def batches_of(self, chunk: int) -> list[Any]:
         """The batches of one chunk of the run, those before `start` too."""
-        # products of a few thousand numbers: threads of BLAS only get in each other's way
-        with threadpool_limits(limits=1, user_api="blas"):
-            return self._batches_of(chunk)
-
-    def _batches_of(self, chunk: int) -> list[Any]:
         first_number, batch_count = chunk * BATCHES * self.batch, min(self.steps - chunk * BATCHES, BATCHES)
         lane_count = lanes_of(self.batch, self.ranks)
-        lanes = []
-        for offset in range(self.rank, lane_count, self.ranks):
-            numbers = range(first_number + offset, first_number + batch_count * self.batch, lane_count)
-            lanes.append(sorted(map(self.source.example, numbers), key=attrgetter("size")))
         share = self.batch // lane_count
         order = np.random.default_rng([self.seed, RandomStream.BATCH_ORDER, chunk]).permutation(batch_count)
-        return [self.objective.collate([e for lane in lanes for e in lane[k * share : (k + 1) * share]]) for k in order]
+        # products of a few thousand numbers: threads of BLAS only get in each other's way
+        with threadpool_limits(limits=1, user_api="blas"):
+            lanes = []
+            for offset in range(self.rank, lane_count, self.ranks):
+                numbers = range(first_number + offset, first_number + batch_count * self.batch, lane_count)
+                lanes.append(sorted(map(self.source.example, numbers), key=attrgetter("size")))
+            starts = share * order
+            return [self.objective.collate([e for lane in lanes for e in lane[k : k + share]]) for k in starts]
 
 
 def chunks_of(steps: int) -> int:
