@@ -8,16 +8,13 @@ all of them together are the same however many there are.
 """
 
 import gc
-import os
 import pickle
 import shutil
 import signal
-import threading
-import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from itertools import accumulate
 from math import floor, gcd
 from operator import attrgetter
@@ -30,6 +27,7 @@ from threadpoolctl import threadpool_limits
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from lidarpose.arrays import evenly_spaced
+from lidarpose.data.writer import end_with_parent
 from lidarpose.errors import InputError
 from lidarpose.sample import CLIP_FRAMES, LabeledSample
 from lidarpose.synth.bodies import PoseBank, smpl_rig
@@ -55,8 +53,6 @@ from lidarpose.train.torch_dataset import InMemoryDataset
 BATCHES = 8
 # lanes at most, and so processes
 LANES = 8
-# how often a worker checks that its parent lives, s
-_POLL = 1.0
 # where Linux keeps shared memory, and how much a worker may need, bytes
 _SHARED_MEMORY, _SHARED_OF_WORKER = Path("/dev/shm"), 2**30
 # bytes to whose multiples arrays are aligned in it
@@ -283,7 +279,7 @@ def loader(chunks: Chunks, *, workers: int) -> Iterator[list[Any]]:
         num_workers=workers,
         prefetch_factor=4 if workers else None,
         collate_fn=_packed if is_packed else _unchanged,
-        worker_init_fn=partial(_begin_worker, os.getpid()) if workers else None,
+        worker_init_fn=_begin_worker,
     )
     return map(_unpacked, data_loader) if is_packed else iter(data_loader)
 
@@ -321,18 +317,11 @@ def _unpacked(chunk: tuple[bytes, list[tuple[int, int]], torch.Tensor]) -> list[
     return pickle.loads(rest, buffers=[memory[start:end] for start, end in spans])
 
 
-def _begin_worker(parent: int, worker: int) -> None:
-    """Lets this worker end when its parent is gone: a killed parent cannot stop it, and it would wait for ever."""
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(_POLL)
-        os._exit(1)
-
+def _begin_worker(worker: int) -> None:
     # Ctrl-C, and the SIGTERM of a batch system, reach workers too, and the parent still needs them for the batches that
     # it finishes
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
-    threading.Thread(target=watch, daemon=True).start()
+    end_with_parent()
     # what was made before this process is not looked through for garbage again: 5 % of the time of making people
     gc.freeze()
