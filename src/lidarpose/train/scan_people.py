@@ -76,9 +76,9 @@ def draw_person(scan: ScanPeople, rng: np.random.Generator) -> Example:
     return person_example(scan, int(rng.integers(len(scan.boxes))), rng)
 
 
-def scan_people(seed: int, number: int, *, family: str = "train") -> ScanPeople:
+def scan_people(seed: int, number: int) -> ScanPeople:
     """The people of scene `number` of `synth.detection_scene`, leveled as it is when people are searched for."""
-    scene, origin = scene_to_search(seed, number, family)
+    scene, origin = scene_to_search(seed, number, "train")
     pelvises = scene.joints[:, _PELVIS, :2].astype(float)
     rng = np.random.default_rng([seed, number])
     rows, clouds, owners = [], [], []
