@@ -10,7 +10,7 @@ from lidarpose.inference.verification import AROUND
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.detection_scene import detection_scene
 from lidarpose.train import scan_people
-from lidarpose.train.augment import UNKNOWN_PART, seen
+from lidarpose.train.augment import UNKNOWN_PART, visible_joints
 from lidarpose.train.data_loader import MixedSource
 from lidarpose.train.detector.candidate_source import SceneSource, scene_to_search
 from lidarpose.train.recipes import Pretrain
@@ -74,7 +74,7 @@ def test_what_the_sensor_sees_is_mirrored_with_the_person(scan, monkeypatch):
     num_mirrored = 0
     for person, example in examples(scan, 60):
         joints, points = example.joints.astype(float), example.points.astype(float)
-        is_visible = seen(joints, points[example.part == UNKNOWN_PART])
+        is_visible = visible_joints(joints, points[example.part == UNKNOWN_PART])
         assert (example.visible == is_visible).mean() > 0.95
         if not example.view[4]:
             continue

@@ -33,9 +33,14 @@ from lidarpose.train.detector.candidate_source import (
     Labels,
     SceneSource,
     labels_of,
-    moved,
+    transform_labels,
 )
-from lidarpose.train.objectives.detector_objective import DetectorObjective, average_precision, chosen, missed_people
+from lidarpose.train.objectives.detector_objective import (
+    DetectorObjective,
+    average_precision,
+    missed_people,
+    training_rows,
+)
 from lidarpose.train.objectives.objective import total
 from lidarpose.train.recipes import TrainDetector
 
@@ -200,7 +205,7 @@ def test_who_is_whose_candidate():
 def test_labels_move_with_the_points():
     labels = replace(an_example(0, count=1).labels, center=np.array([[0.3, 0.1]], np.float32))
     change = CandidateAugmentation(turn=np.pi / 2, mirror=True, scale=1.05, shift=(0.02, -0.04))
-    after = moved(labels, change)
+    after = transform_labels(labels, change)
     np.testing.assert_allclose(after.center[0], [0.1 * 1.05 + 0.02, 0.3 * 1.05 - 0.04], atol=1e-6)
     np.testing.assert_allclose(after.center[0], change.apply(labels.center)[0], atol=1e-6)
     assert after.height[0] == pytest.approx(1.75 * 1.05)
@@ -229,7 +234,7 @@ def test_the_hardest_of_nobody_are_learned_from():
     logit = torch.arange(200.0)
     person = torch.full((200,), NOBODY)
     person[:4], person[199] = torch.arange(4), IGNORE
-    rows = chosen(logit, person, torch.zeros(200, dtype=torch.long)).tolist()
+    rows = training_rows(logit, person, torch.zeros(200, dtype=torch.long)).tolist()
     assert set(range(4)) < set(rows) and 199 not in rows
     assert set(range(189, 199)) < set(rows) and len(rows) < 60
 

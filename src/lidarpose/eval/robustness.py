@@ -228,12 +228,14 @@ def people_to_perturb(setup: EvalSetup) -> list[CroppedPerson]:
         rows = set(evenly_drawn(setup.dataset.count, PEOPLE).tolist())
         samples = [person for k, person in enumerate(setup.dataset) if k in rows]
     # who is not scored is not perturbed either
-    pairs = [(setup.shown(person)[0], person) for person in samples]
+    pairs = [(setup.crop_sample(person)[0], person) for person in samples]
     people = [
         CroppedPerson(shown=crop, whole=person) for crop, person in pairs if crop is not None and len(crop.points)
     ]
     if not people:
-        raise InputError(f"none of the {_who(setup)} has a point to perturb: score more people, or leave stability out")
+        raise InputError(
+            f"none of the {_people_text(setup)} has a point to perturb: score more people, or leave stability out"
+        )
     return people
 
 
@@ -281,7 +283,7 @@ def study(
             notes.append("other sensors need people cast anew: in the clone, pip install '.[synth]'")
     else:
         notes.append("other sensors: people cast anew have no released center")
-    who, ends = f"{len(people):,} {_who(setup)}", end_errors(predictions)
+    who, ends = f"{len(people):,} {_people_text(setup)}", end_errors(predictions)
     return Stability(setting=setup.setting, who=who, curves=tuple(curves), ends=ends, notes=tuple(notes))
 
 
@@ -306,7 +308,7 @@ def end_errors(predictions: Predictions) -> tuple[End, ...]:
     return tuple(ends)
 
 
-def _who(setup: EvalSetup) -> str:
+def _people_text(setup: EvalSetup) -> str:
     return f"{'clean ' if setup.setting.kind == BENCH else ''}people of {setup.setting.dataset}"
 
 

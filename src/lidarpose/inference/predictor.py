@@ -12,10 +12,10 @@ from lidarpose.errors import InputError, check_int, check_name, first_names, mis
 from lidarpose.inference.backend import Backend, OnnxBackend, exported_beside
 from lidarpose.inference.checks import (
     UPSIDE_DOWN,
-    company_warning,
-    lies,
+    is_lying,
     looks_unsure,
     oversize_warning,
+    person_count_warning,
     unit_warning,
     upside_down_warning,
 )
@@ -268,7 +268,9 @@ class Predictor(PoseEstimator):
         track = TrackPoses.of_poses(seconds, [person.pose for person in poses], poses.skeleton)
         steady_poses = filter_track(track) if live else smooth(track).poses()
         frames = [
-            replace(person, id=i, pose=_with_own(person, pose), warnings=_steady_warnings(person, pose))
+            replace(
+                person, id=i, pose=_with_person_probabilities(person, pose), warnings=_steady_warnings(person, pose)
+            )
             for i, (person, pose) in enumerate(zip(poses, steady_poses, strict=True))
         ]
         return replace(poses, people=tuple(frames))
@@ -314,7 +316,7 @@ class Predictor(PoseEstimator):
                 continue
             pose, part = best_poses[i]
             poses[i] = target_pose = pose.to(target_skeleton)
-            notes += filter(None, (unit_note, company_warning(pose, in_box=in_box), _range_warning(target_pose)))
+            notes += filter(None, (unit_note, person_count_warning(pose, in_box=in_box), _range_warning(target_pose)))
             if unit_note:
                 continue
             if warning := oversize_warning(points, pose):
@@ -326,7 +328,7 @@ class Predictor(PoseEstimator):
         flipped_poses = self.poses(flipped_clouds, None if origin is None else origin * UPSIDE_DOWN)
         for i, flipped_pose in zip(unsure_rows, flipped_poses, strict=True):
             # of somebody who lies another axis may be up, which is said of all together
-            if (warning := upside_down_warning(best_poses[i][0], flipped_pose)) and not lies(*best_poses[i]):
+            if (warning := upside_down_warning(best_poses[i][0], flipped_pose)) and not is_lying(*best_poses[i]):
                 cleaned_clouds[i][1].append(warning)
         people = tuple(
             PersonPose(pose=pose, skeleton=target_skeleton, points=points, warnings=tuple(notes), model=self.model)
@@ -368,12 +370,12 @@ class Predictor(PoseEstimator):
             if pose is not None:
                 poses_by_person.setdefault(i, []).append((pose, part))
         return {
-            i: _meant(person_poses, None if box_centers is None else box_centers[i])
+            i: _select_pose(person_poses, None if box_centers is None else box_centers[i])
             for i, person_poses in poses_by_person.items()
         }
 
 
-def _meant(answers: list[tuple[Pose, np.ndarray]], box_center: np.ndarray | None) -> tuple[Pose, np.ndarray]:
+def _select_pose(answers: list[tuple[Pose, np.ndarray]], box_center: np.ndarray | None) -> tuple[Pose, np.ndarray]:
     """Of the answers about candidates of a crop, that of the whole cloud first, the one that is meant: the surest, in a
     box the surest of whoever is nearest to its center. Whoever else is there stands beside them as a second person.
 
@@ -408,7 +410,7 @@ def _range_warning(pose: Pose) -> str | None:
     return f"at the end of the heatmap's range, so perhaps farther out than given: {first_names(names)}"
 
 
-def _with_own(person: PersonPose, pose: Pose | None) -> Pose | None:
+def _with_person_probabilities(person: PersonPose, pose: Pose | None) -> Pose | None:
     """A steady pose with what the network says of its frame as a whole, which is not smoothed; of a frame that was
     filled in nothing is said."""
     if pose is None or person.pose is None:

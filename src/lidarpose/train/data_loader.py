@@ -39,9 +39,9 @@ from lidarpose.train.augment import (
     Augmentation,
     ClipExample,
     Example,
+    add_disturbances,
     augmented,
     clip_example,
-    disturbed,
     example,
     object_example,
     people_in,
@@ -116,7 +116,9 @@ class SyntheticSource:
             return object_example(object_sample, rng, refined=self.refined)
         difficulty = self._difficulty(index, rng)
         sample = self._generator.person(self.seed, index, hard=difficulty).sample
-        result = example(disturbed(sample, strays=self.strays, noise=self.noise, rng=rng), rng, refined=self.refined)
+        result = example(
+            add_disturbances(sample, strays=self.strays, noise=self.noise, rng=rng), rng, refined=self.refined
+        )
         return replace(result, person=people_in(sample)) if self.objects else result
 
     def _difficulty(self, index: int, rng: np.random.Generator) -> float:
@@ -133,10 +135,10 @@ class SyntheticSource:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _OfDataset:
+class DatasetSource:
     """What is shown of datasets: all once an epoch, in an order of its own, each time changed anew.
 
-    dataset: see `InMemoryDataset.load`; strays, noise: see `disturbed`.
+    dataset: see `InMemoryDataset.load`; strays, noise: see `add_disturbances`.
     """
 
     dataset: InMemoryDataset
@@ -154,11 +156,11 @@ class _OfDataset:
         sample = self.dataset.sample(row)
         if not (self.strays or self.noise):
             return sample
-        return disturbed(sample, strays=self.strays, noise=self.noise, rng=rng)
+        return add_disturbances(sample, strays=self.strays, noise=self.noise, rng=rng)
 
 
 @dataclass(frozen=True, kw_only=True)
-class StoredSource(_OfDataset):
+class StoredSource(DatasetSource):
     """The samples of datasets."""
 
     augmentation: Augmentation
@@ -169,7 +171,7 @@ class StoredSource(_OfDataset):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClipSource(_OfDataset):
+class ClipSource(DatasetSource):
     """The clips of datasets. clips, skipped: see `InMemoryDataset.clips`; trans_center, turn: see `clip_example`. Where
     rows follow the clips, all of an epoch begin some frames later, as many as they may without leaving their run."""
 
@@ -189,7 +191,7 @@ class ClipSource(_OfDataset):
         samples = [self._sample(row, rng) for row in rows]
         return clip_example(samples, rng, trans_center=self.trans_center, turn=self.turn)
 
-    def some(self, count: int) -> list[ClipExample]:
+    def validation_clips(self, count: int) -> list[ClipExample]:
         """So many clips at most, evenly spread, to validate on: centered on their points."""
         rng = np.random.default_rng(self.seed)
         clip_rows = self.clips[evenly_spaced(len(self.clips), count), :CLIP_FRAMES]

@@ -23,7 +23,7 @@ from lidarpose.train.augment import (
     Example,
     make_example,
     second_person_label,
-    seen,
+    visible_joints,
 )
 from lidarpose.train.detector.candidate_source import scene_to_search
 
@@ -119,7 +119,7 @@ def person_example(scan: ScanPeople, person: int, rng: np.random.Generator) -> E
         center = joints[_PELVIS] + rng.normal(0, PELVIS_ERROR, 3)
     view = view_features(center, None if rng.random() < BLIND else scan.origin)
     points, joints = points - center, joints - center
-    visible = seen(joints, points[owner == 1]).astype(np.float32)
+    visible = visible_joints(joints, points[owner == 1]).astype(np.float32)
     part = np.where(owner == 1, UNKNOWN_PART, 0)
     if rng.random() < 0.5:
         mirror = np.array([1, -1, 1])

@@ -318,7 +318,9 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
     clip_source = _clips(dataset, config, recipe)
     held_out_clips = None if held_out_dataset is None else _clips(held_out_dataset, config, recipe)
     people = max(round(recipe.epochs * len(clip_source.clips)), 1) * config.frames
-    clip_validation = partial(held_out_clips.some, VALIDATION // config.frames) if held_out_clips is not None else list
+    clip_validation = (
+        partial(held_out_clips.validation_clips, VALIDATION // config.frames) if held_out_clips is not None else list
+    )
     epoch = len(clip_source.clips) * config.frames
     return replace(_of_clips(setup, clip_source), people=people, epoch=epoch, validation=clip_validation)
 

@@ -118,7 +118,7 @@ def draw_augmentation(rng: np.random.Generator, count: int) -> CandidateAugmenta
     return CandidateAugmentation(**{name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())})
 
 
-def moved(labels: Labels, augmentation: CandidateAugmentation) -> Labels:
+def transform_labels(labels: Labels, augmentation: CandidateAugmentation) -> Labels:
     """The labels of candidates that are changed so."""
     scale = np.asarray(augmentation.scale, np.float32)
     center = augmentation.apply(labels.center).astype(np.float32)
@@ -169,7 +169,7 @@ def draw_candidates(scan: DetectorExample, rng: np.random.Generator) -> Detector
     negatives = rng.choice(negatives, min(NEGATIVES, len(negatives)), replace=False)
     rows = np.concatenate([np.flatnonzero(person >= 0), np.sort(negatives)])
     augmentation = draw_augmentation(rng, len(rows))
-    labels = moved(scan.labels.take(rows), augmentation)
+    labels = transform_labels(scan.labels.take(rows), augmentation)
     return DetectorExample(candidates=scan.candidates.take(rows), labels=labels, augmentation=augmentation)
 
 
