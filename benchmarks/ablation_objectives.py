@@ -21,7 +21,7 @@ from lidarpose.models.posenet import Batch, Outputs, PoseNet, Targets
 from lidarpose.skeleton import BODY26
 from lidarpose.train.augment import FLIP_PART, Example
 from lidarpose.train.objectives.baseline_objective import point_labels
-from lidarpose.train.objectives.objective import Share, alone, at_least_one
+from lidarpose.train.objectives.objective import Share, at_least_one, one_process
 from lidarpose.train.objectives.posenet_objective import PoseNetObjective, losses
 
 # voxels that refine a joint
@@ -122,7 +122,7 @@ class PointJoints(VariantObjective):
     """Of networks `with_point_joints`: the cross entropy of each voxel's joint and the distance to it besides."""
 
     def terms(
-        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
+        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = one_process
     ) -> dict[str, Tensor]:
         batch, targets = Batch.from_arrays(arrays, device), Targets.from_arrays(arrays, device)
         outputs = network(batch)
@@ -153,7 +153,7 @@ class HardestPeople(VariantObjective):
     weighs five times as much as another."""
 
     def terms(
-        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
+        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = one_process
     ) -> dict[str, Tensor]:
         outputs, targets = network(Batch.from_arrays(arrays, device)), Targets.from_arrays(arrays, device)
         person_error = (
@@ -190,7 +190,7 @@ class MirroredPairs(VariantObjective):
         return super().collate([*originals, *map(mirrored, originals)])
 
     def terms(
-        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
+        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = one_process
     ) -> dict[str, Tensor]:
         outputs, targets = network(Batch.from_arrays(arrays, device)), Targets.from_arrays(arrays, device)
         straight, image = outputs.joints().float().chunk(2)
@@ -235,7 +235,7 @@ class Taught(VariantObjective):
         return arrays | {_IMAGE + name: value for name, value in image_arrays.items()}
 
     def terms(
-        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
+        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = one_process
     ) -> dict[str, Tensor]:
         teacher, targets = _teacher(self.teacher).to(device), Targets.from_arrays(arrays, device)
         image_arrays = {name.removeprefix(_IMAGE): value for name, value in arrays.items() if name.startswith(_IMAGE)}

@@ -24,7 +24,7 @@ from lidarpose.models import DEFAULT
 from lidarpose.sample import CONFIDENCE_RADIUS
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import PoseBank
-from lidarpose.train.augment import seen
+from lidarpose.train.augment import visible_joints
 
 BINS = 10
 # what `spread` may say, m
@@ -53,7 +53,7 @@ def main() -> None:
     true = np.stack([p.sample.pose.to(BODY26).joints for p in persons])
     error = np.linalg.norm(np.stack([p.joints for p in predictions]) - true, axis=-1)
     body_points = [p.sample.points[p.sample.part > 0].astype(float) for p in persons]
-    visible = np.stack([seen(joints, points) for joints, points in zip(true, body_points, strict=True)])
+    visible = np.stack([visible_joints(joints, points) for joints, points in zip(true, body_points, strict=True)])
     confidence = np.stack([p.confidence for p in predictions])
     spread = np.stack([p.spread for p in predictions])
     predicted_visible = np.stack([p.pose.visible for p in predictions])

@@ -54,10 +54,10 @@ class Shown(Predictor):
         self._first, self._tta, self._averaged = way.first, way.transforms, way.averaged
         self.seconds, self.people = 0.0, 0
 
-    def _people(self, *arguments, **options):
+    def predict_in(self, *arguments, **options):
         """As always, with the processor time that it takes."""
         start = time.process_time()
-        people = super()._people(*arguments, **options)
+        people = super().predict_in(*arguments, **options)
         self.seconds += time.process_time() - start
         self.people += len(people)
         return people

@@ -21,7 +21,7 @@ from lidarpose.synth.place import draw_place
 from lidarpose.synth.scene import SCENES
 from lidarpose.synth.simulate import simulate
 from lidarpose.synth.views import with_views
-from lidarpose.train.augment import Augmentation, augmented, disturbed
+from lidarpose.train.augment import Augmentation, add_disturbances, augmented
 
 SEED = 11
 WILD, WIDE = SCENES["wild"], SCENES["wide"]
@@ -326,7 +326,7 @@ def test_crowded_crops_hold_two_and_the_center_says_who_is_meant():
         sample = Generator(scene=replace(WILD, crowded=1.0), measure=False).person(SEED, index).sample
         np.testing.assert_array_equal(sample.center, sample.box.center)
         others.append(np.count_nonzero(sample.part == 0))
-        worse = disturbed(sample, strays=1.0, noise=1.0, rng=np.random.default_rng(index))
+        worse = add_disturbances(sample, strays=1.0, noise=1.0, rng=np.random.default_rng(index))
         assert worse is not sample
         np.testing.assert_array_equal(worse.center, sample.center)
         stored = LabeledSample(

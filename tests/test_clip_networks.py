@@ -259,7 +259,7 @@ def test_all_windows_of_an_epoch_may_begin_later(monkeypatch):
     still = ClipSource(clips=clip_windows(run), **settings)
     assert sorted(still.example(k) for k in range(3)) == sorted(still.example(k) for k in range(3, 6))
     # those to validate on do not move
-    assert [clip[0] for clip in shifted.some(3)] == [0, 16, 32]
+    assert [clip[0] for clip in shifted.validation_clips(3)] == [0, 16, 32]
 
 
 def test_the_rate_goes_by_the_losses_of_whole_epochs(folder, tmp_path):

@@ -27,7 +27,7 @@ from lidarpose.train.networks import finetuned_network, pretraining_network
 from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, log_gaussian, pretraining, prn
 from lidarpose.train.objectives.dapt_objective import DaptObjective, finetuning_config, pretraining_config, small
 from lidarpose.train.objectives.dapt_transfer import transferred
-from lidarpose.train.objectives.objective import alone, total
+from lidarpose.train.objectives.objective import one_process, total
 from lidarpose.train.optim import optimizers, rate_factor, set_rates
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.setup import TrainSetup
@@ -332,7 +332,7 @@ def test_gradients_of_two_halves_average_to_those_of_the_whole(task, rare):
         torch.testing.assert_close((terms[0][name] + terms[1][name]) / 2, value, rtol=1e-4, atol=1e-6, msg=name)
     largest = max(value.abs().max() for value in want.values())
     # without the share they would not
-    naive = [gradients(net, task.terms(net, half, share=alone)) for half in halves]
+    naive = [gradients(net, task.terms(net, half, share=one_process)) for half in halves]
     off = 0.0
     for name, value in want.items():
         mean, unshared = ((a[name] + b[name]) / 2 for a, b in (gradients_of, naive))

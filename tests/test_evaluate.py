@@ -145,7 +145,7 @@ def test_clean_tells_the_center_of_the_displaced_box_alone(sets, name):
 
 def test_people_without_a_box_take_nobody_s_box_away(sets):
     setup = eval_setup(Asked(standing), open_eval_dataset(sets / "humanm3"), protocol="clean")
-    people = [setup.shown(person)[0] for person in open_eval_dataset(sets / "humanm3")]
+    people = [setup.crop_sample(person)[0] for person in open_eval_dataset(sets / "humanm3")]
     boxless = [replace(person, crop_box=None) if k % 2 else person for k, person in enumerate(people)]
     poses = setup.predict(boxless).pred
     np.testing.assert_array_equal(setup.model.centers, [person.crop_box.center for person in people[::2]])

@@ -36,7 +36,7 @@ from lidarpose.train.augment import (
     augmentation,
     augmented,
     example,
-    seen,
+    visible_joints,
 )
 from lidarpose.train.data_loader import MixedSource, StoredSource, SyntheticSource
 from lidarpose.train.networks import PRETRAINED, expanded_network, initial_network
@@ -264,11 +264,11 @@ def test_what_an_augmentation_hides_is_not_told_visible(how):
     person, hidden = someone(count=60), 0
     body = person.part != 0
     # labels that tell the truth before
-    visible = np.where(np.isnan(person.pose.visible), np.nan, seen(person.joints, person.points[body]))
+    visible = np.where(np.isnan(person.pose.visible), np.nan, visible_joints(person.joints, person.points[body]))
     person = replace(person, pose=body26(person.joints, visible))
     for index in range(40):
         shown = augmented(person, how, np.random.default_rng(index))
-        wanted = np.where(np.isnan(visible), np.nan, seen(shown.joints, shown.points[shown.part != 0]))
+        wanted = np.where(np.isnan(visible), np.nan, visible_joints(shown.joints, shown.points[shown.part != 0]))
         np.testing.assert_array_equal(shown.visible, wanted)
         hidden += np.nansum(visible) - np.nansum(wanted)
     assert hidden > 4

@@ -31,7 +31,7 @@ from lidarpose.models.posenet import Batch, PoseNet, Targets
 from lidarpose.models.voxelize import view_features, voxelize
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SCENES
-from lidarpose.train.augment import SEEN, example, seen
+from lidarpose.train.augment import VISIBLE_RADIUS, example, visible_joints
 from lidarpose.train.objectives.objective import total
 from lidarpose.train.objectives.posenet_objective import MAX_VOXELS, SIGMA, PoseNetObjective, losses
 from lidarpose.train.optim import optimizers
@@ -387,13 +387,13 @@ def test_a_turned_person_is_the_turned_example(yaw):
 def test_a_joint_is_seen_where_points_lie_near_it():
     joints = np.array([[0.0, 0, 0], [1.0, 0, 0], [0.0, 0, 2.0]])
     points = np.array([[0.1, 0.1, 0.0], [1.0, 0.17, 0.0], [0.0, 0.0, 1.8]])
-    np.testing.assert_array_equal(seen(joints, points), [True, True, False])
-    assert not seen(joints, points[:0]).any()
+    np.testing.assert_array_equal(visible_joints(joints, points), [True, True, False])
+    assert not visible_joints(joints, points[:0]).any()
     for known in people():
         sample = known.sample
         body = sample.points[sample.part > 0]
         nearest = np.linalg.norm(sample.pose.joints[:, None] - body[None], axis=-1).min(1, initial=np.inf)
-        np.testing.assert_array_equal(seen(sample.pose.joints, body.astype(float)), nearest < SEEN)
+        np.testing.assert_array_equal(visible_joints(sample.pose.joints, body.astype(float)), nearest < VISIBLE_RADIUS)
 
 
 def test_collated_targets_are_the_examples_and_the_majority_of_parts():

@@ -17,7 +17,7 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
 from lidarpose.inference import inputs as people_module
 from lidarpose.inference.backend import Raw
-from lidarpose.inference.checks import flat_axis, lies, rows_inside, unit_warning
+from lidarpose.inference.checks import flat_axis, is_lying, rows_inside, unit_warning
 from lidarpose.inference.inputs import MAX_POINTS, as_origin, candidates, clean
 from lidarpose.inference.predictor import Predictor
 from lidarpose.io.boxes import read_boxes
@@ -330,13 +330,13 @@ def test_the_sensors_place_reaches_the_network(model, points):
 
 def test_lying(standing, points):
     pose, none = standing.sample.pose, np.zeros((0, 3))
-    assert not lies(pose, points) and not lies(pose, none)
-    assert lies(pose, points[:, [0, 2, 1]]) and lies(pose, points[:, [2, 1, 0]])
+    assert not is_lying(pose, points) and not is_lying(pose, none)
+    assert is_lying(pose, points[:, [0, 2, 1]]) and is_lying(pose, points[:, [2, 1, 0]])
     # one ring of a far person, and a street
-    assert not lies(pose, points[:, :3] * (1, 1, 0)) and not lies(pose, cluttered(points))
+    assert not is_lying(pose, points[:, :3] * (1, 1, 0)) and not is_lying(pose, cluttered(points))
     laid = replace(pose, joints=pose.joints @ rotation_about("x", np.pi / 2).T)
-    assert lies(laid, points) and lies(laid.to(SKELETONS["waymo14"]), none)
-    assert not lies(pose.to(SKELETONS["waymo14"]), none)
+    assert is_lying(laid, points) and is_lying(laid.to(SKELETONS["waymo14"]), none)
+    assert not is_lying(pose.to(SKELETONS["waymo14"]), none)
 
 
 def test_the_flat_axis_of_a_sweep_is_its_up_axis(points):

@@ -10,11 +10,11 @@ from lidarpose.inference.verification import AROUND
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.detection_scene import detection_scene
 from lidarpose.train import scan_people
-from lidarpose.train.augment import UNKNOWN_PART, seen
+from lidarpose.train.augment import UNKNOWN_PART, visible_joints
 from lidarpose.train.data_loader import MixedSource
-from lidarpose.train.detector.candidate_source import scene_to_search
+from lidarpose.train.detector.candidate_source import SceneSource, scene_to_search
 from lidarpose.train.recipes import Pretrain
-from lidarpose.train.scan_people import LEAST_POINTS, ScanPeopleSource, person_example
+from lidarpose.train.scan_people import LEAST_POINTS, draw_person, person_example, populated_scan
 from lidarpose.train.setup import make_setup
 
 SEED = 4
@@ -74,7 +74,7 @@ def test_what_the_sensor_sees_is_mirrored_with_the_person(scan, monkeypatch):
     num_mirrored = 0
     for person, example in examples(scan, 60):
         joints, points = example.joints.astype(float), example.points.astype(float)
-        is_visible = seen(joints, points[example.part == UNKNOWN_PART])
+        is_visible = visible_joints(joints, points[example.part == UNKNOWN_PART])
         assert (example.visible == is_visible).mean() > 0.95
         if not example.view[4]:
             continue
@@ -90,7 +90,7 @@ def test_what_the_sensor_sees_is_mirrored_with_the_person(scan, monkeypatch):
 
 
 def test_an_example_depends_on_its_number_alone():
-    source = ScanPeopleSource(seed=SEED, uses=3, lag=2)
+    source = SceneSource(seed=SEED, uses=3, lag=2, load_scene=populated_scan, draw_example=draw_person)
     first = [source.example(index) for index in range(8)]
     alone = pickle.loads(pickle.dumps(source)).example(7)
     assert np.array_equal(first[7].points, alone.points) and first[7].seed == alone.seed
@@ -108,14 +108,14 @@ def test_a_scan_without_anybody_is_skipped(monkeypatch, scan):
         return scan if len(asked) > 2 else empty
 
     monkeypatch.setattr(scan_people, "scan_people", people)
-    assert ScanPeopleSource(seed=SEED, uses=1, lag=1).load_scene(5) is scan
+    assert populated_scan(SEED, 5) is scan
     assert len(set(asked)) == 3 and asked[0] == 5
 
 
 def test_they_join_pretraining_as_a_share(monkeypatch):
     setup = make_setup(Pretrain(whole_scans=0.25, people=64))
     assert isinstance(setup.source, MixedSource) and setup.source.share == 0.25
-    assert isinstance(setup.source.other, ScanPeopleSource)
+    assert setup.source.other.load_scene is populated_scan
     with pytest.raises(InputError, match="whole_scans are for the package's own networks: leave whole_scans or prn"):
         make_setup(Pretrain(whole_scans=0.1, size="prn"))
     with pytest.raises(InputError, match="whole_scans are made during training: leave whole_scans or shards away"):

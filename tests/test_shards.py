@@ -33,7 +33,7 @@ def people():
 @pytest.fixture
 def folder(tmp_path, people):
     write_card(tmp_path, DatasetCard(settings={"what": "people"}, count=4, per_shard=3, tables=("people",)))
-    rows = [person_row(p, index=k, frame=k % 2, facts=FACTS if k else None) for k, p in enumerate(people)]
+    rows = [person_row(p, index=k, frame=k % 2, info=FACTS if k else None) for k, p in enumerate(people)]
     write_shard(tmp_path / "people-00000.parquet", "people", rows[:3])
     write_shard(tmp_path / "people-00001.parquet", "people", rows[3:])
     return tmp_path
@@ -169,7 +169,7 @@ def test_an_error_between_rows_leaves_no_file(tmp_path, people):
 
 def test_every_fact_is_a_column_and_older_shards_may_lack_one(tmp_path, people):
     path = tmp_path / "a.parquet"
-    write_shard(path, "people", [person_row(people[0], index=0, facts=FACTS)])
+    write_shard(path, "people", [person_row(people[0], index=0, info=FACTS)])
     row = next(read_rows(path, "people"))
     names = [fact.name for fact in fields(PersonInfo)]
     assert [name for name in TABLES["people"] if name in names] == names

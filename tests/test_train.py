@@ -23,7 +23,7 @@ from lidarpose.skeleton import BODY26
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SCENES
 from lidarpose.train import data_loader, optim
-from lidarpose.train.augment import disturbed
+from lidarpose.train.augment import add_disturbances
 from lidarpose.train.data_loader import BATCHES, Chunks, SyntheticSource, loader
 from lidarpose.train.objectives.objective import total
 from lidarpose.train.objectives.posenet_objective import (
@@ -362,7 +362,9 @@ def test_disturbed_people_have_their_joints_and_more_or_other_points():
     before, count = sample.points.copy(), len(sample.points)
 
     def changed(strays, noise, seeds=40):
-        return [disturbed(sample, strays=strays, noise=noise, rng=np.random.default_rng(k)) for k in range(seeds)]
+        return [
+            add_disturbances(sample, strays=strays, noise=noise, rng=np.random.default_rng(k)) for k in range(seeds)
+        ]
 
     assert all(same is sample for same in changed(0.0, 0.0, 1))
     cluttered = changed(1.0, 0.0)

@@ -29,13 +29,18 @@ from lidarpose.train.detector import candidate_source
 from lidarpose.train.detector.candidate_source import (
     IGNORE,
     NOBODY,
-    CandidateSource,
     DetectorExample,
     Labels,
+    SceneSource,
     labels_of,
-    moved,
+    transform_labels,
 )
-from lidarpose.train.objectives.detector_objective import DetectorObjective, average_precision, chosen, missed_people
+from lidarpose.train.objectives.detector_objective import (
+    DetectorObjective,
+    average_precision,
+    missed_people,
+    training_rows,
+)
 from lidarpose.train.objectives.objective import total
 from lidarpose.train.recipes import TrainDetector
 
@@ -85,7 +90,8 @@ def quick_scans(monkeypatch):
     def scan(seed, number, *, family="train"):
         return an_example(number + 1000 * (family == "heldout"))
 
-    monkeypatch.setattr(candidate_source, "scan_example", scan)
+    for module in (candidate_source, setup):
+        monkeypatch.setattr(module, "scan_example", scan)
     monkeypatch.setattr(candidate_source, "VALIDATION", 3)
     monkeypatch.setattr(setup, "DetectorConfig", lambda: SMALL)
 
@@ -199,7 +205,7 @@ def test_who_is_whose_candidate():
 def test_labels_move_with_the_points():
     labels = replace(an_example(0, count=1).labels, center=np.array([[0.3, 0.1]], np.float32))
     change = CandidateAugmentation(turn=np.pi / 2, mirror=True, scale=1.05, shift=(0.02, -0.04))
-    after = moved(labels, change)
+    after = transform_labels(labels, change)
     np.testing.assert_allclose(after.center[0], [0.1 * 1.05 + 0.02, 0.3 * 1.05 - 0.04], atol=1e-6)
     np.testing.assert_allclose(after.center[0], change.apply(labels.center)[0], atol=1e-6)
     assert after.height[0] == pytest.approx(1.75 * 1.05)
@@ -210,13 +216,13 @@ def test_labels_move_with_the_points():
 
 def test_each_scan_is_shown_so_often_whoever_makes_it(quick_scans, monkeypatch):
     shown = []
-    real = CandidateSource._scan
-    monkeypatch.setattr(CandidateSource, "_scan", lambda self, n, newest: shown.append(n) or real(self, n, newest))
-    source = CandidateSource(seed=1, uses=3, lag=4)
+    real = SceneSource._scan
+    monkeypatch.setattr(SceneSource, "_scan", lambda self, n, newest: shown.append(n) or real(self, n, newest))
+    source = replace(setup.make_setup(replace(RECIPE, uses=3)).source, lag=4)
     examples = [source.example(index) for index in range(60)]
     assert all(shown.count(number) == 3 for number in range(8, 12)) and len(source._kept) <= 3 * 4 + 1
     # another process begins in the middle
-    again = CandidateSource(seed=1, uses=3, lag=4).example(37)
+    again = replace(source).example(37)
     objective = DetectorObjective(config=SMALL)
     for name, array in objective.collate([examples[37]]).items():
         np.testing.assert_array_equal(array, objective.collate([again])[name])
@@ -228,7 +234,7 @@ def test_the_hardest_of_nobody_are_learned_from():
     logit = torch.arange(200.0)
     person = torch.full((200,), NOBODY)
     person[:4], person[199] = torch.arange(4), IGNORE
-    rows = chosen(logit, person, torch.zeros(200, dtype=torch.long)).tolist()
+    rows = training_rows(logit, person, torch.zeros(200, dtype=torch.long)).tolist()
     assert set(range(4)) < set(rows) and 199 not in rows
     assert set(range(189, 199)) < set(rows) and len(rows) < 60
 

@@ -22,7 +22,7 @@ from lidarpose.train import loop, run_dir, setup
 from lidarpose.train.data_loader import BATCHES
 from lidarpose.train.detector import crop_source
 from lidarpose.train.detector.candidate_source import NOBODY, scene_to_search
-from lidarpose.train.detector.crop_source import CropExample, CropSource, scan_crops
+from lidarpose.train.detector.crop_source import CropExample, scan_crops
 from lidarpose.train.objectives.verifier_objective import VerifierObjective, missed_by_verifier
 from lidarpose.train.recipes import TrainVerifier
 
@@ -52,7 +52,8 @@ def quick_crops(monkeypatch, tmp_path):
     def crops(seed, number, *, family="train"):
         return an_example(number + 1000 * (family == "heldout"))
 
-    monkeypatch.setattr(crop_source, "scan_crops", crops)
+    for module in (crop_source, setup):
+        monkeypatch.setattr(module, "scan_crops", crops)
     monkeypatch.setattr(crop_source, "VALIDATION", 3)
     path = tmp_path / "small.safetensors"
     torch.manual_seed(0)
@@ -112,11 +113,11 @@ def test_people_and_mistakes_are_told_by_distance_and_points():
 
 
 def test_a_scan_is_another_each_time_and_the_same_for_every_process(quick_crops):
-    source = CropSource(seed=1, uses=3, lag=4)
-    first, again = source.example(37), CropSource(seed=1, uses=3, lag=4).example(37)
+    source = replace(setup.make_setup(replace(RECIPE, init=str(quick_crops), uses=3)).source, lag=4)
+    first, again = source.example(37), replace(source).example(37)
     for a, b in zip(first.clouds, again.clouds, strict=True):
         np.testing.assert_array_equal(a, b)
-    scan = source.load_scene(2)
+    scan = source.load_scene(1, 2)
     before = [cloud.copy() for cloud in scan.clouds]
     shown = [source.draw_example(scan, np.random.default_rng(k)) for k in range(2)]
     assert not np.array_equal(shown[0].clouds[0], shown[1].clouds[0])

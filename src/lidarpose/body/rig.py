@@ -199,7 +199,7 @@ def pose_bodies(
 
 
 @dataclass(frozen=True, kw_only=True)
-class People:
+class BodyShapes:
     """n people: coefficients (n, S) float32 for `Rig.rest`, sex (n,) "female" or "male", age (n,) years, height (n,) m,
     bmi (n,) kg/m2."""
 
@@ -210,7 +210,7 @@ class People:
     bmi: np.ndarray
 
 
-def sample_people(rng: np.random.Generator, n: int) -> People:
+def sample_people(rng: np.random.Generator, n: int) -> BodyShapes:
     """Draws n people: 88 % adults of 18 to 80 years, 12 % children of 4 to 18, half of them female."""
     rig = load_rig()
     probability, neighbors = _sampling_table()
@@ -223,7 +223,7 @@ def sample_people(rng: np.random.Generator, n: int) -> People:
         return (1 - s) * table[first_row] + s * table[second_row]
 
     mixture = {name: mix(getattr(rig, name)) for name in ("coefficients", "age", "height", "bmi")}
-    return People(sex=rig.sex[first_row], **mixture)
+    return BodyShapes(sex=rig.sex[first_row], **mixture)
 
 
 @cache

@@ -90,11 +90,11 @@ _INFO = tuple(info.name for info in fields(PersonInfo))
 
 
 def person_row(
-    sample: Sample, *, index: int, frame: int = 0, track: int = 0, facts: PersonInfo | None = None
+    sample: Sample, *, index: int, frame: int = 0, track: int = 0, info: PersonInfo | None = None
 ) -> dict[str, Any]:
     """A row of the people table. The sample needs pose (body26), part, ring and box."""
-    info: dict[str, Any] = dict.fromkeys(_INFO) if facts is None else asdict(facts)
-    return _sample_columns(sample, "people") | info | {"index": index, "frame": frame, "track": track}
+    measured: dict[str, Any] = dict.fromkeys(_INFO) if info is None else asdict(info)
+    return _sample_columns(sample, "people") | measured | {"index": index, "frame": frame, "track": track}
 
 
 def labeled_row(sample: LabeledSample, *, index: int) -> dict[str, Any]:

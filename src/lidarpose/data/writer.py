@@ -134,15 +134,20 @@ def _start(make: Make, counter, stop) -> None:
     global _worker_state
     # the parent says when to stop
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    end_with_parent()
     _worker_state = (make, counter, stop)
 
 
-def _leave_with_parent() -> None:
+def end_with_parent() -> None:
+    """Ends this worker process when its parent is gone: a killed parent cannot stop it, and it would wait for ever."""
     parent = multiprocessing.parent_process()
     assert parent is not None, "runs in a worker"
-    parent.join()
-    os._exit(1)
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _shard(shard: int) -> None:

@@ -103,10 +103,10 @@ def draw_stability(study: Stability) -> bytes:
     return png_of(figure, None)
 
 
-def compare_stability(studies: dict[str, dict[str, Any]], names: Sequence[str] = ("jitter", "clusters")) -> bytes:
+def compare_stability(studies: dict[str, dict[str, Any]]) -> bytes:
     """Curves of several networks in one chart. Paper: Figure 7. studies: name of a network -> a study of
-    stability.json; names: of its curves."""
-    first_study = next(iter(studies.values()))
+    stability.json."""
+    names, first_study = ("jitter", "clusters"), next(iter(studies.values()))
     figure = _figure(5.2 * len(names), 4.2, "points perturbed: MPJPE in mm", _scored(first_study["who"], first_study))
     for axes, name in zip(np.ravel(figure.subplots(1, len(names))), names, strict=True):
         for (network, study), color in zip(studies.items(), cycle(_PALETTE), strict=False):

@@ -168,7 +168,7 @@ class EvalSetup:
         box = jittered(sample.box, np.random.default_rng([setting.seed, person.shard, person.row]))
         return person.points[box.contains(person.points)], box
 
-    def shown(self, person: EvalSample) -> tuple[EvalSample | None, str]:
+    def crop_sample(self, person: EvalSample) -> tuple[EvalSample | None, str]:
         """The person as the protocol shows them; or None, and why it leaves them out."""
         kind, min_points = self.setting.kind, 0
         if self.setting.protocol == "dapt":
@@ -183,7 +183,7 @@ class EvalSetup:
         return replace(person, points=points, crop_box=box), ""
 
     def predict(self, samples: Sequence[EvalSample]) -> Predictions:
-        """What is known of people as the protocol shows them, see `shown`, and what the network answers."""
+        """What is known of people as the protocol shows them, see `crop_sample`, and what the network answers."""
         answers: list[dict] = [{} for _ in samples]
         answer = self._predict_clean if self.setting.protocol == "clean" else self._predict_dapt
         is_single = self._frames == 1
@@ -194,7 +194,7 @@ class EvalSetup:
         for (is_known, _), rows in rows_by_kind.items():
             origin = np.zeros(3) if is_known else None
             for k, values in zip(rows, answer([samples[k] for k in rows], origin), strict=True):
-                answers[k] = self._known(samples[k]) | values
+                answers[k] = self._label_columns(samples[k]) | values
         return stack(self.joints, answers)
 
     def _predict_clean(self, samples: list[EvalSample], origin: np.ndarray | None) -> Iterator[dict]:
@@ -209,7 +209,7 @@ class EvalSetup:
         else:
             people = model.predict(clouds, sensor_origin=origin, skeleton=name, **clips)
         for person in people:
-            yield {} if person.pose is None else self._picked(person.pose, ())
+            yield {} if person.pose is None else self._prediction_columns(person.pose, ())
 
     def _predict_dapt(self, samples: list[EvalSample], origin: np.ndarray | None) -> Iterator[dict]:
         """One pass about the released code's center."""
@@ -227,7 +227,7 @@ class EvalSetup:
                 [person.points.astype(float) for person in batch_samples], centers, origin, **clip
             )
             for k, (row, center) in enumerate(zip(rows, centers, strict=True)):
-                values = self._picked(estimates, k)
+                values = self._prediction_columns(estimates, k)
                 values["pred"] = values["pred"] + center
                 answers[row] = values if np.isfinite(values["pred"]).all() else {}
         yield from (answers[row] for row in range(len(samples)))
@@ -237,7 +237,7 @@ class EvalSetup:
         """Of a clip of the network, 1 for a network of single frames."""
         return getattr(self.model.backend, "frames", 1)
 
-    def may_part(self, samples: Sequence[EvalSample], person: EvalSample) -> bool:
+    def can_split(self, samples: Sequence[EvalSample], person: EvalSample) -> bool:
         """Whether the clips of these samples are the same without and with the person who comes next."""
         sequence = person.sample.sequence
         if self._frames == 1 or self.dataset.limit is not None or samples[-1].sample.sequence != sequence:
@@ -263,7 +263,7 @@ class EvalSetup:
         }
         return {"clips": Clips(windows=np.concatenate([clip_windows(run) for run in runs]), **surroundings)}
 
-    def _picked(self, estimates, index) -> dict:
+    def _prediction_columns(self, estimates, index) -> dict:
         """Of a pose, or of person `index` of many: the scored joints."""
         joint_indices = self.model.skeleton.map_to(self.joints)
         joint_values = {name: getattr(estimates, name) for name in ("confidence", "spread", "visible")}
@@ -273,7 +273,7 @@ class EvalSetup:
         person_values = {name: value[index] for name in PER_PERSON if (value := getattr(estimates, name)) is not None}
         return joint_values | person_values | {"pred": estimates.joints[index][..., joint_indices, :]}
 
-    def _known(self, person: EvalSample) -> dict[str, Any]:
+    def _label_columns(self, person: EvalSample) -> dict[str, Any]:
         sample, box = person.sample, person.sample.box
         joint_indices = self.dataset.skeleton.map_to(self.joints)
         return {

@@ -50,21 +50,11 @@ _MARGIN = 0.05
 # ---- perturbations: points (n, 3) m with the sensor at the origin, box, amount, rng -> points; 0 changes nothing
 
 
-def jittered_points(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
-    """Every coordinate moved by a normal step, cut at `amount` m, of half as much as standard deviation."""
-    return jitter(points, sigma=_SIGMA * amount, clip=amount, rng=rng)
-
-
 def with_clusters(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
     """Two clusters of `amount` clutter points each about the person."""
     center = center_of(points)
     # the places stay where they are while the clusters grow
     return np.concatenate([points, *(noise_cluster(center, count=int(amount), rng=r) for r in rng.spawn(_CLUSTERS))])
-
-
-def with_dropout(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
-    """All but a random share `amount` of the points; what is dropped at one share is dropped at each larger one."""
-    return points[random_keep(len(points), share=amount, rng=rng)]
 
 
 def behind_an_edge(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
@@ -92,11 +82,6 @@ def moved_box(points: np.ndarray, box: Box | None, amount: float, rng: np.random
     return replace(box, center=box.center + amount * np.array([np.cos(angle), np.sin(angle), 0]))
 
 
-def inside_moved_box(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
-    """What of the points lies in the `moved_box`."""
-    return points[moved_box(points, box, amount, rng).contains(points)]
-
-
 def out_of_level(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
     """Everything turned by `amount` rad about a random level axis through the sensor, as if that were mounted askew and
     took its own axis for up."""
@@ -120,7 +105,7 @@ class Perturbation:
 
 PERTURBATIONS = {
     "jitter": Perturbation(
-        jittered_points,
+        lambda points, box, amount, rng: jitter(points, sigma=_SIGMA * amount, clip=amount, rng=rng),
         "point jitter, clip in cm",
         (0.02, 0.05, 0.1, 0.15, 0.2),
         "normal steps on every coordinate, cut at the clip, of half the clip as standard deviation",
@@ -133,7 +118,11 @@ PERTURBATIONS = {
         scale=1,
     ),
     "dropped": Perturbation(
-        with_dropout, "points dropped, %", (0.25, 0.5, 0.75, 0.9, 0.95), "a random share of the points is gone"
+        # what is dropped at one share is dropped at each larger one
+        lambda points, box, amount, rng: points[random_keep(len(points), share=amount, rng=rng)],
+        "points dropped, %",
+        (0.25, 0.5, 0.75, 0.9, 0.95),
+        "a random share of the points is gone",
     ),
     "occluder": Perturbation(
         behind_an_edge,
@@ -142,7 +131,7 @@ PERTURBATIONS = {
         "all is gone that lies on one side of an edge, straight as the sensor sees it, of a random direction",
     ),
     "crop": Perturbation(
-        inside_moved_box,
+        lambda points, box, amount, rng: points[moved_box(points, box, amount, rng).contains(points)],
         "box displaced, cm",
         (0.05, 0.1, 0.2, 0.3, 0.4),
         "the crop's box is moved in a random level direction; what it leaves is lost, nothing new comes in unless "
@@ -239,12 +228,14 @@ def people_to_perturb(setup: EvalSetup) -> list[CroppedPerson]:
         rows = set(evenly_drawn(setup.dataset.count, PEOPLE).tolist())
         samples = [person for k, person in enumerate(setup.dataset) if k in rows]
     # who is not scored is not perturbed either
-    pairs = [(setup.shown(person)[0], person) for person in samples]
+    pairs = [(setup.crop_sample(person)[0], person) for person in samples]
     people = [
         CroppedPerson(shown=crop, whole=person) for crop, person in pairs if crop is not None and len(crop.points)
     ]
     if not people:
-        raise InputError(f"none of the {_who(setup)} has a point to perturb: score more people, or leave stability out")
+        raise InputError(
+            f"none of the {_people_text(setup)} has a point to perturb: score more people, or leave stability out"
+        )
     return people
 
 
@@ -292,7 +283,7 @@ def study(
             notes.append("other sensors need people cast anew: in the clone, pip install '.[synth]'")
     else:
         notes.append("other sensors: people cast anew have no released center")
-    who, ends = f"{len(people):,} {_who(setup)}", end_errors(predictions)
+    who, ends = f"{len(people):,} {_people_text(setup)}", end_errors(predictions)
     return Stability(setting=setup.setting, who=who, curves=tuple(curves), ends=ends, notes=tuple(notes))
 
 
@@ -317,7 +308,7 @@ def end_errors(predictions: Predictions) -> tuple[End, ...]:
     return tuple(ends)
 
 
-def _who(setup: EvalSetup) -> str:
+def _people_text(setup: EvalSetup) -> str:
     return f"{'clean ' if setup.setting.kind == BENCH else ''}people of {setup.setting.dataset}"
 
 

@@ -93,7 +93,7 @@ def _chunks(setup: EvalSetup) -> Iterator[list[EvalSample]]:
     """The people as the protocol shows them, some at a time, whole clips for networks of clips."""
     chunk: list[EvalSample] = []
     for person in _shown(setup):
-        if len(chunk) >= _CHUNK and setup.may_part(chunk, person):
+        if len(chunk) >= _CHUNK and setup.can_split(chunk, person):
             yield chunk
             chunk = []
         chunk.append(person)
@@ -104,7 +104,7 @@ def _chunks(setup: EvalSetup) -> Iterator[list[EvalSample]]:
 def _shown(setup: EvalSetup) -> Iterator[EvalSample]:
     """The people as the protocol shows them; who has nothing to show is counted."""
     for person in setup.dataset:
-        cropped_person, reason = setup.shown(person)
+        cropped_person, reason = setup.crop_sample(person)
         if cropped_person is None:
             where = f"{person.sample.sequence}, frame {person.sample.frame}, track {person.sample.track}"
             count_skipped(setup.dataset.skipped, reason, where)

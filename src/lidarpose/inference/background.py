@@ -57,7 +57,7 @@ def learn_background(
     problems: list[InputError] = []
     static_voxels, eighths = None, np.zeros(0, np.int64)
     for rows in np.array_split(np.arange(len(sources)), min(_PARTS, len(sources))):
-        voxels, counts, num_read = np.zeros(0, np.int64), np.zeros(0, np.int64), 0
+        scan_voxels = []
         for row in rows:
             try:
                 points = _points(sources[row], columns)
@@ -67,14 +67,14 @@ def learn_background(
                     raise
                 problems.append(problem)
                 continue
-            num_read += 1
             grid = grid or _Grid(points)
             scan_eighths = grid.eighths(points)
             eighths = _ascending(np.concatenate([eighths, scan_eighths]))
-            voxels, counts = _counted(voxels, counts, grid.voxels(scan_eighths))
-        if not num_read:
+            scan_voxels.append(grid.voxels(scan_eighths))
+        if not scan_voxels:
             continue
-        frequent_voxels = voxels[counts >= _SHARE * num_read]
+        voxels, counts = np.unique(np.concatenate(scan_voxels), return_counts=True)
+        frequent_voxels = voxels[counts >= _SHARE * len(scan_voxels)]
         static_voxels = (
             frequent_voxels
             if static_voxels is None
@@ -131,15 +131,6 @@ class _Grid:
     def middles(self, eighths: np.ndarray) -> np.ndarray:
         """(n, 3) m."""
         return (_unpacked(eighths) + 0.5) * (_VOXEL / 2) + self.corner
-
-
-def _counted(numbers: np.ndarray, counts: np.ndarray, new_numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ascending numbers with their counts, each of `new_numbers` counted once more."""
-    all_numbers = _ascending(np.concatenate([numbers, new_numbers]))
-    totals = np.zeros(len(all_numbers), np.int64)
-    totals[np.searchsorted(all_numbers, numbers)] = counts
-    totals[np.searchsorted(all_numbers, new_numbers)] += 1
-    return all_numbers, totals
 
 
 def _ascending(numbers: np.ndarray) -> np.ndarray:

@@ -101,7 +101,7 @@ def oversize_warning(points: np.ndarray, pose: Pose) -> str | None:
     )
 
 
-def company_warning(pose: Pose, *, in_box: bool = False) -> str | None:
+def person_count_warning(pose: Pose, *, in_box: bool = False) -> str | None:
     """The points show nobody, or more people than the one whose pose it is; in_box: a box says who is meant."""
     if pose.person is not None and pose.person < _NOBODY:
         return f"the points look unlike a person (person {float(pose.person):.2f}): perhaps nobody is there"
@@ -126,7 +126,7 @@ def upside_down_warning(pose: Pose, turned: Pose | None) -> str | None:
     return "upside down the person is found with more certainty: does the up axis point down? try up -z"
 
 
-def lies(pose: Pose, points: np.ndarray) -> bool:
+def is_lying(pose: Pose, points: np.ndarray) -> bool:
     """The trunk of a pose, z up, is nearer to level than to upright, or its points (n, 3) m are.
 
     A network that has seen few people lie draws a person standing in points that lie.
@@ -208,7 +208,7 @@ def check_scan(scan: Scan, people: Poses) -> list[str]:
     # one wrong axis is one warning, and people who are cut short by their boxes only seem to lie
     axis = flat_along_another_axis(scan) if is_given else None
     if not (axis or warnings.get(wide_boxes) or warnings.get(boxes_at_feet)):
-        axis = everybody_lies(scan, people)
+        axis = all_lying(scan, people)
     return [warning for warning in (*warnings.values(), axis) if warning]
 
 
@@ -271,10 +271,10 @@ def flat_along_another_axis(scan: Scan) -> str | None:
     return f"the points extend least along {axis}, so {scan.up} is hardly the input's up axis: try {_option(axis)}"
 
 
-def everybody_lies(scan: Scan, people: Poses) -> str | None:
+def all_lying(scan: Scan, people: Poses) -> str | None:
     """Everybody lies down, as where another axis is up. people: in the level frame."""
     posed_people = [(person.pose, person.points) for person in people if person.pose is not None]
-    if not posed_people or not all(lies(pose, points) for pose, points in posed_people):
+    if not posed_people or not all(is_lying(pose, points) for pose, points in posed_people):
         return None
     other_options = ", or ".join(_option(axis) for axis in "zyx" if axis != scan.upright_axis)
     subject = "the person lies" if len(posed_people) == 1 else f"all {len(posed_people)} people lie"

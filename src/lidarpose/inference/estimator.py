@@ -114,7 +114,7 @@ class PoseEstimator:
             centers = np.stack([center_of(points) for points in clouds])
             first_pass = self._transformed(self._first, clouds, centers, origin, clip)
             if box_centers is not None and first_pass.second_person is not None:
-                centers, first_pass = self._of_two(clouds, centers, box_centers, origin, first_pass)
+                centers, first_pass = self._recenter_on_boxes(clouds, centers, box_centers, origin, first_pass)
             root = first_pass.joints[:, self._middle].mean(1)
             # an answer that is no number stays one
             shift = np.round(np.clip(root, -WINDOW / 2, WINDOW / 2) / _CENTER_STEP) * _CENTER_STEP
@@ -132,7 +132,7 @@ class PoseEstimator:
             poses.append(replace(mean_pose, joints=mean_pose.joints[k] + centers[k], **per_person))
         return poses
 
-    def _of_two(
+    def _recenter_on_boxes(
         self,
         clouds: list[np.ndarray],
         centers: np.ndarray,

@@ -184,7 +184,7 @@ def as_origin(value: object) -> np.ndarray | None:
 
 def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """points (n, 3) m as of `only_returns`, at most `MAX_POINTS` of them, and a note for each thing done."""
-    points, notes = _usable(points)
+    points, notes = _finite_returns(points)
     if len(points) > MAX_POINTS:
         notes.append(
             f"thinned from {len(points)} to {MAX_POINTS} points: crop closer to the person if there are others"
@@ -209,11 +209,11 @@ def rounding_warning(points: np.ndarray) -> str | None:
 def only_returns(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """points (n, 3) m without rows that arithmetic would choke on or that are no returns, and a note for each kind, and
     of rounded coordinates."""
-    points, notes = _usable(points)
+    points, notes = _finite_returns(points)
     return points, [*notes, *filter(None, [rounding_warning(points)])]
 
 
-def _usable(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
+def _finite_returns(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     notes = []
     is_usable = within_reach(points)
     if num_dropped := int((~is_usable).sum()):

@@ -12,10 +12,10 @@ from lidarpose.errors import InputError, check_int, check_name, first_names, mis
 from lidarpose.inference.backend import Backend, OnnxBackend, exported_beside
 from lidarpose.inference.checks import (
     UPSIDE_DOWN,
-    company_warning,
-    lies,
+    is_lying,
     looks_unsure,
     oversize_warning,
+    person_count_warning,
     unit_warning,
     upside_down_warning,
 )
@@ -211,7 +211,7 @@ class Predictor(PoseEstimator):
         Raises:
             InputError: arrays of another shape or type.
         """
-        target_skeleton = self.in_skeleton(skeleton)
+        self.in_skeleton(skeleton)
         if clips is not None and getattr(self.backend, "frames", 1) == 1:
             raise InputError(f"clips are for networks of clips, {self.model['name']} reads single frames")
         if find and boxes is not None:
@@ -233,10 +233,8 @@ class Predictor(PoseEstimator):
         is_one = not _is_many(points)
         clouds = [as_points(points)] if is_one else [as_points(cloud, f"points[{i}]") for i, cloud in enumerate(points)]
         clips = None if clips is None else clips.checked(len(clouds))
-        people = self._people_of_clouds(clouds, origin, target_skeleton, progress, clips)
-        if is_one:
-            return people[0]
-        return Poses(people=tuple(people), skeleton=target_skeleton, model=self.model)
+        poses = self._predict_clouds(clouds, origin, skeleton, progress, clips)
+        return poses.people[0] if is_one else poses
 
     def predict_clip(
         self,
@@ -260,20 +258,22 @@ class Predictor(PoseEstimator):
         Raises:
             InputError: as `predict` does, and for other times.
         """
-        target_skeleton = self.in_skeleton(skeleton)
+        self.in_skeleton(skeleton)
         if not _is_many(clouds):
             raise InputError("predict_clip: expected a list of clouds, one a frame, got one cloud: use predict")
         seconds = clip_times(times, len(clouds))
         clips = Clips.of_run(len(clouds)) if len(clouds) and getattr(self.backend, "frames", 1) > 1 else None
         frame_clouds = [as_points(cloud, f"clouds[{i}]") for i, cloud in enumerate(clouds)]
-        people = self._people_of_clouds(frame_clouds, as_origin(sensor_origin), target_skeleton, progress, clips)
-        track = TrackPoses.of_poses(seconds, [person.pose for person in people], target_skeleton)
+        poses = self._predict_clouds(frame_clouds, as_origin(sensor_origin), skeleton, progress, clips)
+        track = TrackPoses.of_poses(seconds, [person.pose for person in poses], poses.skeleton)
         steady_poses = filter_track(track) if live else smooth(track).poses()
         frames = [
-            replace(person, id=i, pose=_with_own(person, pose), warnings=_steady_warnings(person, pose))
-            for i, (person, pose) in enumerate(zip(people, steady_poses, strict=True))
+            replace(
+                person, id=i, pose=_with_person_probabilities(person, pose), warnings=_steady_warnings(person, pose)
+            )
+            for i, (person, pose) in enumerate(zip(poses, steady_poses, strict=True))
         ]
-        return Poses(people=tuple(frames), skeleton=target_skeleton, model=self.model)
+        return replace(poses, people=tuple(frames))
 
     def predict_in(
         self,
@@ -282,13 +282,15 @@ class Predictor(PoseEstimator):
         skeleton: str | None = None,
         progress: bool = False,
         *,
+        clips: Clips | None = None,
         pelvises: np.ndarray | None = None,
         box_centers: np.ndarray | None = None,
         check_upside_down: bool = True,
     ) -> Poses:
-        """As `predict` of clouds (n, 3) m, of which more is known.
+        """As `predict` of clouds (n, 3) m, of which more is known; of rounded coordinates nothing is said.
 
         Args:
+            clips: as in `predict`, checked.
             pelvises: (N, 3) m, nearly, where each cloud shows one person alone: the pass that finds them is spared.
             box_centers: (N, 3) m of the boxes that cut the clouds out: where a cloud shows two people, who is nearer to
                 the center is meant.
@@ -296,40 +298,10 @@ class Predictor(PoseEstimator):
                 costs as much as the pose.
         """
         target_skeleton = self.in_skeleton(skeleton)
-        people = self._people(
-            list(clouds),
-            origin,
-            target_skeleton,
-            progress,
-            centers=pelvises,
-            box_centers=box_centers,
-            check_upside_down=check_upside_down,
-        )
-        return Poses(people=tuple(people), skeleton=target_skeleton, model=self.model)
-
-    def _people_of_clouds(self, clouds, origin, target_skeleton, progress, clips) -> list[PersonPose]:
-        """Of clouds as they were given: of scans' people the scan says how their coordinates are rounded."""
-        people = self._people(clouds, origin, target_skeleton, progress, clips)
-        for i, cloud in enumerate(clouds):
-            if warning := rounding_warning(cloud[within_reach(cloud)]):
-                people[i] = replace(people[i], warnings=(warning, *people[i].warnings))
-        return people
-
-    def _people(
-        self,
-        clouds,
-        origin,
-        target_skeleton,
-        progress,
-        clips=None,
-        centers=None,
-        box_centers=None,
-        check_upside_down=True,
-    ) -> list[PersonPose]:
         cleaned_clouds = [clean(cloud) for cloud in clouds]
         is_usable = np.array([not is_few(points) for points, _ in cleaned_clouds], bool)
-        in_box = centers is not None or box_centers is not None
-        best_poses = self._best(cleaned_clouds, is_usable, origin, progress, clips, centers, box_centers)
+        in_box = pelvises is not None or box_centers is not None
+        best_poses = self._best(cleaned_clouds, is_usable, origin, progress, clips, pelvises, box_centers)
         poses: list[Pose | None] = [None] * len(clouds)
         unsure_rows: list[int] = []
         for i, (points, notes) in enumerate(cleaned_clouds):
@@ -344,24 +316,34 @@ class Predictor(PoseEstimator):
                 continue
             pose, part = best_poses[i]
             poses[i] = target_pose = pose.to(target_skeleton)
-            notes += filter(None, (unit_note, company_warning(pose, in_box=in_box), _range_warning(target_pose)))
+            notes += filter(None, (unit_note, person_count_warning(pose, in_box=in_box), _range_warning(target_pose)))
             if unit_note:
                 continue
             if warning := oversize_warning(points, pose):
                 notes.append(warning)
-            elif centers is None and check_upside_down and looks_unsure(pose, part):
+            elif pelvises is None and check_upside_down and looks_unsure(pose, part):
                 unsure_rows.append(i)
         # a second look at the few whose pose looks unsure; where pelvises are known people were seen upright before
         flipped_clouds = [best_poses[i][1] * UPSIDE_DOWN for i in unsure_rows]
         flipped_poses = self.poses(flipped_clouds, None if origin is None else origin * UPSIDE_DOWN)
         for i, flipped_pose in zip(unsure_rows, flipped_poses, strict=True):
             # of somebody who lies another axis may be up, which is said of all together
-            if (warning := upside_down_warning(best_poses[i][0], flipped_pose)) and not lies(*best_poses[i]):
+            if (warning := upside_down_warning(best_poses[i][0], flipped_pose)) and not is_lying(*best_poses[i]):
                 cleaned_clouds[i][1].append(warning)
-        return [
+        people = tuple(
             PersonPose(pose=pose, skeleton=target_skeleton, points=points, warnings=tuple(notes), model=self.model)
             for pose, (points, notes) in zip(poses, cleaned_clouds, strict=True)
-        ]
+        )
+        return Poses(people=people, skeleton=target_skeleton, model=self.model)
+
+    def _predict_clouds(self, clouds, origin, skeleton, progress, clips) -> Poses:
+        """Of clouds as they were given: of scans' people the scan says how their coordinates are rounded."""
+        poses = self.predict_in(clouds, origin, skeleton, progress, clips=clips)
+        people = list(poses)
+        for i, cloud in enumerate(clouds):
+            if warning := rounding_warning(cloud[within_reach(cloud)]):
+                people[i] = replace(people[i], warnings=(warning, *people[i].warnings))
+        return replace(poses, people=tuple(people))
 
     def _best(
         self, cleaned_clouds, is_usable, origin, progress, clips, centers, box_centers
@@ -388,12 +370,12 @@ class Predictor(PoseEstimator):
             if pose is not None:
                 poses_by_person.setdefault(i, []).append((pose, part))
         return {
-            i: _meant(person_poses, None if box_centers is None else box_centers[i])
+            i: _select_pose(person_poses, None if box_centers is None else box_centers[i])
             for i, person_poses in poses_by_person.items()
         }
 
 
-def _meant(answers: list[tuple[Pose, np.ndarray]], box_center: np.ndarray | None) -> tuple[Pose, np.ndarray]:
+def _select_pose(answers: list[tuple[Pose, np.ndarray]], box_center: np.ndarray | None) -> tuple[Pose, np.ndarray]:
     """Of the answers about candidates of a crop, that of the whole cloud first, the one that is meant: the surest, in a
     box the surest of whoever is nearest to its center. Whoever else is there stands beside them as a second person.
 
@@ -428,7 +410,7 @@ def _range_warning(pose: Pose) -> str | None:
     return f"at the end of the heatmap's range, so perhaps farther out than given: {first_names(names)}"
 
 
-def _with_own(person: PersonPose, pose: Pose | None) -> Pose | None:
+def _with_person_probabilities(person: PersonPose, pose: Pose | None) -> Pose | None:
     """A steady pose with what the network says of its frame as a whole, which is not smoothed; of a frame that was
     filled in nothing is said."""
     if pose is None or person.pose is None:

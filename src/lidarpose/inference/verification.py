@@ -169,7 +169,7 @@ def _highest_score(detections: Detections, header: dict) -> np.ndarray:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class People:
+class VerifiedPeople:
     """N people, level, surest first: boxes, rows of their points, pelvises (N, 3) m, verified (N,) bool, logits (N,),
     which scores rise with, NaN of known people; rejected (R, 3) m: detections that were nobody."""
 
@@ -190,7 +190,7 @@ def verified(
     max_people: int | None = None,
     known: KnownPlaces | None = None,
     detect_beside: DetectBeside | None = None,
-) -> People:
+) -> VerifiedPeople:
     """The people among the detections, surest first, in boxes about their poses; of known people about where they are
     expected.
 
@@ -209,7 +209,7 @@ def verified(
     # who is expected needs neither verdict nor pose
     posed_from = thresholds if detect_beside is None else np.minimum(thresholds, _SURE_SCORE)
     posed_from = np.where(known_index < 0, posed_from, np.inf)
-    places = _assessed(detections, points, origin, header, posed_from, max_people, possible_rows)
+    places = _score_detections(detections, points, origin, header, posed_from, max_people, possible_rows)
     is_nobody = places.scores[possible_rows] < _NOBODY * least_score
     rejected = detections.centers[possible_rows[is_nobody & (known_index[possible_rows] < 0)]]
     known_boxes: dict[int, Box] = {}
@@ -219,13 +219,13 @@ def verified(
         places.scores[known_rows] = [box.score for box in known_boxes.values()]
         places.pelvises[known_rows] = known.pelvises[known_index[known_rows]]
     if detect_beside is not None:
-        places = _with_hidden(places, known_boxes, points, origin, header, least_score, max_people, detect_beside)
+        places = _add_people_beside(places, known_boxes, points, origin, header, least_score, max_people, detect_beside)
         thresholds = np.append(thresholds, np.full(len(places.scores) - len(thresholds), least_score))
     places.pelvises[places.scores < thresholds] = np.nan
-    people = _boxed(places, points, least_score, max_people, known_boxes)
+    people = _fit_boxes(places, points, least_score, max_people, known_boxes)
     people = _without_repeats(people, places, points, origin)
     kept_rows = [row for row, _, _ in people]
-    return People(
+    return VerifiedPeople(
         boxes=[replace(box, id=number) for number, (_, box, _) in enumerate(people)],
         rows=[own_rows for _, _, own_rows in people],
         pelvises=places.pelvises[kept_rows],
@@ -235,8 +235,12 @@ def verified(
     )
 
 
+# of a person: the row of the detection, the box, and rows of the points in it
+_FittedBox = tuple[int, Box, np.ndarray]
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Assessed:
+class _ScoredDetections:
     """What is known of D detections: scores and logits (D,), see `final_score`, NaN where they were not looked at;
     mounted (D,), the probability; joints (D, J, 3) and pelvises (D, 3) m, NaN of who is not posed; near_rows: of each
     the rows of the points about it."""
@@ -248,7 +252,7 @@ class _Assessed:
     pelvises: np.ndarray
     near_rows: list[np.ndarray]
 
-    def joined(self, other: "_Assessed", other_rows: np.ndarray) -> "_Assessed":
+    def joined(self, other: "_ScoredDetections", other_rows: np.ndarray) -> "_ScoredDetections":
         """These, then the others, which know the points of some rows alone."""
         near_rows = self.near_rows + [other_rows[rows] for rows in other.near_rows]
         arrays = {
@@ -256,10 +260,10 @@ class _Assessed:
             for name, values in vars(self).items()
             if name != "near_rows"
         }
-        return _Assessed(**arrays, near_rows=near_rows)
+        return _ScoredDetections(**arrays, near_rows=near_rows)
 
 
-def _assessed(
+def _score_detections(
     detections: Detections,
     points: np.ndarray,
     origin: np.ndarray | None,
@@ -267,7 +271,7 @@ def _assessed(
     posed_from: np.ndarray,
     max_people: int | None,
     rows: np.ndarray,
-) -> _Assessed:
+) -> _ScoredDetections:
     """Verifies the detections of some rows, and poses those whose scores are at least `posed_from` (D,); where that is
     infinite nobody is verified."""
     near_rows = [np.zeros(0, int)] * len(detections)
@@ -282,13 +286,13 @@ def _assessed(
         posed_rows = posed_rows[_surest_first(scores[posed_rows], logits[posed_rows])][: _PLACES * max_people]
     poses = crops.poses(posed_rows)
     pelvises = poses.joints[:, poses.skeleton.index("pelvis")].copy()
-    return _Assessed(
+    return _ScoredDetections(
         scores=scores, logits=logits, mounted=mounted, joints=poses.joints, pelvises=pelvises, near_rows=near_rows
     )
 
 
-def _with_hidden(
-    places: _Assessed,
+def _add_people_beside(
+    places: _ScoredDetections,
     known_boxes: dict[int, Box],
     points: np.ndarray,
     origin: np.ndarray | None,
@@ -296,10 +300,10 @@ def _with_hidden(
     least_score: float,
     max_people: int | None,
     detect_beside: DetectBeside,
-) -> _Assessed:
+) -> _ScoredDetections:
     """The places, and then those beside sure people, of what is left without these people's points."""
     sure_pelvises = np.where(places.scores[:, None] >= _SURE_SCORE, places.pelvises, np.nan)
-    people = _boxed(replace(places, pelvises=sure_pelvises), points, _SURE_SCORE, None, known_boxes)
+    people = _fit_boxes(replace(places, pelvises=sure_pelvises), points, _SURE_SCORE, None, known_boxes)
     posed_rows = [row for row, _, _ in people if row not in known_boxes]
     if not posed_rows:
         return places
@@ -307,14 +311,14 @@ def _with_hidden(
     hidden = detect_beside(other_rows, places.pelvises[posed_rows, :2])
     posed_from = np.full(len(hidden), least_score)
     rows = np.flatnonzero(_highest_score(hidden, header) >= posed_from)
-    hidden_places = _assessed(hidden, points[other_rows], origin, header, posed_from, max_people, rows)
+    hidden_places = _score_detections(hidden, points[other_rows], origin, header, posed_from, max_people, rows)
     return places.joined(hidden_places, other_rows)
 
 
 def _on_people(
-    places: _Assessed, people: list[tuple[int, Box, np.ndarray]], points: np.ndarray, known_boxes: dict[int, Box]
+    places: _ScoredDetections, people: list[_FittedBox], points: np.ndarray, known_boxes: dict[int, Box]
 ) -> np.ndarray:
-    """(n,) bool: which points are on the bodies of people, as of `_boxed`, or in the boxes of known ones."""
+    """(n,) bool: which points are on the bodies of people, as of `_fit_boxes`, or in the boxes of known ones."""
     is_body = np.zeros(len(points), bool)
     starts, ends = np.array(_bundled(DEFAULT).header.skeleton.bones).T
     for row, _, own_rows in people:
@@ -330,10 +334,10 @@ def _on_people(
 
 
 def _without_repeats(
-    people: list[tuple[int, Box, np.ndarray]], places: _Assessed, points: np.ndarray, origin: np.ndarray | None
-) -> list[tuple[int, Box, np.ndarray]]:
-    """The people as of `_boxed`, without those whom the points in their boxes alone show where a surer one is: what is
-    left of somebody's points may look like one more beside them."""
+    people: list[_FittedBox], places: _ScoredDetections, points: np.ndarray, origin: np.ndarray | None
+) -> list[_FittedBox]:
+    """The people as of `_fit_boxes`, without those whom the points in their boxes alone show where a surer one is: what
+    is left of somebody's points may look like one more beside them."""
     pelvises = places.pelvises[[row for row, _, _ in people]].reshape(-1, 3)
     distance = np.linalg.norm(pelvises[:, None] - pelvises[None], axis=-1)
     # to the nearest surer one
@@ -350,16 +354,20 @@ def _without_repeats(
     return [person for person, is_gone in zip(people, is_repeated, strict=True) if not is_gone]
 
 
-def _boxed(
-    places: _Assessed, points: np.ndarray, least_score: float, max_people: int | None, known_boxes: dict[int, Box]
-) -> list[tuple[int, Box, np.ndarray]]:
-    """The different people of places that have a pelvis, the surest first: rows, boxes, and rows of their points; of
-    known people, by row, the boxes where they are expected."""
+def _fit_boxes(
+    places: _ScoredDetections,
+    points: np.ndarray,
+    least_score: float,
+    max_people: int | None,
+    known_boxes: dict[int, Box],
+) -> list[_FittedBox]:
+    """The different people of places that have a pelvis, the surest first; known_boxes: by row, where known people are
+    expected."""
     scores, pelvises = places.scores, places.pelvises
     skeleton = _bundled(DEFAULT).header.skeleton
     person_rows = surest_rows(scores, pelvises, places.logits)
     is_owned = np.zeros(len(points), bool)
-    people: list[tuple[int, Box, np.ndarray]] = []
+    people: list[_FittedBox] = []
     for i in person_rows:
         if i in known_boxes:
             box = known_boxes[i]

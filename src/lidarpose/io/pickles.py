@@ -158,7 +158,7 @@ class _DataUnpickler(pickle._Unpickler):
             raise TypeError(f"a call of {name}")
         else:
             return _Stub(name, args)
-        return self.charged(result)
+        return self.within_budget(result)
 
     def set_state(self) -> None:
         """The stub on the stack becomes what it stands for."""
@@ -169,9 +169,9 @@ class _DataUnpickler(pickle._Unpickler):
             value: Any = _dtype(stub.args[0], state[1])
         elif stub.name == _RECONSTRUCT:
             _, shape, dtype, is_fortran, data = state
-            value = self.charged(_array(data, dtype, shape, is_fortran))
+            value = self.within_budget(_array(data, dtype, shape, is_fortran))
         elif stub.name.startswith("chumpy."):
-            value = self.charged(_chumpy(stub.name, state))
+            value = self.within_budget(_chumpy(stub.name, state))
         else:
             value = _dense(stub.name, state, self.dense_left)
             # many entries may add up in one number
@@ -179,7 +179,7 @@ class _DataUnpickler(pickle._Unpickler):
         self.stack[-1] = value
         object.__setattr__(stub, "value", value)
 
-    def charged(self, value: Any) -> Any:
+    def within_budget(self, value: Any) -> Any:
         """The value, once it is sure that all values together do not outgrow the file."""
         self.copies_left -= getattr(value, "nbytes", None) or (len(value) if hasattr(value, "__len__") else 0)
         if self.copies_left < 0:

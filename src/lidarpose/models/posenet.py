@@ -69,9 +69,9 @@ class Targets:
 
     joints (B, J, 3) m in the person's frame; known (B, J) bool: false where the truth is not known, for a dataset that
     labels some of the skeleton's joints; visible (B, J): 1 where some point lies near the joint, 0 where none does, NaN
-    where that is not known, see `train.augment.seen`; part (B, F) int64, the majority part of each fine voxel's points,
-    -1 where padded or unknown; person (B, 2): 1 where the crop shows a person, and a second one, 0 where it does not,
-    NaN where that is not known.
+    where that is not known, see `train.augment.visible_joints`; part (B, F) int64, the majority part of each fine
+    voxel's points, -1 where padded or unknown; person (B, 2): 1 where the crop shows a person, and a second one, 0
+    where it does not, NaN where that is not known.
     """
 
     joints: Tensor

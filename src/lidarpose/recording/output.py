@@ -17,7 +17,7 @@ from zlib import crc32
 
 from lidarpose.errors import InputError, counted
 from lidarpose.io.files import check_writable, file_error, write_error
-from lidarpose.io.sources import DamagedFrame, Frame, Source
+from lidarpose.io.sources import DamagedFrame, Frame, FrameSource
 from lidarpose.progress import Progress
 from lidarpose.recording.coordinates import in_world
 from lidarpose.recording.predict_recording import FramePoses, FramePredictor
@@ -201,7 +201,7 @@ class Summary:
 
 
 def write_recording(
-    source: Source,
+    source: FrameSource,
     predictor: FramePredictor,
     result: Path,
     *,
@@ -265,7 +265,7 @@ def nothing_read(name: str, frames: int, first_error: str | None) -> InputError:
     return file_error(name, f"of {counted(frames, 'frame')} none can be read, the first: {first_error}")
 
 
-def _add_frames(source: Source, predictor: FramePredictor, part: PartFile) -> None:
+def _add_frames(source: FrameSource, predictor: FramePredictor, part: PartFile) -> None:
     """Poses the frames that are not in the part yet."""
     frames = source.frames()
     if part.state is not None and part.last is not None:

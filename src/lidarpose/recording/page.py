@@ -8,7 +8,7 @@ import numpy as np
 from lidarpose.arrays import evenly_spaced
 from lidarpose.errors import counted
 from lidarpose.geometry import transform_points
-from lidarpose.io.sources import Frame, Source
+from lidarpose.io.sources import Frame, FrameSource
 from lidarpose.recording.coordinates import FixedFrame
 from lidarpose.recording.picture import in_fixed_frame
 from lidarpose.sample import Pose
@@ -65,7 +65,7 @@ class RecordingPage:
         track.way += float(np.linalg.norm(place - track.place))
         track.frames, track.last, track.place = track.frames + 1, time, place
 
-    def render(self, source: Source, skeleton: Skeleton, *, title: str) -> bytes:
+    def render(self, source: FrameSource, skeleton: Skeleton, *, title: str) -> bytes:
         """The HTML; the source is read again for the points of what is shown."""
         shown = {about["frame"]: k for k, (about, _, _) in enumerate(self._lines)}
         is_surroundings = set(evenly_spaced(len(shown), _SURROUNDINGS).tolist())

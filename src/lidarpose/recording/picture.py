@@ -8,7 +8,7 @@ import numpy as np
 from lidarpose.arrays import evenly_spaced
 from lidarpose.errors import counted
 from lidarpose.geometry import transform_points
-from lidarpose.io.sources import Frame, Source
+from lidarpose.io.sources import Frame, FrameSource
 from lidarpose.recording.coordinates import FixedFrame, moved_yaw
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import Skeleton
@@ -62,7 +62,7 @@ class TrajectoryPicture:
                 if box is not None:
                     self._yaws[person["track"]] = box.yaw
 
-    def draw(self, source: Source, skeleton: Skeleton, *, title: str) -> bytes:
+    def draw(self, source: FrameSource, skeleton: Skeleton, *, title: str) -> bytes:
         """The PNG; the source is read again for the points of some frames."""
         paths = {id: np.array(places) for id, places in self._ways.items()}
         points, poses = self._points(source), None
@@ -107,7 +107,7 @@ class TrajectoryPicture:
             )
             yield Panel(points=person_points, pose=pose, label=label, box=box, distance=float(distance))
 
-    def _points(self, source: Source) -> np.ndarray:
+    def _points(self, source: FrameSource) -> np.ndarray:
         """(n, 3) m of frames from the beginning to the end; of one where the sensor stays."""
         if not self._frames:
             return np.zeros((0, 3))

@@ -17,7 +17,7 @@ from lidarpose.inference.predict_scan import check_choice, is_wide, predict_scan
 from lidarpose.inference.predictor import Predictor
 from lidarpose.inference.results import Poses
 from lidarpose.inference.scan import Scan
-from lidarpose.io.sources import DamagedFrame, Frame, Source, open_source
+from lidarpose.io.sources import DamagedFrame, Frame, FrameSource, open_source
 from lidarpose.io.sources.frame import DEFAULT_RATE
 from lidarpose.models import DEFAULT
 from lidarpose.recording.frame_boxes import FrameBoxes
@@ -86,7 +86,7 @@ class PosingOptions(TypedDict, total=False):
 
 
 def predict_recording(
-    source: "str | os.PathLike | Sequence[str | os.PathLike] | Source",
+    source: "str | os.PathLike | Sequence[str | os.PathLike] | FrameSource",
     *,
     columns: int | None = None,
     topic: str | None = None,

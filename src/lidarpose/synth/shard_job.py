@@ -203,7 +203,7 @@ class Maker:
             people = [generator.person(seed, index)]
         else:
             people = generator.clip(seed, index, frames=CLIP_FRAMES)
-        return {"people": [person_row(p.sample, index=index, frame=f, facts=p.facts) for f, p in enumerate(people)]}
+        return {"people": [person_row(p.sample, index=index, frame=f, info=p.facts) for f, p in enumerate(people)]}
 
     def _street_rows(self, index: int) -> dict[str, list]:
         from lidarpose.synth.street import samples, street

@@ -24,7 +24,7 @@ _OBJECT_ERROR = 0.15
 # how often the sensor's position is kept from the network
 BLIND = 0.3
 # a joint of which the body's surface is seen within this distance is visible, m: hips lie 12 cm deep
-SEEN = 0.18
+VISIBLE_RADIUS = 0.18
 # part of a point of which nothing is known
 UNKNOWN_PART = -1
 # a sample of fewer points after the crop stays whole
@@ -149,7 +149,7 @@ def example(sample: Sample, rng: np.random.Generator, *, refined: float = REFINE
         center = sample.pose.joints[_PELVIS] + rng.normal(0, PELVIS_ERROR, 3)
     origin = None if rng.random() < BLIND else np.zeros(3)
     points, joints = sample.points - center, sample.pose.joints - center
-    visible = seen(joints, points[sample.part > 0]).astype(np.float32)
+    visible = visible_joints(joints, points[sample.part > 0]).astype(np.float32)
     return make_example(rng, points, joints, part=sample.part, visible=visible, view=view_features(center, origin))
 
 
@@ -258,7 +258,7 @@ def make_example(rng: np.random.Generator, points: np.ndarray, joints: np.ndarra
     return Example(points=points.astype(np.float32), joints=joints.astype(np.float32), seed=seed, **arrays)
 
 
-def disturbed(sample: _Sample, *, strays: float, noise: float, rng: np.random.Generator) -> _Sample:
+def add_disturbances(sample: _Sample, *, strays: float, noise: float, rng: np.random.Generator) -> _Sample:
     """A synthetic sample whose points are worse than a sensor's: with probability `strays` clusters of clutter points,
     which no box has cut, and with probability `noise` normal steps of 0.5 to 8 cm on every coordinate.
 
@@ -293,12 +293,12 @@ def _with_clutter(
     return np.concatenate([points, clutter]), np.concatenate([part, np.zeros(len(clutter), part.dtype)])
 
 
-def seen(joints: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """joints (J, 3) m, points (n, 3) m on the body -> (J,) bool: some point lies within `SEEN` of the joint."""
+def visible_joints(joints: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """joints (J, 3) m, points (n, 3) m on the body -> (J,) bool: some point lies within `VISIBLE_RADIUS` of it."""
     if not len(points):
         return np.zeros(len(joints), bool)
     square_distance = (joints**2).sum(1)[:, None] + (points**2).sum(1) - 2 * joints @ points.T
-    return square_distance.min(1) < SEEN**2
+    return square_distance.min(1) < VISIBLE_RADIUS**2
 
 
 def _view(sample: LabeledSample, kind: Augmentation, rng: np.random.Generator) -> tuple[LabeledSample, np.ndarray]:
@@ -327,7 +327,8 @@ def _cropped(sample: LabeledSample, keep_mask: np.ndarray) -> LabeledSample:
     part, visible = part_and_visible(sample)
     # a joint whose points are all gone is not seen any more; points whose part is unknown count as body
     is_body = part != 0
-    is_lost = seen(sample.joints, sample.points[is_body]) & ~seen(sample.joints, sample.points[keep_mask & is_body])
+    was_visible = visible_joints(sample.joints, sample.points[is_body])
+    is_lost = was_visible & ~visible_joints(sample.joints, sample.points[keep_mask & is_body])
     visible = np.where(is_lost & (visible == 1), np.float32(0), visible)
     pose = Pose(joints=sample.joints, visible=visible, skeleton=BODY26, frame="sensor")
     return replace(sample, points=sample.points[keep_mask], part=part[keep_mask], pose=pose)

@@ -8,16 +8,13 @@ all of them together are the same however many there are.
 """
 
 import gc
-import os
 import pickle
 import shutil
 import signal
-import threading
-import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from itertools import accumulate
 from math import floor, gcd
 from operator import attrgetter
@@ -30,6 +27,7 @@ from threadpoolctl import threadpool_limits
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from lidarpose.arrays import evenly_spaced
+from lidarpose.data.writer import end_with_parent
 from lidarpose.errors import InputError
 from lidarpose.sample import CLIP_FRAMES, LabeledSample
 from lidarpose.synth.bodies import PoseBank, smpl_rig
@@ -41,9 +39,9 @@ from lidarpose.train.augment import (
     Augmentation,
     ClipExample,
     Example,
+    add_disturbances,
     augmented,
     clip_example,
-    disturbed,
     example,
     object_example,
     people_in,
@@ -55,8 +53,6 @@ from lidarpose.train.torch_dataset import InMemoryDataset
 BATCHES = 8
 # lanes at most, and so processes
 LANES = 8
-# how often a worker checks that its parent lives, s
-_POLL = 1.0
 # where Linux keeps shared memory, and how much a worker may need, bytes
 _SHARED_MEMORY, _SHARED_OF_WORKER = Path("/dev/shm"), 2**30
 # bytes to whose multiples arrays are aligned in it
@@ -120,7 +116,9 @@ class SyntheticSource:
             return object_example(object_sample, rng, refined=self.refined)
         difficulty = self._difficulty(index, rng)
         sample = self._generator.person(self.seed, index, hard=difficulty).sample
-        result = example(disturbed(sample, strays=self.strays, noise=self.noise, rng=rng), rng, refined=self.refined)
+        result = example(
+            add_disturbances(sample, strays=self.strays, noise=self.noise, rng=rng), rng, refined=self.refined
+        )
         return replace(result, person=people_in(sample)) if self.objects else result
 
     def _difficulty(self, index: int, rng: np.random.Generator) -> float:
@@ -137,10 +135,10 @@ class SyntheticSource:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _OfDataset:
+class DatasetSource:
     """What is shown of datasets: all once an epoch, in an order of its own, each time changed anew.
 
-    dataset: see `InMemoryDataset.load`; strays, noise: see `disturbed`.
+    dataset: see `InMemoryDataset.load`; strays, noise: see `add_disturbances`.
     """
 
     dataset: InMemoryDataset
@@ -158,11 +156,11 @@ class _OfDataset:
         sample = self.dataset.sample(row)
         if not (self.strays or self.noise):
             return sample
-        return disturbed(sample, strays=self.strays, noise=self.noise, rng=rng)
+        return add_disturbances(sample, strays=self.strays, noise=self.noise, rng=rng)
 
 
 @dataclass(frozen=True, kw_only=True)
-class StoredSource(_OfDataset):
+class StoredSource(DatasetSource):
     """The samples of datasets."""
 
     augmentation: Augmentation
@@ -173,7 +171,7 @@ class StoredSource(_OfDataset):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClipSource(_OfDataset):
+class ClipSource(DatasetSource):
     """The clips of datasets. clips, skipped: see `InMemoryDataset.clips`; trans_center, turn: see `clip_example`. Where
     rows follow the clips, all of an epoch begin some frames later, as many as they may without leaving their run."""
 
@@ -193,7 +191,7 @@ class ClipSource(_OfDataset):
         samples = [self._sample(row, rng) for row in rows]
         return clip_example(samples, rng, trans_center=self.trans_center, turn=self.turn)
 
-    def some(self, count: int) -> list[ClipExample]:
+    def validation_clips(self, count: int) -> list[ClipExample]:
         """So many clips at most, evenly spread, to validate on: centered on their points."""
         rng = np.random.default_rng(self.seed)
         clip_rows = self.clips[evenly_spaced(len(self.clips), count), :CLIP_FRAMES]
@@ -237,9 +235,6 @@ class Chunks(IterableDataset):
     rank: int = 0
     ranks: int = 1
 
-    def __post_init__(self):
-        lanes_of(self.batch, self.ranks)
-
     def __iter__(self) -> Iterator[list[Any]]:
         worker = get_worker_info()
         offset, stride = (0, 1) if worker is None else (worker.id, worker.num_workers)
@@ -248,20 +243,18 @@ class Chunks(IterableDataset):
 
     def batches_of(self, chunk: int) -> list[Any]:
         """The batches of one chunk of the run, those before `start` too."""
-        # products of a few thousand numbers: threads of BLAS only get in each other's way
-        with threadpool_limits(limits=1, user_api="blas"):
-            return self._batches_of(chunk)
-
-    def _batches_of(self, chunk: int) -> list[Any]:
         first_number, batch_count = chunk * BATCHES * self.batch, min(self.steps - chunk * BATCHES, BATCHES)
         lane_count = lanes_of(self.batch, self.ranks)
-        lanes = []
-        for offset in range(self.rank, lane_count, self.ranks):
-            numbers = range(first_number + offset, first_number + batch_count * self.batch, lane_count)
-            lanes.append(sorted(map(self.source.example, numbers), key=attrgetter("size")))
         share = self.batch // lane_count
         order = np.random.default_rng([self.seed, RandomStream.BATCH_ORDER, chunk]).permutation(batch_count)
-        return [self.objective.collate([e for lane in lanes for e in lane[k * share : (k + 1) * share]]) for k in order]
+        # products of a few thousand numbers: threads of BLAS only get in each other's way
+        with threadpool_limits(limits=1, user_api="blas"):
+            lanes = []
+            for offset in range(self.rank, lane_count, self.ranks):
+                numbers = range(first_number + offset, first_number + batch_count * self.batch, lane_count)
+                lanes.append(sorted(map(self.source.example, numbers), key=attrgetter("size")))
+            starts = share * order
+            return [self.objective.collate([e for lane in lanes for e in lane[k : k + share]]) for k in starts]
 
 
 def chunks_of(steps: int) -> int:
@@ -288,7 +281,7 @@ def loader(chunks: Chunks, *, workers: int) -> Iterator[list[Any]]:
         num_workers=workers,
         prefetch_factor=4 if workers else None,
         collate_fn=_packed if is_packed else _unchanged,
-        worker_init_fn=partial(_begin_worker, os.getpid()) if workers else None,
+        worker_init_fn=_begin_worker,
     )
     return map(_unpacked, data_loader) if is_packed else iter(data_loader)
 
@@ -326,18 +319,11 @@ def _unpacked(chunk: tuple[bytes, list[tuple[int, int]], torch.Tensor]) -> list[
     return pickle.loads(rest, buffers=[memory[start:end] for start, end in spans])
 
 
-def _begin_worker(parent: int, worker: int) -> None:
-    """Lets this worker end when its parent is gone: a killed parent cannot stop it, and it would wait for ever."""
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(_POLL)
-        os._exit(1)
-
+def _begin_worker(worker: int) -> None:
     # Ctrl-C, and the SIGTERM of a batch system, reach workers too, and the parent still needs them for the batches that
     # it finishes
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
-    threading.Thread(target=watch, daemon=True).start()
+    end_with_parent()
     # what was made before this process is not looked through for garbage again: 5 % of the time of making people
     gc.freeze()

@@ -23,9 +23,9 @@ from lidarpose.train.augment import (
     Example,
     make_example,
     second_person_label,
-    seen,
+    visible_joints,
 )
-from lidarpose.train.detector.candidate_source import SceneSource, scene_to_search
+from lidarpose.train.detector.candidate_source import scene_to_search
 
 # how a person is cut out: by a box about a pose, by the column about a detection, or by a labeled box
 _CUTS, _CHANCES = ("pose box", "column", "labeled box"), (0.6, 0.15, 0.25)
@@ -62,23 +62,23 @@ class ScanPeople:
     origin: np.ndarray | None
 
 
-class ScanPeopleSource(SceneSource[ScanPeople, Example]):
-    """One person of a scan at a time, changed a little."""
-
-    def load_scene(self, number: int) -> ScanPeople:
-        for attempt in range(_TRIES):
-            people = scan_people(self.seed, number + attempt * _STRIDE)
-            if people.boxes:
-                break
-        return people
-
-    def draw_example(self, scan: ScanPeople, rng: np.random.Generator) -> Example:
-        return person_example(scan, int(rng.integers(len(scan.boxes))), rng)
+def populated_scan(seed: int, number: int) -> ScanPeople:
+    """The people of a scene; of another one where that has nobody."""
+    for attempt in range(_TRIES):
+        people = scan_people(seed, number + attempt * _STRIDE)
+        if people.boxes:
+            break
+    return people
 
 
-def scan_people(seed: int, number: int, *, family: str = "train") -> ScanPeople:
+def draw_person(scan: ScanPeople, rng: np.random.Generator) -> Example:
+    """Somebody of a scan, changed a little."""
+    return person_example(scan, int(rng.integers(len(scan.boxes))), rng)
+
+
+def scan_people(seed: int, number: int) -> ScanPeople:
     """The people of scene `number` of `synth.detection_scene`, leveled as it is when people are searched for."""
-    scene, origin = scene_to_search(seed, number, family)
+    scene, origin = scene_to_search(seed, number, "train")
     pelvises = scene.joints[:, _PELVIS, :2].astype(float)
     rng = np.random.default_rng([seed, number])
     rows, clouds, owners = [], [], []
@@ -119,7 +119,7 @@ def person_example(scan: ScanPeople, person: int, rng: np.random.Generator) -> E
         center = joints[_PELVIS] + rng.normal(0, PELVIS_ERROR, 3)
     view = view_features(center, None if rng.random() < BLIND else scan.origin)
     points, joints = points - center, joints - center
-    visible = seen(joints, points[owner == 1]).astype(np.float32)
+    visible = visible_joints(joints, points[owner == 1]).astype(np.float32)
     part = np.where(owner == 1, UNKNOWN_PART, 0)
     if rng.random() < 0.5:
         mirror = np.array([1, -1, 1])

@@ -31,15 +31,15 @@ from lidarpose.skeleton import Skeleton, skeleton
 from lidarpose.synth.scene import scene_config
 from lidarpose.train.augment import Augmentation, ClipExample, Example, augmentation, augmented
 from lidarpose.train.data_loader import BATCHES, ClipSource, MixedSource, Source, StoredSource, SyntheticSource
-from lidarpose.train.detector.candidate_source import CandidateSource, validation_scans
-from lidarpose.train.detector.crop_source import CropSource, validation_crops
+from lidarpose.train.detector.candidate_source import SceneSource, draw_candidates, scan_example, validation_scans
+from lidarpose.train.detector.crop_source import draw_crops, scan_crops, validation_crops
 from lidarpose.train.networks import Config, expanded_network, finetuned_network, initial_network, pretraining_network
 from lidarpose.train.objectives.detector_objective import DetectorObjective, missed_people
 from lidarpose.train.objectives.objective import Objective
 from lidarpose.train.objectives.verifier_objective import VerifierObjective, missed_by_verifier
 from lidarpose.train.recipes import Finetune, PoseRecipe, Pretrain, Recipe, TrainDetector, TrainVerifier
 from lidarpose.train.run_dir import folder_names
-from lidarpose.train.scan_people import ScanPeopleSource
+from lidarpose.train.scan_people import draw_person, populated_scan
 from lidarpose.train.torch_dataset import InMemoryDataset
 from lidarpose.train.validation import validate
 
@@ -135,7 +135,7 @@ def _detection(recipe: TrainDetector) -> TrainSetup:
         card["init_card"] = header.card
     return TrainSetup(
         objective=objective,
-        source=CandidateSource(seed=recipe.seed, uses=recipe.uses, lag=_lag(recipe.batch, recipe.uses)),
+        source=_scene_source(recipe.seed, recipe.uses, recipe.batch, scan_example, draw_candidates),
         people=recipe.scenes * recipe.uses,
         network=network,
         validation=partial(validation_scans, _VALIDATION_SEED),
@@ -170,7 +170,7 @@ def _verification(recipe: TrainVerifier) -> TrainSetup:
 
     return TrainSetup(
         objective=VerifierObjective(config=config),
-        source=CropSource(seed=recipe.seed, uses=recipe.uses, lag=_lag(recipe.batch, recipe.uses)),
+        source=_scene_source(recipe.seed, recipe.uses, recipe.batch, scan_crops, draw_crops),
         people=recipe.scenes * recipe.uses,
         network=network,
         validation=partial(validation_crops, _VALIDATION_SEED),
@@ -182,10 +182,11 @@ def _verification(recipe: TrainVerifier) -> TrainSetup:
     )
 
 
-def _lag(batch: float, uses: int) -> int:
-    """Scans between two times that one is shown, of so many examples a step: a worker shows each scan again that it has
-    made, for all usual numbers of workers."""
-    return max(int(_LAG * BATCHES * batch) // uses, 1)
+def _scene_source(seed: int, uses: int, batch: float, load_scene: Callable, draw_example: Callable) -> SceneSource:
+    """Of scans, for so many examples a step: a worker shows each scan again that it has made, for all usual numbers of
+    workers."""
+    lag = max(int(_LAG * BATCHES * batch) // uses, 1)
+    return SceneSource(seed=seed, uses=uses, lag=lag, load_scene=load_scene, draw_example=draw_example)
 
 
 def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
@@ -211,7 +212,7 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     source: Source = SyntheticSource(seed=recipe.seed, easy=easy_people, **synthetic_settings)
     if recipe.whole_scans:
         batch = recipe.batch * recipe.whole_scans
-        other_source = ScanPeopleSource(seed=recipe.seed, uses=_SCAN_USES, lag=_lag(batch, _SCAN_USES))
+        other_source = _scene_source(recipe.seed, _SCAN_USES, batch, populated_scan, draw_person)
         source = MixedSource(main=source, other=other_source, share=recipe.whole_scans)
     setup = TrainSetup(
         objective=objective,
@@ -317,7 +318,9 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
     clip_source = _clips(dataset, config, recipe)
     held_out_clips = None if held_out_dataset is None else _clips(held_out_dataset, config, recipe)
     people = max(round(recipe.epochs * len(clip_source.clips)), 1) * config.frames
-    clip_validation = partial(held_out_clips.some, VALIDATION // config.frames) if held_out_clips is not None else list
+    clip_validation = (
+        partial(held_out_clips.validation_clips, VALIDATION // config.frames) if held_out_clips is not None else list
+    )
     epoch = len(clip_source.clips) * config.frames
     return replace(_of_clips(setup, clip_source), people=people, epoch=epoch, validation=clip_validation)
 

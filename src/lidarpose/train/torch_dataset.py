@@ -27,7 +27,7 @@ from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import PoseBank
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import SceneConfig
-from lidarpose.train.augment import UNKNOWN_PART, seen
+from lidarpose.train.augment import UNKNOWN_PART, visible_joints
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -184,7 +184,7 @@ def _to_body26(sample: LabeledSample) -> LabeledSample:
         visible[columns] = np.select([sample.joint_labels == SEEN, sample.joint_labels == HIDDEN], [1.0, 0.0], np.nan)
     elif sample.part is not None:
         # from the parts, as of samples made during training
-        visible[columns] = seen(joints[columns], sample.points[part > 0])
+        visible[columns] = visible_joints(joints[columns], sample.points[part > 0])
     labels = np.where(np.isnan(joints).any(-1), UNLABELED, np.where(visible == 0, HIDDEN, SEEN))
     return replace(
         sample,

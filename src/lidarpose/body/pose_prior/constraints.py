@@ -197,7 +197,7 @@ def walked_displacement(pace: np.ndarray, strides: np.ndarray, course: np.ndarra
 STATIC = ("idle", "crouch", "bend", "kneel", "squat", "stoop", "reach_down", "get_down", "box")
 ON_ONE_FOOT = ("kick", "knee_raise")
 _STATIC, _ONE_FOOT = (np.array([name in names for name in KINDS]) for names in (STATIC, ON_ONE_FOOT))
-_AGAIN = _STATIC & (UNUSUAL > 0)
+_ITERATED_KINDS = _STATIC & (UNUSUAL > 0)
 _KNEEL = KINDS.index("kneel")
 _HIP, _KNEE, _ANKLE, _ABD = (
     np.array([ANGLE_INDEX[f"{side}_{name}"] for side in ("left", "right")]) for name in ("hip", "knee", "ankle", "abd")
@@ -221,7 +221,7 @@ def balanced(angles: np.ndarray, kind: np.ndarray) -> np.ndarray:
     of what it stands on; the leg that reaches lower bends more, or the front leg of a kneeling body reaches to the
     ground. One linear step, whose error is millimeters; several for the unusual kinds, whose legs are bent far.
     """
-    for kind_mask in (_STATIC | _ONE_FOOT, *[_AGAIN] * 2):
+    for kind_mask in (_STATIC | _ONE_FOOT, *[_ITERATED_KINDS] * 2):
         angles = _balance_once(angles, kind, np.flatnonzero(kind_mask[kind]))
     return angles
 
@@ -242,7 +242,7 @@ def _balance_once(angles: np.ndarray, kind: np.ndarray, rows: np.ndarray) -> np.
     points[:, :8, 2] -= np.repeat(joints[:, _ANKLES, 0], 4, 1) * lean[:, :1]
     points[:, :8, 2] -= (points[:, :8, 1] - np.repeat(joints[:, _HIPS, 1], 4, 1)) * lean[:, 1:]
     is_on_both_feet = _STATIC[kind[rows]]
-    least_reach = np.where(_AGAIN[kind[rows[is_on_both_feet]]], _SHORTEST[0], _SHORTEST[1])
+    least_reach = np.where(_ITERATED_KINDS[kind[rows[is_on_both_feet]]], _SHORTEST[0], _SHORTEST[1])
     row_angles[is_on_both_feet] = _level_feet(
         row_angles[is_on_both_feet],
         joints[is_on_both_feet],

@@ -185,13 +185,13 @@ def _draw_people(rng: np.random.Generator, n: int, shares: np.ndarray, times: np
     if is_clip:
         latents.where[kind == _FALL, 0] *= _EARLY_FALL
     rotations = _poses(latents, times)[0]
-    is_invalid = _is_wrong(rotations, kind)
+    is_invalid = _violates_constraints(rotations, kind)
     rows, refused_rows, spare_rows = np.arange(n), np.flatnonzero(is_invalid[:n]), n + np.flatnonzero(~is_invalid[n:])
     rows[refused_rows[: len(spare_rows)]] = spare_rows[: len(refused_rows)]
     return latents.take(rows), rotations[rows]
 
 
-def _is_wrong(rotations: np.ndarray, kind: np.ndarray) -> np.ndarray:
+def _violates_constraints(rotations: np.ndarray, kind: np.ndarray) -> np.ndarray:
     """rotations (n, T, 24, 3, 3) of the kinds (n,) -> (n,) bool: at some moment parts are too deep in each other, or
     what the body rests on is in the air."""
     ends = constraints.capsule_ends(*constraints.body_frames(rotations.reshape(-1, 24, 3, 3)))

@@ -155,11 +155,6 @@ class DetectorResult:
     reliability: list[dict[str, float]]
     things: dict[str, int]
 
-    def row(self, figure: str, at: str = "", group: str = "all", of: str = "all") -> dict[str, Any]:
-        """The row of a figure, which must be there."""
-        keys = {"figure": figure, "at": at, "group": group, "of": of}
-        return next(row for row in self.rows if keys.items() <= row.items())
-
 
 def score_detector(
     detect: Detect,

@@ -23,12 +23,11 @@ from lidarpose.io.sources.frame import (
     FrameSource,
     ReadingOptions,
     Recording,
-    Source,
 )
 from lidarpose.io.sources.kitti import open_kitti
 from lidarpose.io.sources.nuscenes import open_nuscenes
 
-__all__ = ["RECORDINGS", "DamagedFrame", "Frame", "FrameSource", "Source", "is_single_scan", "open_source"]
+__all__ = ["RECORDINGS", "DamagedFrame", "Frame", "FrameSource", "is_single_scan", "open_source"]
 
 # of `RECORDINGS`, the module whose `open_recording(path, options)` reads it
 _READERS = {".mcap": "rosbag", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "ouster", ".pcapng": "ouster"}
@@ -64,7 +63,7 @@ def open_source(
         every: only each so many-th frame.
 
     Returns:
-        A `Source`: its frames, one in memory at a time, as often as wanted.
+        Its frames, one in memory at a time, as often as wanted.
 
     Raises:
         InputError: nothing there, or nothing that holds points.

@@ -63,31 +63,6 @@ class DamagedFrame:
     error: str
 
 
-class _Named(Protocol):
-    """`name` is that of the file or folder, `count` the number of frames if it is known before they are read;
-    `warnings` are lines about the whole, some of which are only known after iterating."""
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def count(self) -> int | None: ...
-
-    @property
-    def warnings(self) -> Sequence[str]: ...
-
-
-class Source(_Named, Protocol):
-    """Frames in order, one in memory at a time, as often as wanted.
-
-    `frames(first)` begins with the frame of this index, without reading those before; iterating is `frames(0)`.
-    """
-
-    def frames(self, first: int = 0) -> Iterator[Frame | DamagedFrame]: ...
-
-    def __iter__(self) -> Iterator[Frame | DamagedFrame]: ...
-
-
 # ---- what the readers of each format make
 
 
@@ -111,11 +86,22 @@ class LazyFrame:
     read: Callable[[], Sweep]
 
 
-class Recording(_Named, Protocol):
+class Recording(Protocol):
     """What the reader of a format makes of a file or folder: frames not yet decoded, as often as wanted.
 
-    An InputError after the first frame ends the recording there, and becomes a damaged frame.
+    `name` is that of the file or folder, `count` the number of frames if it is known before they are read; `warnings`
+    are lines about the whole, some only known after iterating. An InputError after the first frame ends the recording
+    there, and becomes a damaged frame.
     """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def count(self) -> int | None: ...
+
+    @property
+    def warnings(self) -> Sequence[str]: ...
 
     def lazy_frames(self, first: int = 0) -> Iterator[LazyFrame]: ...
 
@@ -197,7 +183,8 @@ def _refuse(error: InputError) -> Sweep:
 
 
 class FrameSource:
-    """The frames of a recording within a span of time, of every so many. A `Source`.
+    """The frames of a recording within a span of time, of every so many: in order, one in memory at a time, as often as
+    wanted.
 
     Args:
         rate: frames a second, where frames have no times; 10 by default.
@@ -272,7 +259,7 @@ class FrameSource:
         return -1 if self.start is not None and elapsed < self.start - _ROUNDING else 0
 
     def frames(self, first: int = 0) -> Iterator[Frame | DamagedFrame]:
-        """The frames from index `first` on."""
+        """The frames from index `first` on, without reading those before."""
         self._num_back = 0
         last_time = -np.inf
         index = first - 1

@@ -42,7 +42,7 @@ def _open_drive(drive: Path) -> IndexedRecording:
     files, notes = scan_files(drive / "velodyne_points" / "data")
     rows = _numbers(files)
     stamps = _timestamps(drive / "velodyne_points" / "timestamps.txt")
-    times = _chosen(stamps, rows, "velodyne_points/timestamps.txt", notes)
+    times = _frame_times(stamps, rows, "velodyne_points/timestamps.txt", notes)
     calib_folder = next((path for path in (drive, drive.parent) if (path / "calib_imu_to_velo.txt").is_file()), drive)
     entries = _calibration(calib_folder / "calib_imu_to_velo.txt")
     poses = None
@@ -59,7 +59,7 @@ def _open_sequence(sequence: Path) -> IndexedRecording:
     files, notes = scan_files(sequence / "velodyne")
     rows = _numbers(files)
     stamps = _table(sequence / "times.txt", 1)
-    times = _chosen(None if stamps is None else stamps[:, 0], rows, "times.txt", notes)
+    times = _frame_times(None if stamps is None else stamps[:, 0], rows, "times.txt", notes)
     tables = (sequence / "poses.txt", sequence.parents[1] / "poses" / f"{sequence.name}.txt")
     poses = _table(next((path for path in tables if path.is_file()), tables[0]), 12)
     row = _calibration(sequence / "calib.txt").get("Tr", np.zeros(0))
@@ -135,7 +135,7 @@ def _numbers(files: Sequence[Path]) -> list[int]:
     return list(range(len(files)))
 
 
-def _chosen(stamps: np.ndarray | None, rows: Sequence[int], name: str, notes: list[str]) -> np.ndarray | None:
+def _frame_times(stamps: np.ndarray | None, rows: Sequence[int], name: str, notes: list[str]) -> np.ndarray | None:
     """The times (n,) s of frames, or None and a warning."""
     if stamps is not None and max(rows) < len(stamps) and np.isfinite(stamps[rows]).all():
         return stamps[rows]

@@ -15,7 +15,7 @@ from lidarpose.errors import InputError, check_int
 from lidarpose.eval.detector.detection_scores import MATCH_RADIUS, match
 from lidarpose.eval.detector.evaluate_detector import run_detector
 from lidarpose.inference.detection import MOST_POSED
-from lidarpose.inference.verification import FEATURES, People, verification_features, verified
+from lidarpose.inference.verification import FEATURES, VerifiedPeople, verification_features, verified
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.detector.detector import MAX_RANGE, Detections, Detector
 from lidarpose.models.detector.network import DetectorNet
@@ -83,7 +83,7 @@ class ScanTable:
     detections: Detections
     features: np.ndarray
     people: np.ndarray
-    verify: Callable[[dict, float], People]
+    verify: Callable[[dict, float], VerifiedPeople]
 
     def is_near(self) -> np.ndarray:
         """(D,): whether somebody is there, be it who another detection is of, too."""

@@ -7,7 +7,7 @@ as after `--resume`, makes it again.
 Legend: K candidates, P people of a scan.
 """
 
-from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import pi
@@ -118,7 +118,7 @@ def draw_augmentation(rng: np.random.Generator, count: int) -> CandidateAugmenta
     return CandidateAugmentation(**{name: np.array([row[name] for row in rows]) for name in (rows[0] if rows else ())})
 
 
-def moved(labels: Labels, augmentation: CandidateAugmentation) -> Labels:
+def transform_labels(labels: Labels, augmentation: CandidateAugmentation) -> Labels:
     """The labels of candidates that are changed so."""
     scale = np.asarray(augmentation.scale, np.float32)
     center = augmentation.apply(labels.center).astype(np.float32)
@@ -126,23 +126,18 @@ def moved(labels: Labels, augmentation: CandidateAugmentation) -> Labels:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneSource(ABC, Generic[SceneT, ExampleT]):
+class SceneSource(Generic[SceneT, ExampleT]):
     """Each scene of `detection_scene` of a seed `uses` times, `lag` scenes between two times.
 
     Scene j is example uses * j the first time. Where no scene is old enough yet, a younger one stands in.
+    load_scene(seed, number): what is learned from in a scene; draw_example(scan, rng): an example of it, drawn anew.
     """
 
     seed: int
     uses: int
     lag: int
-
-    @abstractmethod
-    def load_scene(self, number: int) -> SceneT:
-        """What is learned from in a scene."""
-
-    @abstractmethod
-    def draw_example(self, scan: SceneT, rng: np.random.Generator) -> ExampleT:
-        """An example of it, drawn anew."""
+    load_scene: Callable[[int, int], SceneT]
+    draw_example: Callable[[SceneT, np.random.Generator], ExampleT]
 
     def __getstate__(self) -> dict:
         return {name: value for name, value in vars(self).items() if name != "_kept"}
@@ -163,24 +158,19 @@ class SceneSource(ABC, Generic[SceneT, ExampleT]):
         if number not in scans:
             for old_number in [old_number for old_number in scans if old_number < newest_scene - self.uses * self.lag]:
                 del scans[old_number]
-            scans[number] = self.load_scene(number)
+            scans[number] = self.load_scene(self.seed, number)
         return scans[number]
 
 
-class CandidateSource(SceneSource[DetectorExample, DetectorExample]):
-    """Candidates of scenes: all of people, and some of nobody."""
-
-    def load_scene(self, number: int) -> DetectorExample:
-        return scan_example(self.seed, number)
-
-    def draw_example(self, scan: DetectorExample, rng: np.random.Generator) -> DetectorExample:
-        person = scan.labels.person
-        negatives = np.flatnonzero(person == NOBODY)
-        negatives = rng.choice(negatives, min(NEGATIVES, len(negatives)), replace=False)
-        rows = np.concatenate([np.flatnonzero(person >= 0), np.sort(negatives)])
-        augmentation = draw_augmentation(rng, len(rows))
-        labels = moved(scan.labels.take(rows), augmentation)
-        return DetectorExample(candidates=scan.candidates.take(rows), labels=labels, augmentation=augmentation)
+def draw_candidates(scan: DetectorExample, rng: np.random.Generator) -> DetectorExample:
+    """Candidates of a scan: all of people, and some of nobody."""
+    person = scan.labels.person
+    negatives = np.flatnonzero(person == NOBODY)
+    negatives = rng.choice(negatives, min(NEGATIVES, len(negatives)), replace=False)
+    rows = np.concatenate([np.flatnonzero(person >= 0), np.sort(negatives)])
+    augmentation = draw_augmentation(rng, len(rows))
+    labels = transform_labels(scan.labels.take(rows), augmentation)
+    return DetectorExample(candidates=scan.candidates.take(rows), labels=labels, augmentation=augmentation)
 
 
 def scan_example(seed: int, number: int, *, family: str = "train") -> DetectorExample:

@@ -14,7 +14,7 @@ from lidarpose.inference.tta import IDENTITY, apply
 from lidarpose.inference.verification import AROUND, inside_column
 from lidarpose.models.detector.detector import MAX_RANGE, Detector
 from lidarpose.sample import MIN_POINTS
-from lidarpose.train.detector.candidate_source import IGNORE, NOBODY, SceneSource, scene_to_search
+from lidarpose.train.detector.candidate_source import IGNORE, NOBODY, scene_to_search
 
 # a detection nearer than this to a person is of that person; beyond the second distance, with at most this share of its
 # points on people, it is of nobody; others teach nothing, m
@@ -48,24 +48,19 @@ class CropExample:
         return len(self.clouds)
 
 
-class CropSource(SceneSource[CropExample, CropExample]):
-    """Crops of scenes, changed a little each time."""
-
-    def load_scene(self, number: int) -> CropExample:
-        return scan_crops(self.seed, number)
-
-    def draw_example(self, scan: CropExample, rng: np.random.Generator) -> CropExample:
-        seed, is_mirrored = int(rng.integers(2**31)), rng.random(scan.size) < 0.5
-        mirror = np.where(is_mirrored, -1, 1)
-        view = scan.view.copy()
-        view[:, 1] *= mirror
-        clouds = []
-        for cloud, side in zip(scan.clouds, mirror.tolist(), strict=True):
-            is_kept = rng.random(len(cloud)) < rng.uniform(_KEPT, 1)
-            points = cloud[is_kept] if is_kept.sum() >= MIN_POINTS else cloud
-            points = points * ([1, side, 1] * rng.uniform(1 - _SCALE, 1 + _SCALE, 1))
-            clouds.append(points + rng.normal(0, _NOISE, points.shape) + rng.normal(0, _SHIFT, 3))
-        return replace(scan, clouds=clouds, view=view, seed=seed)
+def draw_crops(scan: CropExample, rng: np.random.Generator) -> CropExample:
+    """All crops of a scan, changed a little."""
+    seed, is_mirrored = int(rng.integers(2**31)), rng.random(scan.size) < 0.5
+    mirror = np.where(is_mirrored, -1, 1)
+    view = scan.view.copy()
+    view[:, 1] *= mirror
+    clouds = []
+    for cloud, side in zip(scan.clouds, mirror.tolist(), strict=True):
+        is_kept = rng.random(len(cloud)) < rng.uniform(_KEPT, 1)
+        points = cloud[is_kept] if is_kept.sum() >= MIN_POINTS else cloud
+        points = points * ([1, side, 1] * rng.uniform(1 - _SCALE, 1 + _SCALE, 1))
+        clouds.append(points + rng.normal(0, _NOISE, points.shape) + rng.normal(0, _SHIFT, 3))
+    return replace(scan, clouds=clouds, view=view, seed=seed)
 
 
 @cache

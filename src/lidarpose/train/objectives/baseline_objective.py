@@ -22,7 +22,7 @@ from lidarpose.models.checkpoint import build
 from lidarpose.models.voxelize import WINDOW
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.train.augment import ClipExample, Example
-from lidarpose.train.objectives.objective import Share, alone, at_least_one, in_body26, on_device
+from lidarpose.train.objectives.objective import Share, at_least_one, in_body26, on_device, one_process
 
 # a point is labeled with the nearest joint within this distance, m
 LABEL_RADIUS = 0.25
@@ -50,7 +50,7 @@ class BaselineObjective:
         return arrays | {"joints": joints - arrays["middle"][:, None], "radius": radius}
 
     def terms(
-        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
+        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = one_process
     ) -> dict[str, Tensor]:
         """`frame_losses`; joints without a label teach nothing."""
         tensors = on_device(arrays, device)
@@ -98,7 +98,7 @@ class ClipObjective:
         return {name: (tensors[name], tensors[f"{name}_valid"]) for name in self.config.clouds}
 
     def terms(
-        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
+        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = one_process
     ) -> dict[str, Tensor]:
         """`clip_losses`; clips all have as many frames and joints, so means of processes are means of
         all."""
@@ -181,7 +181,7 @@ def clip_losses(outputs: ClipOutputs, rotations: Tensor, pelvis: Tensor, offsets
     }
 
 
-def mean_distance(joints: Tensor, true: Tensor, known: Tensor, share: Share = alone) -> Tensor:
+def mean_distance(joints: Tensor, true: Tensor, known: Tensor, share: Share = one_process) -> Tensor:
     """m, over joints with a label."""
     distance = (joints - torch.where(known[..., None], true, 0.0)).norm(dim=-1)
     return (distance * known).sum() / at_least_one(share(known.sum()))

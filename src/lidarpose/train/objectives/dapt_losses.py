@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from lidarpose.models.dapt.dapt_net import DaptOutputs
-from lidarpose.train.objectives.objective import Share, alone, at_least_one
+from lidarpose.train.objectives.objective import Share, at_least_one, one_process
 
 # width of a heatmap's target, bins
 SIGMA = 2.0
@@ -34,7 +34,7 @@ class DaptTargets:
     part: Tensor | None = None
 
 
-def pretraining(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = alone) -> dict[str, Tensor]:
+def pretraining(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = one_process) -> dict[str, Tensor]:
     """Paper: Eq. 9, L_pre = lambda_reg L_reg + lambda_seg L_seg, of the coordinate head and the part head.
 
     Terms "regression" and "segmentation", and "mpjpe" of the coordinates for the log; share: see `objective`.
@@ -49,7 +49,7 @@ def pretraining(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = al
     }
 
 
-def finetuning(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = alone) -> dict[str, Tensor]:
+def finetuning(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = one_process) -> dict[str, Tensor]:
     """Paper: Eq. 10, L_ft = L_hm, of the heatmaps alone, where the released code adds a term of the auxiliary head.
 
     Terms "heatmap" or "regression", and "mpjpe" of the joints for the log; share: see `objective`.
@@ -63,7 +63,7 @@ def finetuning(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = alo
     return terms | {"mpjpe": _mpjpe(joints.float(), targets, labels)}
 
 
-def prn(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = alone) -> dict[str, Tensor]:
+def prn(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = one_process) -> dict[str, Tensor]:
     """Of the neck prn in either stage: distances of refined and of voted joints, and the cross entropy of the joint
     that a voxel is nearest to, background among them; weights of 1 are ours, none are published."""
     coordinates, voted, parts, part = outputs.coordinates, outputs.voted, outputs.parts, targets.part

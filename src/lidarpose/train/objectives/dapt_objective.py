@@ -17,7 +17,7 @@ from lidarpose.models.dapt.dapt_net import DaptNet, to_tensors
 from lidarpose.models.dapt.voxel_tables import LAYOUTS, Tables, build_tables
 from lidarpose.train.augment import UNKNOWN_PART, Example
 from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, pretraining, prn
-from lidarpose.train.objectives.objective import Share, alone, in_body26, majority_part
+from lidarpose.train.objectives.objective import Share, in_body26, majority_part, one_process
 from lidarpose.train.recipes import SMALL_PAPER, TINY_PAPER
 
 STAGES = ("pretrain", "finetune")
@@ -101,7 +101,7 @@ class DaptObjective:
         return DaptArrays(tables=tables, joints=joints, part=labels)
 
     def terms(
-        self, network: Callable, arrays: DaptArrays, *, device: torch.device | str = "cpu", share: Share = alone
+        self, network: Callable, arrays: DaptArrays, *, device: torch.device | str = "cpu", share: Share = one_process
     ) -> dict[str, Tensor]:
         """`dapt_losses.pretraining`, `finetuning` or `prn`. A joint's weight is 1 where it is labeled, seen or not, as
         in the released code."""

@@ -18,7 +18,7 @@ from lidarpose.models.detector.detector_config import INPUTS, DetectorConfig
 from lidarpose.models.detector.network import DetectorNet
 from lidarpose.models.detector.render import render
 from lidarpose.train.detector.candidate_source import IGNORE, NOBODY, DetectorExample
-from lidarpose.train.objectives.objective import Share, alone, at_least_one, on_device
+from lidarpose.train.objectives.objective import Share, at_least_one, on_device, one_process
 
 # weights; distances are in meters
 PERSON, OFFSET, FOOT, HEIGHT, MOUNTED = 1.0, 2.0, 1.0, 1.0, 0.5
@@ -51,7 +51,7 @@ class DetectorObjective:
         return arrays | {"scan": np.repeat(np.arange(len(examples)), [example.size for example in examples])}
 
     def terms(
-        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
+        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = one_process
     ) -> dict[str, Tensor]:
         """Cross entropy of people's candidates and of the hard ones of nobody's; distances and height of people's."""
         tensors = on_device(arrays, device)
@@ -59,7 +59,7 @@ class DetectorObjective:
         person = tensors["person"]
         with torch.no_grad():
             logit = network(*inputs).float()[:, 0]
-            rows = chosen(logit, person, tensors["scan"])
+            rows = training_rows(logit, person, tensors["scan"])
             precision = average_precision(logit[person != IGNORE], person[person != IGNORE] >= 0)
         out = network(*(values[rows] for values in inputs)).float()
         is_person = (person[rows] >= 0).float()
@@ -91,7 +91,7 @@ class DetectorObjective:
         return network(*inputs).float().cpu().numpy()
 
 
-def chosen(logit: Tensor, person: Tensor, scan: Tensor) -> Tensor:
+def training_rows(logit: Tensor, person: Tensor, scan: Tensor) -> Tensor:
     """Rows to learn from, by logits (K,): all people's, the hardest of nobody's, and some at random, by torch's
     generator."""
     positives, negatives = (person >= 0).nonzero()[:, 0], (person == NOBODY).nonzero()[:, 0]

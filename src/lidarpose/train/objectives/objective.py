@@ -20,7 +20,7 @@ LOGGED = ("mpjpe", "ap")
 Share = Callable[[Tensor], Tensor]
 
 
-def alone(count: Tensor) -> Tensor:
+def one_process(count: Tensor) -> Tensor:
     """The `Share` of a single process."""
     return count
 
@@ -42,7 +42,7 @@ class Objective(Protocol):
         ...
 
     def terms(
-        self, network: Callable, arrays: Any, *, device: torch.device | str = "cpu", share: Share = alone
+        self, network: Callable, arrays: Any, *, device: torch.device | str = "cpu", share: Share = one_process
     ) -> dict[str, Tensor]:
         """Each weighted loss term by name; their sum is minimized. Those of `LOGGED`, detached, are no part of it.
         network: called as the network itself, be it wrapped."""

@@ -18,7 +18,7 @@ from lidarpose.models.voxelize import VoxelPyramid, voxelize
 from lidarpose.sample import CONFIDENCE_RADIUS
 from lidarpose.skeleton import BODY26
 from lidarpose.train.augment import Example
-from lidarpose.train.objectives.objective import Share, alone, at_least_one, majority_part
+from lidarpose.train.objectives.objective import Share, at_least_one, majority_part, one_process
 
 # most fine voxels a person in training
 MAX_VOXELS = 224
@@ -82,7 +82,7 @@ class PoseNetObjective:
         }
 
     def terms(
-        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = alone
+        self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = one_process
     ) -> dict[str, Tensor]:
         outputs, targets = network(Batch.from_arrays(arrays, device)), Targets.from_arrays(arrays, device)
         return losses(outputs, targets, share=share, bone=self.bone, symmetry=self.symmetry)
@@ -93,7 +93,7 @@ class PoseNetObjective:
 
 
 def losses(
-    outputs: Outputs, targets: Targets, *, share: Share = alone, bone: float = 0.0, symmetry: float = 0.0
+    outputs: Outputs, targets: Targets, *, share: Share = one_process, bone: float = 0.0, symmetry: float = 0.0
 ) -> dict[str, Tensor]:
     """Each term, weighted, by name; their sum is what is minimized. "mpjpe" (meters) is for the log alone.
 

@@ -16,7 +16,7 @@ from lidarpose.models.posenet import Batch, PoseNet
 from lidarpose.train.detector.candidate_source import NOBODY
 from lidarpose.train.detector.crop_source import CropExample
 from lidarpose.train.objectives.detector_objective import average_precision, share_missed
-from lidarpose.train.objectives.objective import Share, alone, at_least_one
+from lidarpose.train.objectives.objective import Share, at_least_one, one_process
 from lidarpose.train.objectives.posenet_objective import training_voxels
 
 # weight of whether people ride or sit in wheelchairs
@@ -52,7 +52,7 @@ class VerifierObjective:
         return groups
 
     def terms(
-        self, network: Callable, arrays: list[dict], *, device: torch.device | str = "cpu", share: Share = alone
+        self, network: Callable, arrays: list[dict], *, device: torch.device | str = "cpu", share: Share = one_process
     ) -> dict[str, Tensor]:
         """Cross entropy of the K detections, and of people's being mounted."""
         logits = torch.cat([self._logits(network, group, device) for group in arrays])
