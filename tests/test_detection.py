@@ -556,6 +556,11 @@ def test_who_cannot_reach_the_least_score_is_neither_verified_nor_posed(monkeypa
     np.testing.assert_allclose(people.logits, logits[own])
     np.testing.assert_allclose([box.score for box in people.boxes], scores[own])
     assert len(people.boxes) >= 2 and (np.diff([box.score for box in people.boxes]) <= 0).all()
+    # who is less sure and shown too narrows nobody's box
+    more = verification.verified(detections, points, origin, header | {"default_score": 0.6}, 0.05).boxes
+    assert len(more) > len(people.boxes)
+    for own, same in zip(people.boxes, more, strict=False):
+        assert (own.score, *own.center, *own.size) == (same.score, *same.center, *same.size)
     # nobody is most of somebody surer
     owned = set()
     for rows in people.rows:

@@ -604,6 +604,11 @@ def test_a_crop_without_anybody_is_flagged(model, tmp_path, capsys):
     person = model.predict(wall, sensor_origin=(0, 0, 0))
     assert person.person < 0.05
     assert any("look unlike a person" in line and f"{person.person:.2f}" in line for line in person.warnings)
+    # where a score says whether somebody is there, nothing else does
+    box = {"center": [6, 0, 0], "size": [0.6, 1.2, 2.2]}
+    for score, is_flagged in ((None, True), (0.9, False)):
+        boxed = model.predict(wall, boxes=[box | {"score": score}], sensor_origin=(0, 0, 0))[0]
+        assert boxed.person < 0.05 and any("unlike a person" in line for line in boxed.warnings) is is_flagged
     np.save(tmp_path / "wall.npy", wall)
     assert main(["predict", str(tmp_path / "wall.npy"), "--crop", "--out", str(tmp_path / "wall.json")]) == 0
     assert "look unlike a person" in capsys.readouterr().err

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas
@@ -162,6 +163,14 @@ def test_lines_of_another_command_are_not_gone_on_with(drive, folder, monkeypatc
         predict = FramePredictor._predicted
         patch.setattr(FramePredictor, "_predicted", lambda self, *of: (stop if of[0].index else predict)(self, *of))
         run(drive, "--end", 0.2, "--out", out, status=130)
+    part = Path(f"{out}.part")
+    finished = part.read_bytes()
+    # a command that is wrong costs nothing, and leaves nothing of its own
+    run(drive, "--end", 0.2, "--skeleton", "coco", "--out", out, status=2)
+    assert part.read_bytes() == finished
+    run(drive, "--end", 0.2, "--skeleton", "coco", "--out", folder / "wrong.jsonl", status=2)
+    assert not list(folder.glob("wrong*"))
+    capsys.readouterr()
     assert main(["predict", str(drive), "--end", "0.2", "--max-people", "1", "--out", str(out)]) == 0
     assert "of another command (max_people): beginning anew" in capsys.readouterr().err
     assert [len(json.loads(line)["people"]) for line in open(out)] == [1, 1, 1]
@@ -633,7 +642,7 @@ def test_a_damaged_part_is_begun_anew(drive, stopped, tmp_path):
         path.write_bytes(damaged_lines)
         state_path.write_text(json.dumps(damaged_state))
         with output.PartFile(out, state["command"]) as part:
-            assert part.frames == 0 and not path.read_bytes()
+            assert part.frames == 0 and not list(part.lines())
     path.write_bytes(lines)
     state_path.write_text(json.dumps(state))
     with output.PartFile(out, state["command"]) as part:

@@ -101,9 +101,12 @@ def oversize_warning(points: np.ndarray, pose: Pose) -> str | None:
     )
 
 
-def person_count_warning(pose: Pose, *, in_box: bool = False) -> str | None:
-    """The points show nobody, or more people than the one whose pose it is; in_box: a box says who is meant."""
-    if pose.person is not None and pose.person < _NOBODY:
+def person_count_warning(pose: Pose, *, in_box: bool = False, is_scored: bool = False) -> str | None:
+    """The points show nobody, or more people than the one whose pose it is.
+
+    in_box: a box says who is meant; is_scored: and by its score whether somebody is there.
+    """
+    if not is_scored and pose.person is not None and pose.person < _NOBODY:
         return f"the points look unlike a person (person {float(pose.person):.2f}): perhaps nobody is there"
     if pose.second_person is not None and pose.second_person > _TWO:
         if in_box:

@@ -285,6 +285,7 @@ class Predictor(PoseEstimator):
         clips: Clips | None = None,
         pelvises: np.ndarray | None = None,
         box_centers: np.ndarray | None = None,
+        is_scored: bool = False,
         check_upside_down: bool = True,
     ) -> Poses:
         """As `predict` of clouds (n, 3) m, of which more is known; of rounded coordinates nothing is said.
@@ -294,6 +295,8 @@ class Predictor(PoseEstimator):
             pelvises: (N, 3) m, nearly, where each cloud shows one person alone: the pass that finds them is spared.
             box_centers: (N, 3) m of the boxes that cut the clouds out: where a cloud shows two people, who is nearer to
                 the center is meant.
+            is_scored: whether boxes say how sure it is that somebody is there, which is told by more than the points
+                in them: then nothing is said of it.
             check_upside_down: whether those whose pose is unsure are looked at upside down too, to warn of it, which
                 costs as much as the pose.
         """
@@ -316,7 +319,8 @@ class Predictor(PoseEstimator):
                 continue
             pose, part = best_poses[i]
             poses[i] = target_pose = pose.to(target_skeleton)
-            notes += filter(None, (unit_note, person_count_warning(pose, in_box=in_box), _range_warning(target_pose)))
+            count_note = person_count_warning(pose, in_box=in_box, is_scored=is_scored)
+            notes += filter(None, (unit_note, count_note, _range_warning(target_pose)))
             if unit_note:
                 continue
             if warning := oversize_warning(points, pose):

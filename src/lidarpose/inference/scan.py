@@ -111,13 +111,14 @@ def pose_scan(scan: Scan, predictor: Predictor, *, skeleton: str | None = None, 
         warnings.append(warning)
         scan = replace(scan, origin=None)
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
-    if scan.pelvises is not None and clouds:
+    if scan.boxes:
+        pelvises = None if scan.pelvises is None else scan.pelvises @ scan.R_level_input.T
+        # not where the pelvises are known
+        box_centers = np.stack([scan.R_level_input @ box.center for box in scan.boxes]) if pelvises is None else None
+        is_scored = all(box.score is not None for box in scan.boxes)
         level_poses = predictor.predict_in(
-            clouds, origin, skeleton, progress, pelvises=scan.pelvises @ scan.R_level_input.T
+            clouds, origin, skeleton, progress, pelvises=pelvises, box_centers=box_centers, is_scored=is_scored
         )
-    elif scan.boxes:
-        box_centers = np.stack([scan.R_level_input @ box.center for box in scan.boxes])
-        level_poses = predictor.predict_in(clouds, origin, skeleton, progress, box_centers=box_centers)
     else:
         level_poses = predictor.predict(clouds, sensor_origin=origin, skeleton=skeleton, progress=progress)
     predict_ms = (time.perf_counter() - crop_end) * 1e3

@@ -222,7 +222,7 @@ def verified(
         places = _add_people_beside(places, known_boxes, points, origin, header, least_score, max_people, detect_beside)
         thresholds = np.append(thresholds, np.full(len(places.scores) - len(thresholds), least_score))
     places.pelvises[places.scores < thresholds] = np.nan
-    people = _fit_boxes(places, points, least_score, max_people, known_boxes)
+    people = _fit_boxes(places, points, header.get("default_score", least_score), max_people, known_boxes)
     people = _without_repeats(people, places, points, origin)
     kept_rows = [row for row, _, _ in people]
     return VerifiedPeople(
@@ -357,12 +357,13 @@ def _without_repeats(
 def _fit_boxes(
     places: _ScoredDetections,
     points: np.ndarray,
-    least_score: float,
+    neighbor_score: float,
     max_people: int | None,
     known_boxes: dict[int, Box],
 ) -> list[_FittedBox]:
-    """The different people of places that have a pelvis, the surest first; known_boxes: by row, where known people are
-    expected."""
+    """The different people of places that have a pelvis, the surest first; neighbor_score: people of this score, and
+    those who are as sure as oneself, are kept out of the own box; known_boxes: by row, where known people are expected.
+    """
     scores, pelvises = places.scores, places.pelvises
     skeleton = _bundled(DEFAULT).header.skeleton
     person_rows = surest_rows(scores, pelvises, places.logits)
@@ -373,9 +374,8 @@ def _fit_boxes(
             box = known_boxes[i]
             crop_box, is_mounted = replace(box, size=box.size + 2 * _MOVED), box.mounted
         else:
-            distances = [
-                np.hypot(*(pelvises[k] - pelvises[i])[:2]) for k in person_rows if k != i and scores[k] >= least_score
-            ]
+            neighbors = [k for k in person_rows if k != i and scores[k] >= min(scores[i], neighbor_score)]
+            distances = [np.hypot(*(pelvises[k] - pelvises[i])[:2]) for k in neighbors]
             pose = Pose(joints=places.joints[i], skeleton=skeleton)
             box = crop_box = box_about(pose, min(distances, default=np.inf))
             is_mounted = bool(places.mounted[i] > 0.5)

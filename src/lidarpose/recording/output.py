@@ -58,9 +58,8 @@ class PartFile:
         if not _is_locked(self._file):
             self._file.close()
             raise file_error(self.path, "another lidarpose writes it: wait for its end, or choose another --out")
-        size = self._read()
-        self._file.truncate(size)
-        self._file.seek(size)
+        # what is there stays until there is a line to write: a command that is wrong costs nothing
+        self._size: int | None = self._read()
 
     def _read(self) -> int:
         """How many bytes of the part hold finished lines of this command."""
@@ -96,8 +95,17 @@ class PartFile:
     def __enter__(self) -> "PartFile":
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None and not self._file.closed and not os.fstat(self._file.fileno()).st_size:
+            self.remove()
         self._file.close()
+
+    def _cut(self) -> None:
+        """Leaves the finished lines of this command alone."""
+        if self._size is not None:
+            self._file.truncate(self._size)
+            self._file.seek(self._size)
+            self._size = None
 
     def append(self, frame: FramePoses, state: dict[str, Any], digest: int) -> None:
         """One more finished frame; digest: of its points. A kill in between costs this frame: lines without their state
@@ -105,6 +113,7 @@ class PartFile:
         self.frames, self.last, self.state = self.frames + 1, (frame.index, frame.id, digest), state
         temporary = self.state_path.with_name(self.state_path.name + ".new")
         try:
+            self._cut()
             self._file.write(json.dumps(frame.to_dict()).encode() + b"\n")
             self._file.flush()
             content = {
@@ -123,6 +132,7 @@ class PartFile:
 
     def lines(self) -> Iterator[dict[str, Any]]:
         """The finished lines."""
+        self._cut()
         with open(self.path, "rb") as file:
             yield from map(json.loads, file)
 
@@ -250,8 +260,6 @@ def write_recording(
 
             write_result(result, final())
         except KeyboardInterrupt:
-            if not part.frames:
-                part.remove()
             place = f"the finished frames are in {part.path}, and the same command goes on"
             raise KeyboardInterrupt(f"stopped: {place}" if part.frames else "stopped") from None
         part.remove()
