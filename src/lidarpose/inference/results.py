@@ -335,13 +335,13 @@ class Poses(Sequence[PersonPose]):
         from lidarpose.viz.bird_eye import ScanPanel
 
         R_level_input = rotation_from_up(self.up)
-        joints = [person.pose.joints for person in people if person.pose is not None]
+        posed = [person for person in people if person.has_pose]
         label = f"{counted(len(people), 'person', 'people')} found" if people else "nobody found"
         return ScanPanel(
             points=points @ R_level_input.T,
             boxes=[box for person in people if (box := person.box or _box_around(person))],
-            poses=Pose(joints=np.stack(joints), skeleton=self.skeleton) if joints else None,
-            names=[str(person.id) for person in people if person.pose is not None and person.id is not None],
+            poses=Pose(joints=np.stack([person.joints for person in posed]), skeleton=self.skeleton) if posed else None,
+            names=[str(person.id) for person in posed],
             label=label,
             sensor=None if self.origin is None else tuple((R_level_input @ self.origin)[:2].tolist()),
         )

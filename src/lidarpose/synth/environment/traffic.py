@@ -3,7 +3,7 @@
 Drawn for training alone, and only of kinds of `things.THINGS` that training may see.
 """
 
-from functools import cache
+from functools import cache, partial
 from math import pi
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from lidarpose.synth.environment import mesh as shapes
 from lidarpose.synth.environment.mesh import Mesh, shape, union
 from lidarpose.synth.environment.site import Site
-from lidarpose.synth.environment.things import car, draw_thing, facade
+from lidarpose.synth.environment.things import draw_thing, facade
 
 # half of what is built, how near to the sensor vehicles come, and the gap between vehicles and what stands there, m
 _REACH, _NEAREST, _GAP = 42.0, 3.5, 0.4
@@ -51,10 +51,6 @@ def with_windows(car_mesh: Mesh, rng: np.random.Generator) -> Mesh:
     return union([Mesh(car_mesh.vertices, car_mesh.faces[~is_open]), inside])
 
 
-def _vehicle(rng: np.random.Generator) -> Mesh:
-    return car(rng.random(8), rng)
-
-
 def _post(rng: np.random.Generator) -> Mesh:
     """A post or a mast with plates, boxes and balls: signs, bins, meters, flowers, a traffic light."""
     u = rng.random(3)
@@ -90,7 +86,12 @@ def _corner(rng: np.random.Generator) -> Mesh:
 
 
 # what stands along roads: names of `things.KINDS`, how often, and builders
-_ROADSIDE = (("pole", 0.5, _post), ("bush", 0.15, _clump), ("wall end", 0.2, _corner), ("car", 0.15, _vehicle))
+_ROADSIDE = (
+    ("pole", 0.5, _post),
+    ("bush", 0.15, _clump),
+    ("wall end", 0.2, _corner),
+    ("car", 0.15, partial(draw_thing, "car")),
+)
 
 
 def _put(site: Site, name: str, mesh: Mesh, position: tuple[float, float], nearest: float) -> None:
@@ -107,7 +108,7 @@ def _add_road(site: Site, offset: float, turn: int, rng: np.random.Generator) ->
     position, mean_gap = -_REACH + 12 * rng.random(), rng.choice([2.0, 8.0, 25.0])
     heading = pi * rng.integers(2) + turn * pi / 2
     while position < _REACH:
-        mesh = _vehicle(rng).moved((0, 0, 0), heading + rng.normal(0, 0.05))
+        mesh = draw_thing("car", rng).moved((0, 0, 0), heading + rng.normal(0, 0.05))
         _put(site, "car", mesh, (offset, position) if turn % 2 else (position, offset), _NEAREST)
         position += 5.0 + rng.exponential(mean_gap)
 
