@@ -419,8 +419,7 @@ def tracks() -> str:
 def paper(name: str) -> str:
     """A table of the paper on synthesized people, and what its finished cells cost; see `lidarpose paper`."""
     content = _read(f"paper/{name}")
-    finished = [cell for cell in content["cells"] if cell["state"] == "done"]
-    return "\n".join([*report.result_lines(content), "", *report.cost_lines(finished), ""])
+    return "\n".join([*report.result_lines(content), "", *report.cost_lines(content, finished=True), ""])
 
 
 def tables() -> dict[str, Callable[[], str]]:

@@ -12,11 +12,23 @@ from lidarpose.data.dataset_card import CARD
 from lidarpose.errors import LidarPoseError
 from lidarpose.eval.dataset import EvalSample, open_eval_dataset
 from lidarpose.eval.metrics import aggregate
+from lidarpose.eval.predictions import read_poses
 from lidarpose.eval.protocols import DAPT, check_protocol
 from lidarpose.eval.scores import COLUMNS, FILE, Result, read_scores
 from lidarpose.io.files import content_digest, write_atomic
 from lidarpose.models.checkpoint import load_checkpoint, runs_of
-from lidarpose.paper.steps import CELLS, Execute, Step, StepFailed, begin_out, is_done, last_entry, length_of, run_steps
+from lidarpose.paper.steps import (
+    CELLS,
+    POSES,
+    Execute,
+    Step,
+    StepFailed,
+    begin_out,
+    is_done,
+    last_entry,
+    length_of,
+    run_steps,
+)
 from lidarpose.paper.tables import PROTOCOL, Cell, Options, Table, Target, cells, row_key
 from lidarpose.sample import MIN_POINTS, center_of
 
@@ -26,7 +38,7 @@ _UNDERTRAINED = 0.2
 _LEGEND = (
     "MPJPE in mm, the mean over seeds; in brackets the 95 % interval over people, of several seeds the least and the "
     "greatest. *undertrained*: not 20 % better than the mean pose about the protocol's center; nothing can be "
-    "concluded from it."
+    "concluded from it. *Against* a row: the mean difference over the same people, where both rows' poses are there."
 )
 # beside figures as printed in the paper
 _PRINTED = (
@@ -70,6 +82,9 @@ def write_table(
 ) -> dict[str, Any]:
     """Writes OUT/TABLE.json and OUT/TABLE.md of what is there, and each done cell's own JSON."""
     failed = failed or {}
+    entries = [_entry(table, cell, out, failed.get(k, "")) for k, cell in enumerate(selected)]
+    for cell, entry in zip(selected, entries, strict=True):
+        entry |= _difference(cell, _reference(table, cell, selected), out) if entry["state"] == "done" else {}
     content = {
         "schema": SCHEMA,
         "version": __version__,
@@ -78,7 +93,8 @@ def write_table(
         "target": "real sets, the paper's protocol" if options.real else "stand-in: synthesized people",
         "people": options.people,
         "hours": options.hours,
-        "cells": [_entry(table, cell, out, failed.get(k, "")) for k, cell in enumerate(selected)],
+        "reference": table.reference,
+        "cells": entries,
     }
     write_atomic(out / f"{table.name}.json", json.dumps(content, indent=1) + "\n")
     write_atomic(out / f"{table.name}.md", markdown(content))
@@ -102,6 +118,32 @@ def _entry(table: Table, cell: Cell, out: Path, failure: str) -> dict[str, Any]:
     figures = {"state": "done"} | _figures(cell, cell.evaluation, out)
     write_atomic(path, json.dumps(figures, indent=1) + "\n")
     return entry | figures
+
+
+def _reference(table: Table, cell: Cell, selected: Sequence[Cell]) -> Cell | None:
+    """The cell of the table's reference row in the same column and with the same seed."""
+    wanted = (table.reference, cell.column, cell.seed)
+    return next((other for other in selected if (other.row, other.column, other.seed) == wanted), None)
+
+
+def _difference(cell: Cell, reference: Cell | None, out: Path) -> dict[str, float]:
+    """A cell's MPJPE less that of the reference on the same people, mm, and its 95 % interval over people; nothing of
+    the reference itself, of other people, or where the poses of either are gone."""
+    steps = [other.evaluation for other in (cell, reference) if other is not None and other.evaluation is not None]
+    paths = [step.product(out) / POSES for step in steps]
+    if len(set(paths)) < 2 or not all(path.is_file() for path in paths):
+        return {}
+    (first,), (second,) = (read_poses(path).values() for path in paths)
+    if first.skeleton.joints != second.skeleton.joints or not np.array_equal(first.true, second.true, equal_nan=True):
+        return {}
+    # whom only one of both has a pose of tells nothing of the difference
+    both = first.posed & second.posed
+    errors, reference_errors = (people.select(both).errors() for people in (first, second))
+    clustered = read_scores(paths[0].with_name(FILE)).results[0].setting.clusters
+    clusters = first.sequence[both] if clustered else None
+    ends = aggregate.paired_interval(errors, reference_errors, np.random.default_rng(0), clusters=clusters)
+    value = aggregate.mean(errors - reference_errors)
+    return {"difference": value, "difference_low": ends.low, "difference_high": ends.high}
 
 
 def _path(evaluation: Step, out: Path) -> Path:
@@ -195,7 +237,7 @@ def markdown(content: dict[str, Any]) -> str:
     printed = _PRINTED if any(entry["published"] is not None for entry in entries) else ""
     lines = [f"# {content['title']}", "", f"Target: {content['target']}. {budget}. {_LEGEND}{printed}", ""]
     lines += result_lines(content)
-    lines += ["", "## Cells", "", *cost_lines(entries)]
+    lines += ["", "## Cells", "", *cost_lines(content)]
     return "\n".join([*lines, "", "## Commands", "", *_commands(entries)]) + "\n"
 
 
@@ -210,10 +252,23 @@ def result_lines(content: dict[str, Any]) -> list[str]:
     return lines
 
 
-def cost_lines(entries: list[dict[str, Any]]) -> list[str]:
-    """What each cell reached and cost."""
+def cost_lines(content: dict[str, Any], *, finished: bool = False) -> list[str]:
+    """What each cell reached and cost, or each that is done; its difference to the reference row where any has one."""
+    entries = [entry for entry in content["cells"] if not finished or entry["state"] == "done"]
     heads = "row, column, seed, MPJPE, PA, PCK-3, PCK-5, mean pose, people seen, hours, people/s in training, size"
-    return [*_grid([*heads.split(", "), "parameters", "state"]), *(_line(_cost(entry)) for entry in entries)]
+    columns, lines = [*heads.split(", "), "parameters", "state"], [_cost(entry) for entry in entries]
+    if any("difference" in entry for entry in entries):
+        columns.insert(4, f"against {content['reference']}")
+        for entry, line in zip(entries, lines, strict=True):
+            line.insert(4, _difference_text(entry))
+    return [*_grid(columns), *map(_line, lines)]
+
+
+def _difference_text(entry: dict[str, Any]) -> str:
+    if "difference" not in entry:
+        return "-"
+    low, high = entry["difference_low"], entry["difference_high"]
+    return f"{entry['difference']:+.1f} [{low:+.1f}, {high:+.1f}]"
 
 
 def plan(table: Table, selected: Sequence[Cell], out: Path, problem: Any) -> str:
