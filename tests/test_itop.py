@@ -17,7 +17,7 @@ from lidarpose.data.prepare import prepare, reader
 from lidarpose.data.readers import itop
 from lidarpose.data.readers.base import Skipped
 from lidarpose.data.shards import open_dataset
-from lidarpose.errors import MissingExtra
+from lidarpose.errors import InputError, MissingExtra
 from lidarpose.eval.dataset import open_eval_dataset
 from lidarpose.eval.protocols import eval_setup
 from lidarpose.eval.run import evaluate_dataset
@@ -110,6 +110,15 @@ def test_whoever_has_one_split_alone_is_not_told_that_the_other_is_missing(tmp_p
     assert warnings == {"test": [], None: ["of train by side side/train are not there"]}
 
 
+def test_a_split_that_is_still_being_loaded_stops_no_other(tmp_path, smpl):
+    raw = tmp_path / "raw"
+    files.write_itop(raw, smpl, parts=("side/test", "side/train"), frames=1)
+    cut_off(raw / LABELS.replace("test", "train"))
+    assert prepare("itop", raw, tmp_path / "test", split="test")["people"] == 1
+    with pytest.raises(InputError, match="cannot be read as HDF5"):
+        prepare("itop", raw, tmp_path / "all")
+
+
 def scored(out, shift=0.0, joints=ITOP14.joints):
     """The result of a network that knows the truth, but that `joints` are off by `shift` m."""
     dataset = open_eval_dataset(out)
@@ -199,7 +208,7 @@ def test_frames_that_cannot_be_used_are_counted(tmp_path, smpl):
 def test_without_h5py_the_extra_is_named(raw, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(MissingExtra, match=r"'.\[itop\]'"):
-        reader("itop").parts(raw[0])
+        reader("itop").check(raw[0], "side/test")
 
 
 def clusters_reference(points):

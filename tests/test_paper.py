@@ -302,7 +302,7 @@ def test_the_mean_pose_is_of_what_is_learned_from_and_of_people_who_have_a_pose(
         assert mean_pose_error(replace(target, train=train), SimpleNamespace(setting=setting), tmp_path) == error
 
 
-def test_a_set_that_the_protocol_refuses_is_refused_before_anything_is_trained(tmp_path, smpl):
+def test_a_set_that_the_protocol_refuses_is_refused_before_anything_is_trained(tmp_path, smpl, monkeypatch, capsys):
     write_sloper4d(tmp_path / "raw", smpl)
     prepare("sloper4d", tmp_path / "raw", tmp_path / "set", smpl=smpl)
     options = Options(data={"sloper4d": str(tmp_path / "set")}, people=64)
@@ -311,6 +311,9 @@ def test_a_set_that_the_protocol_refuses_is_refused_before_anything_is_trained(t
     # which has no column of it
     with pytest.raises(InputError, match="table3 scores on waymo: name one by --data"):
         run_table(TABLES["table3"], options, tmp_path / "out", [], pytest.fail, print)
+    monkeypatch.chdir(tmp_path)
+    words = ["--data", f"sloper4d={options.data['sloper4d']}"]
+    assert main(["paper", "table1", "--dry-run", *words]) == 2 and "--split-by dapt" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("size, suffix", [("paper", ""), ("paper-small", "-small"), ("paper-tiny", "-tiny")])
@@ -500,7 +503,8 @@ def test_cells_in_words():
         _entry(row="b"), _entry(row="b", seed=1, mpjpe=120.0, undertrained=True),
         _entry(row="c", state="failed", reason="no such flag"),
         _entry(row="d", state="not run", reason="its command was not run", published=60.0),
-        _entry(row="e", low=None, high=None),
+        _entry(row="e", low=None, high=None, notes=["the split leaks: by time"]),
+        _entry(row="f", seed=1, notes=["the split leaks: by time"]),
     ]  # fmt: skip
     page = markdown({"title": "T", "target": "stand-in", "people": 2000, "hours": 1.5, "cells": entries})
     assert "Budget: 2,000 people a stage of training, 1.5 hours a row." in page
@@ -510,6 +514,7 @@ def test_cells_in_words():
         "| c | failed: no such flag |",
         "| d | not run (paper 60.0) |",
         "| e | 100.0 |",
+        "- x: the split leaks: by time",
         "| b | x | 1 | 120.0 | 60.0 | 90.0 | - | 200.0 | 1,000 | 0.50 | - | tiny | 1,234 | undertrained |",
         "| d | x | 0 | - | - | - | - | - | - | - | - | - | - | not run |",
     ):

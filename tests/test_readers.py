@@ -151,8 +151,36 @@ def test_humanm3_says_which_folder_is_incomplete_or_above_the_root(tmp_path, smp
     # its body is no database of people; nor is the database read where a sequence is complete
     for name in ("SMPL_NEUTRAL.pkl", "train.pkl"):
         (tmp_path / "HumanM3" / name).write_bytes(pickle.dumps({}))
-        with pytest.raises(InputError, match="has .*train/a without pose_calib: get that folder too"):
+        with pytest.raises(InputError, match="has .*train/a without pose_calib: get what is missing"):
             made("humanm3", smpl).parts(tmp_path / "HumanM3")
+
+
+@pytest.mark.parametrize("too_deep", ["train", "train/a"])
+def test_humanm3_s_root_named_too_deep_is_said(tmp_path, smpl, too_deep):
+    root = tmp_path / "train/HumanM3"
+    files.write_humanm3(root, smpl, sequences=("train/a", "test/c"), frames=1)
+    assert made("humanm3", smpl).parts(root) == ["test/c", "train/a"]
+    with pytest.raises(InputError, match=f"lies in HumanM3's root, which is likely {root}: name that"):
+        made("humanm3", smpl).parts(root / too_deep)
+
+
+def test_a_sequence_of_humanm3_that_lacks_clouds_and_labels_is_named(tmp_path, smpl):
+    files.write_humanm3(tmp_path, smpl, sequences=("train/a", "test/c"), frames=1)
+    (tmp_path / "test/intersection/smpl_estimated").mkdir(parents=True)
+    with pytest.raises(InputError, match="intersection without pointcloud and pose_calib: get what is missing"):
+        made("humanm3", smpl).parts(tmp_path)
+
+
+def test_a_joint_of_humanm3_that_is_null_is_not_labeled(tmp_path, smpl):
+    files.write_humanm3(tmp_path, smpl, sequences=("train/a",), frames=1)
+    (path,) = (tmp_path / "train/a/pose_calib").glob("*.json")
+    bodies = json.loads(path.read_text())
+    track = sorted(bodies)[0]
+    bodies[track][3] = [None] * 3
+    path.write_text(json.dumps(bodies))
+    items, _ = everything("humanm3", tmp_path, smpl)
+    (item,) = (one for one in items if one.track == track)
+    assert np.isnan(item.joints[3]).all() and item.joint_labels[3] == 0 and (np.delete(item.joint_labels, 3) > 0).all()
 
 
 def test_humanm3_skips_are_counted_and_named(tmp_path, smpl):

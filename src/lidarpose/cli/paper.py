@@ -49,7 +49,7 @@ def add(commands, execute: Callable[[list[str]], int]) -> None:
 
 def _paper(commands, execute: Callable[[list[str]], int], options: argparse.Namespace) -> None:
     from lidarpose.paper import figures
-    from lidarpose.paper.report import plan, run_table, write_table
+    from lidarpose.paper.report import check_targets, plan, run_table, write_table
     from lidarpose.paper.steps import begin_out, check_out
     from lidarpose.paper.tables import TABLES, Options, cells
 
@@ -72,6 +72,7 @@ def _paper(commands, execute: Callable[[list[str]], int], options: argparse.Name
     table, row_keys = TABLES[options.name], names(options.rows or "")
     selected_cells = cells(table, paper_options, row_keys)
     if options.dry_run:
+        check_targets(selected_cells)
         print(plan(table, selected_cells, out, partial(_problem, commands)), end="")
         return
     if options.table_only:

@@ -105,6 +105,8 @@ def prepare(
     # of a split that is asked for alone, nobody misses the others
     absent_names = {split_name: names for split_name, names in absent_names.items() if split in (None, split_name)}
     parts = _parts_of(name, parts, rule, split)
+    for part in parts:
+        source.check(root, part)
     card = _card(source, parts, rule, split)
     missing_shards = open_folder(out, card)
     make = PartWriter(reader=source, root=root, out=out, parts=tuple(parts), rule=rule, only=split)

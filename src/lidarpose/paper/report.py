@@ -56,10 +56,7 @@ def run_table(
     reported and written as failed, and the others go on. A cell whose figures are there is done, wherever it was."""
     begin_out(out)
     selected_cells = cells(table, options, chosen)
-    # before hours of training, not after them
-    for test in {cell.target.test for cell in selected_cells if cell.evaluation is not None}:
-        if isinstance(test, str):
-            check_protocol(PROTOCOL, open_eval_dataset(test))
+    check_targets(selected_cells)
     failures: dict[int, str] = {}
     for k, cell in enumerate(selected_cells):
         if cell.evaluation is not None and not _is_there(table, cell.evaluation, out):
@@ -70,6 +67,13 @@ def run_table(
                 tell(f"{cell.row}, {cell.column}: failed: {error}")
         content = write_table(table, selected_cells, options, out, failures)
     return content
+
+
+def check_targets(selected: Sequence[Cell]) -> None:
+    """Raises InputError, one line, where a real set cannot be scored by the protocol: before hours of training."""
+    for test in {cell.target.test for cell in selected if cell.evaluation is not None}:
+        if isinstance(test, str):
+            check_protocol(PROTOCOL, open_eval_dataset(test))
 
 
 def _is_there(table: Table, evaluation: Step, out: Path) -> bool:
@@ -168,6 +172,7 @@ def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
         "people_scored": row.people,
         "joints": list(result.setting.joints),
         "protocol": result.setting.summary,
+        "notes": list(result.notes),
         "people_seen": sum(run.get("people_seen", 0) for run in runs),
         "hours": round(sum(run.get("hours", 0.0) for run in runs), 3),
         "people_per_second": round(entry["people"] / entry["seconds"], 1) if entry and entry["seconds"] else None,
@@ -237,7 +242,7 @@ def markdown(content: dict[str, Any]) -> str:
     printed = _PRINTED if any(entry["published"] is not None for entry in entries) else ""
     lines = [f"# {content['title']}", "", f"Target: {content['target']}. {budget}. {_LEGEND}{printed}", ""]
     lines += result_lines(content)
-    lines += ["", "## Cells", "", *cost_lines(content)]
+    lines += ["", *_note_lines(entries), "## Cells", "", *cost_lines(content)]
     return "\n".join([*lines, "", "## Commands", "", *_commands(entries)]) + "\n"
 
 
@@ -250,6 +255,15 @@ def result_lines(content: dict[str, Any]) -> list[str]:
         row_entries = [[e for e in entries if (e["row"], e["column"]) == (row, column)] for column in columns]
         lines.append(_line([row, *map(_cell_text, row_entries)]))
     return lines
+
+
+def _note_lines(entries: list[dict[str, Any]]) -> list[str]:
+    """What the evaluations say that a reader must know, each once with the columns that it is of."""
+    columns: dict[str, list[str]] = {}
+    for entry in entries:
+        for note in entry.get("notes", ()):
+            columns.setdefault(note, []).append(entry["column"])
+    return [*(f"- {', '.join(dict.fromkeys(names))}: {note}" for note, names in columns.items()), *[""][: len(columns)]]
 
 
 def cost_lines(content: dict[str, Any], *, finished: bool = False) -> list[str]:

@@ -70,6 +70,9 @@ class Reader(ABC):
     def parts(self, root: Path) -> list[str]:
         """Names of what can be read on its own, sorted. Raises InputError, one line, where the root is incomplete."""
 
+    def check(self, root: Path, part: str) -> None:  # noqa: B027
+        """Raises InputError, one line, where a part cannot be read, before anything is written."""
+
     @abstractmethod
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """Everybody in one part, in an order that never changes."""

@@ -28,6 +28,7 @@ from lidarpose.skeleton import HUMAN15
 _FPS = 10.0
 # what lies at the root
 _SPLITS = ("train", "test")
+_FOLDERS = ("pointcloud", "pose_calib")
 # how many folders below the root a sequence may lie
 _DEEPEST = 3
 
@@ -47,13 +48,19 @@ class HumanM3(Reader):
             raise file_error(root, f"is a folder above HumanM3's root, which is likely {nested_folders[0]}: name that")
         sequences, incomplete_sequence = [], ""
         for folder in sorted(_folders(root, _DEEPEST)):
-            missing_folders = [name for name in ("pointcloud", "pose_calib") if not (folder / name).is_dir()]
+            missing_folders = [name for name in _FOLDERS if not (folder / name).is_dir()]
             if not missing_folders:
                 sequences.append(folder.relative_to(root).as_posix())
-            elif len(missing_folders) == 1:
-                incomplete_sequence = incomplete_sequence or f"{folder} without {missing_folders[0]}"
+            elif len(missing_folders) == 1 or (
+                folder != root and folder.parent.name in _SPLITS and not _has_sequence(folder)
+            ):
+                incomplete_sequence = incomplete_sequence or f"{folder} without {' and '.join(missing_folders)}"
+        # of what lies below a split the split would be lost
+        split_folder = root.parent if sequences == ["."] else root
+        if sequences and split_folder.name in _SPLITS and not any((root / name).is_dir() for name in _SPLITS):
+            raise file_error(root, f"lies in HumanM3's root, which is likely {split_folder.parent}: name that")
         if sequences and incomplete_sequence:
-            raise file_error(root, f"has {incomplete_sequence}: get that folder too, or move its sequence away")
+            raise file_error(root, f"has {incomplete_sequence}: get what is missing, or move that sequence away")
         if not sequences and not databases:
             raise self.wrong_root(root, f"got {incomplete_sequence or base.entries(root)}")
         return sequences or databases
@@ -63,9 +70,13 @@ class HumanM3(Reader):
         return _read_database(root, part) if part.endswith(".pkl") else _read_sequence(root, part)
 
 
+def _has_sequence(folder: Path) -> bool:
+    return any((path / name).is_dir() for path in _folders(folder, 1) for name in _FOLDERS)
+
+
 def _folders(folder: Path, depth: int) -> Iterator[Path]:
     yield folder
-    if depth and not (folder / "pose_calib").is_dir() and not (folder / "pointcloud").is_dir():
+    if depth and not any((folder / name).is_dir() for name in _FOLDERS):
         for child in folder.iterdir():
             if child.is_dir():
                 yield from _folders(child, depth - 1)
@@ -90,7 +101,9 @@ def _read_sequence(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         people = {}
         for track in sorted(bodies, key=lambda track: (int(track) if track.isdecimal() else -1, track)):
             try:
-                people[track] = base.numbers(path, bodies[track], (15, 3), f"joints of {track}")
+                joints = base.numbers(path, bodies[track], (15, 3), f"joints of {track}", finite=False)
+                # one that is not labeled is null
+                people[track] = np.where(np.isfinite(joints), joints, np.nan)
             except InputError as error:
                 yield Skipped("not 15 joints", str(error))
         yield from _people(cloud, people, part, frame, (frame - first_frame) / _FPS)

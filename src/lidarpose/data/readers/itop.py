@@ -64,15 +64,17 @@ class Itop(Reader):
     skeleton = ITOP14.name
 
     def parts(self, root: Path) -> list[str]:
-        """The parts of which a file is there. Raises InputError where there is none, where one of a pair is missing or
-        damaged, and where the two are of different frames; MissingExtra without h5py."""
+        """The parts of which a file is there. Raises InputError where there is none."""
         parts = [part for part in PARTS if any(_path(root, part, kind).is_file() for kind in _DATASETS)]
         if not parts:
             raise self.wrong_root(root)
-        for part in parts:
-            with _opened(root, part):
-                pass
         return parts
+
+    def check(self, root: Path, part: str) -> None:
+        """Raises InputError where one of a pair is missing or damaged, and where the two are of different frames;
+        MissingExtra without h5py."""
+        with _opened(root, part):
+            pass
 
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         """The person of each frame that was checked, in the order of the file."""
