@@ -326,6 +326,18 @@ def test_threads():
         assert load(threads=asked).backend.session.get_session_options().intra_op_num_threads == used
 
 
+@pytest.mark.parametrize("given, most", [("1", 1), ("2,4", 2), ("0", 8), ("many", 8), ("", 8), ("99", 8)])
+def test_one_setting_bounds_the_threads_of_all_networks(monkeypatch, given, most):
+    monkeypatch.setattr(onnx.os, "sched_getaffinity", lambda _: range(64), raising=False)
+    monkeypatch.setenv("OMP_NUM_THREADS", given)
+    assert usable_threads() == most
+
+
+def test_devices_are_taken_as_torch_s_and_none_is_the_cpu():
+    for device in (torch.device("cpu"), None):
+        assert load("tiny", device=device).backend.name == "onnx"
+
+
 def test_a_runtime_that_cannot_be_loaded_is_not_the_file_s_fault(monkeypatch):
     import_module = mock.Mock()
     monkeypatch.setattr(onnx, "import_module", import_module)

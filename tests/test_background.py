@@ -25,6 +25,11 @@ def test_what_stands_still_is_learned_and_who_moves_is_kept(recording):
             assert (~static)[frame.person == k].mean() > 0.6, k
 
 
+def test_one_array_is_one_scan():
+    wall = np.random.default_rng(0).uniform((5, -3, 0), (5.01, 3, 3), (400, 3))
+    np.testing.assert_array_equal(learn_background(wall), learn_background([wall]))
+
+
 def test_who_waits_and_leaves_is_not_static(monkeypatch):
     rng = np.random.default_rng(0)
     wall = rng.uniform((5, -3, 0), (5.01, 3, 3), (4000, 3))

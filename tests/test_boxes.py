@@ -336,3 +336,14 @@ def test_tensors_of_any_precision_are_boxes_and_open_files_are_left_alone(tmp_pa
         with pytest.raises(InputError, match="expected the path of a file of boxes"):
             read_boxes(file)
         assert file.read() == "[]"
+
+
+def test_a_box_alone_says_what_is_up_and_a_document_says_it_once(tmp_path):
+    (box,) = boxes = Boxes([Box(center=[0, 0, 0], size=[1, 1, 2])], up="-y")
+    assert box.to_dict()["up"] == "-y" and "up" not in boxes.to_dict()["people"][0]
+    assert read_boxes([box.to_dict()]).up == read_boxes(boxes.to_dict()).up == "-y"
+    assert "up" not in Box(center=[0, 0, 0], size=[1, 1, 2]).to_dict()
+    # other tools' keys are ignored
+    assert read_boxes([box.to_dict() | {"up": True}]).up == "z"
+    with pytest.raises(InputError, match="b.txt: is to hold JSON"):
+        boxes.save(tmp_path / "b.txt")

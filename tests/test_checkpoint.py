@@ -356,3 +356,17 @@ def test_a_refused_import_writes_nothing(tmp_path, stored):
     with pytest.raises(InputError, match=f"tensor {name} holds numbers that are not finite or no floats"):
         import_released(tmp_path / "whole.safetensors", tmp_path / "in.safetensors")
     assert [path.name for path in tmp_path.iterdir()] == ["whole.safetensors"]
+
+
+def test_loading_leaves_torch_s_random_numbers_and_default_type_alone(stored):
+    torch.manual_seed(3)
+    expected = torch.rand(3)
+    torch.manual_seed(3)
+    torch.set_default_dtype(torch.float64)
+    try:
+        network, _ = load_checkpoint(stored)
+        assert torch.get_default_dtype() == torch.float64
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert {value.dtype for value in network.state_dict().values() if value.is_floating_point()} == {torch.float32}
+    assert torch.equal(torch.rand(3), expected)

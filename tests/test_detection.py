@@ -671,3 +671,11 @@ def test_what_is_left_of_somebody_s_points_is_nobody_beside_them(monkeypatch):
     assert [row for row, _, _ in kept] == [0, 2, 3] and asked == [[0.5, 1.0]]
     assert verification._without_repeats(people[3:], places, points, None) == people[3:] and len(asked) == 1
     assert verification._without_repeats([], places, points, None) == []
+
+
+def test_options_of_a_search_are_numbers_of_any_kind(model, scene, fake):
+    expected = lidarpose.detect(scene[0], max_range=20.0)
+    for options in ({"max_range": np.array(20.0)}, {"max_range": np.float32(20), "up": None}):
+        assert [box.score for box in lidarpose.detect(scene[0], **options)] == [box.score for box in expected]
+    with pytest.raises(InputError, match="columns must be a whole number of at least 3"):
+        lidarpose.detect(scene[0], columns=2)

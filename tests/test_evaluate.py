@@ -84,6 +84,18 @@ def shifted_truth(people, shift=(0.0, 0.0, 0.0)):
     return Fake(answer)
 
 
+class Own:
+    """A user's model: what it must have, and nothing else."""
+
+    skeleton = "smpl24"
+
+    def __init__(self, answers):
+        self.answers = answers
+
+    def predict(self, clouds, *, sensor_origin, skeleton):
+        return self.answers(clouds)
+
+
 @pytest.fixture(scope="module")
 def sets(tmp_path_factory):
     """Prepared folders by name."""
@@ -253,12 +265,27 @@ def test_what_does_not_fit_is_an_error_before_anybody_is_predicted(sets, name, o
         (Fake(standing), "bench", {"protocol": "dapt"}, "is synthetic"),
         (Fake(standing), "bench", {"split": "test"}, "without splits"),
         (3, "bench", {}, "expected a network to evaluate"),
+        (SimpleNamespace(predict=5), "bench", {}, "expected a network to evaluate"),
+        (SimpleNamespace(predict=list), "bench", {}, "SimpleNamespace.skeleton: expected a Skeleton or its name, got"),
+        (Own(lambda clouds: [None] * len(clouds)), "bench", {"limit": 3}, "^Own.predict: expected an answer for each"),
+        (Own(lambda clouds: []), "bench", {"limit": 3}, "^Own.predict: expected an answer for each of 3 clouds"),
         ("tiny", None, {}, "expected a dataset to evaluate on"),
     ],
 )
 def test_synthetic_sets_have_neither_splits_nor_oracles_and_arguments_are_checked(model, dataset, options, words):
     with pytest.raises(InputError, match=words):
         evaluation.evaluate(model, dataset, **options)
+
+
+def test_a_model_of_one_s_own_needs_joints_and_answers_alone(sets):
+    def answers(clouds):
+        poses = [Pose(joints=np.repeat(np.median(cloud, 0)[None], 24, 0), skeleton=SMPL24) for cloud in clouds]
+        return [SimpleNamespace(pose=pose) for pose in poses]
+
+    result = evaluation.evaluate(Own(answers), "bench", limit=5)
+    assert result.setting.method == "Own" and 100 < result.line("mpjpe").value < 2000
+    with pytest.raises(InputError, match="^the protocol dapt needs a model with `outputs` and `backend`"):
+        evaluation.evaluate(Own(answers), sets / "humanm3", protocol="dapt")
 
 
 def test_splits_that_are_scored_by_default(sets, tmp_path):

@@ -417,3 +417,9 @@ def test_every_kind_of_network_is_exported(tmp_path, change):
     ours = lidarpose.load(path, backend="onnx").predict(cloud)
     assert np.abs(ours.joints - due.joints).max() < 1e-4
     assert (ours.in_range is None) == (change.get("heatmap") == "none")
+
+
+@pytest.mark.slow
+def test_bundled_weights_are_exported_by_name(tmp_path):
+    export("tiny", tmp_path / "tiny.onnx")
+    assert OnnxBackend(tmp_path / "tiny.onnx").source == content_digest(bundled_path("tiny"), expected="a checkpoint")

@@ -319,7 +319,7 @@ BAD_CALLS = {
     "load a file that is none": lambda: lidarpose.load(__file__),
     "load with a decoder": lambda: lidarpose.load("tiny", decode="mean"),
     "load with looks": lambda: lidarpose.load("tiny", tta=9),
-    "predict an array": lambda: lidarpose.predict(np.zeros((9, 3))),
+    "predict an array": lambda: lidarpose.predict(np.zeros((9, 2))),
     "predict no file": lambda: lidarpose.predict(f"{NOWHERE}.npy"),
     "predict up": lambda: lidarpose.predict(f"{NOWHERE}.npy", up="w"),
     "export": lambda: lidarpose.export("tiny", "x.tflite", format="tflite"),

@@ -86,3 +86,14 @@ def test_a_searched_scan_is_drawn_from_above(monkeypatch, tmp_path):
         assert np.abs(panel.boxes[0].center - center).max() < (1e-9 if up in UP_AXES else 0.3)
     alone = Poses(people=(), skeleton=SMPL24, scan=scan, source="a.pcd").picture()
     assert len(alone) < len(sheet) and panels[-1].sensor is None and panels[-1].label == "nobody found"
+
+
+def test_one_person_s_page_is_that_of_a_call(tmp_path):
+    person = PersonPose(pose=None, skeleton=SMPL24, points=np.zeros((9, 3)))
+    assert person.html(tmp_path / "a.html", title="one") == person.alone().html(title="one")
+
+
+def test_who_has_no_id_is_not_called_none():
+    people = PersonPose(pose=None, skeleton=SMPL24, points=np.zeros((9, 3))).alone()
+    with pytest.raises(KeyError, match="ids are not set"):
+        people["None"]

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,12 +20,13 @@ from lidarpose.inference import inputs as people_module
 from lidarpose.inference.backend import Raw
 from lidarpose.inference.checks import flat_axis, is_lying, rows_inside, unit_warning
 from lidarpose.inference.inputs import MAX_POINTS, as_origin, candidates, clean
+from lidarpose.inference.predict_scan import predictor_of
 from lidarpose.inference.predictor import Predictor
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.point_cloud import Cloud
 from lidarpose.models import bundled_path
 from lidarpose.sample import Box
-from lidarpose.skeleton import SKELETONS
+from lidarpose.skeleton import BODY26, SKELETONS, WAYMO14
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 
@@ -210,7 +212,7 @@ def test_many_are_as_one_by_one(model, points, standing):
 
 def test_lists_of_none_and_stacks(model, points):
     assert len(model.predict([])) == 0 and json.loads(model.predict([]).to_json())["people"] == []
-    assert len(model.predict((points, points))) == len(model.predict(np.stack([points] * 2))) == 2
+    assert len(model.predict((points, points))) == len(model.predict(list(np.stack([points] * 2)))) == 2
     assert len(model.predict([records(points)] * 2)) == 2
     assert len(model.predict([points.tolist()])) == len(model.predict([torch.from_numpy(points.copy())])) == 1
     assert [person.joints for person in model.predict([points[:0], [], np.zeros((0, 3))])] == [None] * 3
@@ -673,9 +675,73 @@ def test_points_are_as_good_as_their_file(tmp_path, points):
     wide = np.concatenate([points, points.min(0) + [[0, 0, 0], [30, 30, 0]]])
     assert lidarpose.predict(wide, model="tiny").scan is not None
     assert lidarpose.predict(points, find=True, min_score=0.99, model="tiny").scan is not None
-    for not_points in (None, 7, "points", np.zeros((3, 2)), np.zeros((0, 3)), np.zeros((300, 3))):
+    for not_points in (None, 7, "points", np.zeros((3, 2)), np.zeros((2, 300, 3))):
         with pytest.raises(InputError, match="expected|no such file|must be"):
             lidarpose.predict(not_points, model="tiny")
+
+
+def test_nobody_is_in_an_array_without_points(model):
+    empty, nan = np.zeros((0, 3)), np.full((300, 3), np.nan)
+    for points in (empty, nan, np.zeros((300, 3))):
+        for options in ({}, {"find": True}, {"boxes": []}):
+            people = lidarpose.predict(points, model=model, **options)
+            assert len(people) == 0 and (points is empty or "dropped 300 of 300" in people.warnings[0])
+    assert lidarpose.predict(empty, model=model, find=True).warnings == model.predict(empty, find=True).warnings
+    assert not lidarpose.predict(empty, crop=True, model=model)[0].has_pose
+
+
+@pytest.mark.parametrize("records", [False, True])
+def test_an_array_in_rows_of_beams_is_no_list_of_people(model, records):
+    image = np.zeros((32, 1024), [(name, "f4") for name in "xyz"]) if records else np.zeros((32, 1024, 3))
+    expected = "got (32, 1024, 3): one scan is points." + ("ravel()" if records else "reshape(-1, 3), several people")
+    for predict in (model.predict, lidarpose.predict, lidarpose.detect, lambda a: model.predict(a, find=True)):
+        with pytest.raises(InputError, match=re.escape(expected)):
+            predict(image)
+    assert len(model.predict(list(np.zeros((2, 9, 3))))) == len(model.predict_clip(np.zeros((2, 9, 3)))) == 2
+
+
+def test_bundled_networks_are_kept_and_files_are_loaded_anew(tmp_path):
+    assert predictor_of("tiny") is predictor_of("tiny")
+    path = shutil.copy(bundled_path("tiny", ".onnx"), tmp_path)
+    assert predictor_of(path) is not predictor_of(path)
+
+
+@pytest.mark.parametrize("wrong", [torch.nn.Linear(3, 3), lambda points: points, lambda: None, object()])
+def test_a_model_that_is_no_predictor_is_refused(points, wrong):
+    with pytest.raises(InputError, match="^model: expected a predictor, weights .*: make one by lidarpose.load$"):
+        lidarpose.predict(points, crop=True, model=wrong)
+
+
+def test_boxes_of_another_up_axis_are_refused(model, points):
+    boxes = lidarpose.read_boxes({"schema": "lidarpose.boxes/1", "up": "y", "people": [box_around(points)]})
+    with pytest.raises(InputError, match="the boxes say that up is y, not z: give up y"):
+        lidarpose.predict(points, boxes=boxes, up="z", model=model)
+    assert lidarpose.predict(points, boxes=boxes, up=[0, 1, 1e-3], model=model).up == "0.0,1.0,0.001"
+
+
+def test_a_skeleton_is_taken_as_one_or_by_its_name(model, points):
+    pair = lidarpose.Skeleton(name="ankles", joints=("left_ankle", "right_ankle"), parents=(-1, 0))
+    pose = model.predict(points, skeleton=pair)
+    assert pose.joints.shape == (2, 3) and pose.skeleton is pair
+    np.testing.assert_array_equal(
+        lidarpose.predict(points, crop=True, skeleton=WAYMO14, model=model)[0].joints,
+        lidarpose.predict(points, crop=True, skeleton="waymo14", model=model)[0].joints,
+    )
+    named = lidarpose.Pose(joints=np.zeros((26, 3)), skeleton="body26")
+    assert named.skeleton is BODY26 and named.to("waymo14").skeleton is WAYMO14
+    for wrong in (5, "waymo"):
+        with pytest.raises(InputError, match="unknown skeleton"):
+            model.predict(points, skeleton=wrong)
+
+
+def test_the_boxes_of_poses_are_taken(model, sweep):
+    path, _, boxes = sweep
+    people = lidarpose.predict(path, boxes=boxes, model=model)
+    again = lidarpose.read_boxes(people)
+    assert [box.id for box in again] == ["a", 7] and again.up == people.up
+    np.testing.assert_array_equal(lidarpose.predict(path, boxes=people, model=model)[1].joints, people[1].joints)
+    with pytest.raises(InputError, match="a cloud of one person has none"):
+        lidarpose.read_boxes(lidarpose.predict(path, crop=True, model=model))
 
 
 def test_ids_are_what_json_can_hold(model, sweep):

@@ -3,6 +3,8 @@
 import errno
 import json
 import os
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -690,3 +692,79 @@ def test_what_is_no_source_is_refused(source, model):
 def test_an_option_that_is_none_is_refused_at_once():
     with pytest.raises(TypeError, match="predict_recording.. got an unexpected keyword argument 'min_scor'"):
         lidarpose.predict_recording("nowhere", min_scor=0.5)
+
+
+# ---- frames that a running sensor gives
+
+
+def fed(clouds, buffer=None):
+    """Frames of clouds, in one array that is used again where it is given."""
+    for k, cloud in enumerate(clouds):
+        if buffer is not None:
+            buffer[:] = cloud
+        yield lidarpose.Frame(points=cloud if buffer is None else buffer, index=k, id=str(k), time=k / 10)
+
+
+def test_frames_of_a_running_sensor_are_posed_as_they_come(model):
+    rng = np.random.default_rng(0)
+    clouds = [rng.normal((5, 0, 0), (0.2, 0.2, 0.5), (99, 3)) for _ in range(3)]
+    expected = [model.predict(cloud).joints for cloud in clouds]
+    buffer = np.zeros((99, 3), np.float64)
+    for frames in (fed(clouds), list(fed(clouds)), fed(clouds, buffer)):
+        results = list(lidarpose.predict_recording(frames, crop=True, model=model, up=None))
+        assert [result.id for result in results] == ["0", "1", "2"]
+        for result, cloud, joints in zip(results, clouds, expected, strict=True):
+            np.testing.assert_array_equal(result.poses[0].points, cloud)
+            np.testing.assert_allclose(result.poses[0].joints, joints, atol=1e-6)
+
+
+def test_a_scan_keeps_its_points_when_the_driver_fills_its_array_again(model, monkeypatch):
+    buffer = np.zeros((400, 3), np.float64)
+    clouds = [np.full((400, 3), k) + np.arange(1200).reshape(400, 3) / 100 for k in (1.0, 2.0, 3.0)]
+    results = list(lidarpose.predict_recording(fed(clouds, buffer), find=True, model=model))
+    for result, cloud in zip(results, clouds, strict=True):
+        np.testing.assert_array_equal(result.poses.scan, cloud)
+
+
+def test_paths_may_come_from_a_generator_and_nothing_else_is_a_source(model, tmp_path):
+    np.save(tmp_path / "a.npy", np.random.default_rng(0).normal(scale=0.3, size=(99, 3)))
+    assert len(list(lidarpose.predict_recording(tmp_path.glob("*.npy"), crop=True, model=model))) == 1
+    with pytest.raises(InputError, match="expected paths or frames, got ndarray: make a lidarpose.Frame"):
+        lidarpose.predict_recording(iter([np.zeros((9, 3))]), model=model)
+    for option in ({"every": 2}, {"start": 1.0}, {"end": 1.0}, {"rate": 5.0}):
+        for source in (fed([np.ones((9, 3))]), lidarpose.open_source(tmp_path)):
+            with pytest.raises(InputError, match=f"^{next(iter(option))} is for paths, got frames"):
+                lidarpose.predict_recording(source, model=model, **option)
+
+
+@pytest.mark.parametrize(
+    "T", [np.eye(3), 2 * np.eye(4), np.full((4, 4), np.nan), np.diag([1, 1, -1, 1]), "pose", [[1]]]
+)
+def test_the_pose_of_a_frame_is_a_rigid_transform(T):
+    with pytest.raises(InputError, match=r"^Frame.T_world_sensor: expected \(4, 4\)[^\n]*: give None"):
+        lidarpose.Frame(points=np.zeros((0, 3)), index=0, id="0", T_world_sensor=T)
+    assert lidarpose.Frame(points=np.zeros((0, 3)), index=0, id="0", T_world_sensor=np.eye(4).tolist()).T_world_sensor[
+        0, 0
+    ]
+
+
+def test_who_leaves_early_does_not_wait_for_the_next_frame(model):
+    cloud, is_over = np.random.default_rng(0).normal(scale=0.3, size=(99, 3)), threading.Event()
+
+    def endless():
+        yield from fed([cloud])
+        is_over.wait(60)
+
+    frames = lidarpose.predict_recording(endless(), crop=True, model=model)
+    next(frames)
+    start = time.perf_counter()
+    frames.close()
+    assert time.perf_counter() - start < 20
+    is_over.set()
+
+
+def test_boxes_of_other_frames_are_an_error_at_the_end(model):
+    boxes = {"b": [[0, 0, 0, 1, 1, 2, 0]]}
+    frames = lidarpose.predict_recording(fed([np.ones((9, 3))]), boxes=boxes, model=model)
+    with pytest.raises(InputError, match="has boxes of frames b, none of which is here: the last one is 0"):
+        list(frames)

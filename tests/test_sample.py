@@ -192,3 +192,11 @@ def test_a_few_strays_hardly_move_the_center_however_far_they_are():
 
 def test_the_center_of_one_point_is_its_cell():
     np.testing.assert_allclose(center_of(np.array([[0.26, -0.01, 10.04]])), [0.25, -0.05, 10.05])
+
+
+def test_what_a_box_contains_is_asked_of_points():
+    box = Box(center=[0, 0, 0], size=[1, 1, 2])
+    assert box.contains(np.zeros((2, 4))).tolist() == [True, True]
+    for wrong in (np.zeros(3), np.zeros((4, 2)), np.zeros((2, 3, 3)), "points", [[1, 2, 3], [1, 2]]):
+        with pytest.raises(InputError, match=r"^Box.contains: expected points \(n, 3\) m, got shape"):
+            box.contains(wrong)

@@ -251,3 +251,11 @@ def test_what_are_no_boxes_is_refused_and_changes_nothing():
     assert tracker.state() == other.state()
     # whatever holds boxes will do
     assert tracker.update(0.1, (person(0.05) for _ in range(1))) == [0]
+
+
+@pytest.mark.parametrize(
+    "state", [{}, None, {"max_gap": 2.0, "tracks": []}, Tracker().state() | {"tracks": {"id": []}}]
+)
+def test_what_is_no_state_is_refused(state):
+    with pytest.raises(InputError, match="^expected the state of a tracker, got .*: give what Tracker.state"):
+        Tracker.from_state(state)

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from lidarpose.io.boxes import Boxes as Boxes
     from lidarpose.io.boxes import read_boxes as read_boxes
     from lidarpose.io.point_cloud import read_points as read_points
+    from lidarpose.io.sources import Frame as Frame
     from lidarpose.io.sources import open_source as open_source
     from lidarpose.lidar.presets import sensor as sensor
     from lidarpose.lidar.raycast import cast_rays as cast_rays
@@ -66,6 +67,7 @@ _HOMES = {
     "read_points": "lidarpose.io.point_cloud",
     "read_boxes": "lidarpose.io.boxes",
     "open_source": "lidarpose.io.sources",
+    "Frame": "lidarpose.io.sources.frame",
     "Box": "lidarpose.sample",
     "Boxes": "lidarpose.io.boxes",
     "Pose": "lidarpose.sample",

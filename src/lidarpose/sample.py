@@ -12,7 +12,7 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_from_up, up_text
-from lidarpose.skeleton import SMPL24, Skeleton
+from lidarpose.skeleton import SMPL24, Skeleton, as_skeleton
 
 # no coordinate on Earth is larger, m; arithmetic on what is would overflow
 FARTHEST = 1e9
@@ -52,9 +52,10 @@ class Pose:
 
     joints (..., J, 3) m; confidence (..., J) in [0, 1], the probability that the joint is within 10 cm;
     spread (..., J) m, the expected distance between the joint and the truth; visible (..., J) in [0, 1], the
-    probability that the sensor sees the joint; in_range (..., J) bool, False where the joint may lie farther out than
-    it says, since it was found at the end of what the network can tell; person, second_person (...) in [0, 1], the
-    probabilities that the cloud shows a person, and a second one besides; frame names the frame of the joints.
+    probability that a point of the body lies within 18 cm of the joint; in_range (..., J) bool, False where the joint
+    may lie farther out than it says, since it was found at the end of what the network can tell; person, second_person
+    (...) in [0, 1], the probabilities that the cloud shows a person, and a second one besides; frame names the frame of
+    the joints. The skeleton may be given by its name.
     """
 
     joints: np.ndarray
@@ -68,6 +69,7 @@ class Pose:
     frame: str = "input"
 
     def __post_init__(self):
+        object.__setattr__(self, "skeleton", as_skeleton(self.skeleton))
         count = len(self.skeleton)
         _as_arrays(self, "joints", *PER_JOINT, *PER_PERSON)
         if self.joints.ndim < 2 or self.joints.shape[-2:] != (count, 3):
@@ -85,8 +87,9 @@ class Pose:
         if self.in_range is not None and self.in_range.dtype != bool:
             raise InputError(f"Pose.in_range must be true or false for each joint, got {self.in_range.dtype}")
 
-    def to(self, skeleton: Skeleton) -> "Pose":
-        """The same pose with the joints of another skeleton, picked by name."""
+    def to(self, skeleton: Skeleton | str) -> "Pose":
+        """The same pose with the joints of another skeleton, or of that of a name, picked by their names."""
+        skeleton = as_skeleton(skeleton)
         indices = self.skeleton.map_to(skeleton)
         values = {name: getattr(self, name) for name in PER_JOINT}
         joint_values: dict[str, Any] = {
@@ -169,13 +172,20 @@ class Box:
             object.__setattr__(self, "up", up_text(self.up))
 
     def to_dict(self) -> dict[str, Any]:
-        """center, size and yaw, as JSON holds them."""
-        return {"center": self.center.tolist(), "size": self.size.tolist(), "yaw": float(self.yaw)}
+        """center, size and yaw, and up where it is not z, as JSON holds them."""
+        place = {"center": self.center.tolist(), "size": self.size.tolist(), "yaw": float(self.yaw)}
+        return place if self.up in (None, "z") else place | {"up": self.up}
 
     def contains(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
-        """points (n, 3) m -> (n,) bool: inside the box grown by `margin` m on each side."""
+        """points (n, 3+) m -> (n,) bool: inside the box grown by `margin` m on each side. Raises InputError."""
+        try:
+            array = np.asarray(points, float)
+        except (TypeError, ValueError):
+            array = np.full((), np.nan)
+        if array.ndim != 2 or array.shape[1] < 3:
+            raise InputError(f"Box.contains: expected points (n, 3) m, got shape {array.shape}: give rows of x, y, z")
         c, s = np.cos(self.yaw), np.sin(self.yaw)
-        x, y, z = (np.asarray(points, float)[:, :3] - self.center).T
+        x, y, z = (array[:, :3] - self.center).T
         length, width, height = self.size / 2 + margin
         return (np.abs(c * x + s * y) <= length) & (np.abs(c * y - s * x) <= width) & (np.abs(z) <= height)
 

@@ -157,3 +157,8 @@ def skeleton(name: str) -> Skeleton:
     """A named skeleton: smpl24, human15, waymo14, itop14 or body26."""
     check_name("skeleton", name, SKELETONS)
     return SKELETONS[name]
+
+
+def as_skeleton(of: Skeleton | str) -> Skeleton:
+    """A skeleton, by name too. Raises InputError for anything else."""
+    return of if isinstance(of, Skeleton) else skeleton(of)

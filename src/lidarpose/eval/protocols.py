@@ -18,6 +18,7 @@ from lidarpose.eval.dataset import EvalDataset, EvalSample
 from lidarpose.eval.predictions import Predictions, stack
 from lidarpose.eval.scores import Setting
 from lidarpose.inference.inputs import Clips
+from lidarpose.io.files import shorten
 from lidarpose.sample import PER_PERSON, UNLABELED, Box, LabeledSample, clip_windows
 from lidarpose.skeleton import Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
@@ -134,8 +135,10 @@ def released_box(joints: np.ndarray, centers: dict[str, np.ndarray], box: Box | 
 
 
 class Model(Protocol):
-    """What is evaluated: `lidarpose.Predictor`, or anything that answers as it does. One of clips, whose backend has
-    `frames`, also takes `predict(clips=)` and `outputs(clip=)`."""
+    """What is evaluated: `lidarpose.Predictor`, or anything with joints `skeleton` and with `predict`, whose answers
+    have a `pose` each, None or a `Pose` of that skeleton. model: what scores.json says of it, by default its class's
+    name. The protocol dapt also needs `outputs` and `backend`. A network of clips, whose backend has `frames`, also
+    takes `predict(clips=)` and `outputs(clip=)`."""
 
     skeleton: Skeleton
     model: dict[str, Any]
@@ -208,6 +211,15 @@ class EvalSetup:
             people = model.predict_in(clouds, origin, name, box_centers=box_centers, check_upside_down=False)
         else:
             people = model.predict(clouds, sensor_origin=origin, skeleton=name, **clips)
+        if (
+            not isinstance(people, Sequence)
+            or len(people) != len(clouds)
+            or not all(hasattr(person, "pose") for person in people)
+        ):
+            raise InputError(
+                f"{model.model['name']}.predict: expected an answer for each of {len(clouds)} clouds, with a `pose` of "
+                f"{name} or None, got {shorten(repr(people), 60)}: answer as lidarpose.Predictor does"
+            )
         for person in people:
             yield {} if person.pose is None else self._prediction_columns(person.pose, ())
 
@@ -235,7 +247,7 @@ class EvalSetup:
     @property
     def _frames(self) -> int:
         """Of a clip of the network, 1 for a network of single frames."""
-        return getattr(self.model.backend, "frames", 1)
+        return getattr(getattr(self.model, "backend", None), "frames", 1)
 
     def can_split(self, samples: Sequence[EvalSample], person: EvalSample) -> bool:
         """Whether the clips of these samples are the same without and with the person who comes next."""
@@ -304,6 +316,10 @@ def eval_setup(
     dataset lacks joints of the `skeleton` asked for, or it and the network have no joint in common."""
     seed = check_int("seed", seed, least=0)
     check_protocol(protocol, dataset)
+    if protocol == "dapt" and not (hasattr(model, "outputs") and hasattr(model, "backend")):
+        raise InputError(
+            "the protocol dapt needs a model with `outputs` and `backend`, as Predictor: use protocol clean"
+        )
     if protocol == "dapt" and model.model.get("tta", 1) > 1:
         raise InputError("the protocol dapt predicts each person once, as the released code does: leave tta out")
     target_skeleton = dataset.scored

@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 
@@ -22,12 +23,12 @@ from lidarpose.eval.predictions import Predictions, concatenate, poses_parquet
 from lidarpose.eval.protocols import EvalSetup, Model, eval_setup
 from lidarpose.eval.robustness import Stability, people_to_perturb, study, to_json
 from lidarpose.eval.scores import BASELINE, FILE, MetricRow, Result, Scores, Setting
-from lidarpose.inference.predictor import load
+from lidarpose.inference.predictor import Predictor, load
 from lidarpose.io.files import check_writable, content_digest, file_error, listed, write_all_atomic
 from lidarpose.models import weights_path
 from lidarpose.models.checkpoint import runs_of
 from lidarpose.sample import UNLABELED
-from lidarpose.skeleton import BODY26
+from lidarpose.skeleton import BODY26, Skeleton, as_skeleton
 
 # people predicted at once, or more up to the end of a clip: so many clouds are in memory
 _CHUNK = 512
@@ -133,7 +134,8 @@ def _person_rows(setup: EvalSetup, bench: Bench, predictions: Predictions, setti
     clouds = [bench.points[row] for row in bench.objects]
     answers = model.predict(clouds, sensor_origin=origin, skeleton=model.skeleton.name)
     # what no pose is found in is no person
-    objects = np.array([0.0 if answer.person is None else answer.person for answer in answers])
+    probabilities = [None if answer.pose is None else answer.pose.person for answer in answers]
+    objects = np.array([0.0 if probability is None else float(probability) for probability in probabilities])
     return tuple(person_rows(people, objects, bench.columns["others"][people.row], setting))
 
 
@@ -224,7 +226,8 @@ def run(
     """Scores a network on datasets. Everything is checked before anybody is predicted.
 
     Args:
-        model: a `Predictor`, anything that answers as it does, or what `load` takes.
+        model: a `Predictor`, what `load` takes, or an object with the joints `skeleton` and `predict(clouds,
+            sensor_origin=, skeleton=)`, which gives for each cloud an object whose `pose` is a `Pose` or None.
         datasets: folders that `lidarpose prepare` or `synth` wrote, or "bench" or "bench-2".
         protocol: "clean" or "dapt".
         split: by default test, else val, else "all", which is everybody.
@@ -283,13 +286,26 @@ def _loaded(model: Model | str | os.PathLike, **options: Any) -> tuple[Model, di
         if path.is_file():
             weights = {"file": path.name, "digest": content_digest(path, expected="a checkpoint")}
         model = load(model, **options)
-    elif not hasattr(model, "predict"):
+    elif not callable(getattr(model, "predict", None)):
         raise InputError(f"expected a network to evaluate, weights by name or path or a predictor, got {model!r}")
     elif options != {"device": "cpu", "backend": None, "decode": "window", "tta": 1}:
         raise InputError("device, backend, decode and tta are of weights by name or path: give them to load instead")
+    elif not isinstance(model, Predictor):
+        model = _described(model)
     # whether a dataset's own sequences were trained on shows only in the checkpoint
     card = getattr(getattr(model, "header", None), "card", {})
     return model, dict(model.model) | weights | {"skeleton": model.skeleton.name, "trained by": card.get("command")}
+
+
+def _described(model: Any) -> Model:
+    """A user's own model with what it may lack. Raises InputError for one of unknown joints."""
+    kind, skeleton, known = type(model).__name__, getattr(model, "skeleton", None), getattr(model, "model", None)
+    if not isinstance(skeleton, str | Skeleton):
+        raise InputError(f"{kind}.skeleton: expected a Skeleton or its name, got {skeleton!r}: say whose joints it has")
+    names = ("predict", "predict_in", "outputs", "backend", "header")
+    parts: dict[str, Any] = {name: getattr(model, name) for name in names if hasattr(model, name)}
+    known = {"name": kind} | (known if isinstance(known, dict) else {})
+    return cast(Model, SimpleNamespace(**parts, skeleton=as_skeleton(skeleton), model=known))
 
 
 # ---- the folder of results

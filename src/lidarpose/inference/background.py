@@ -41,8 +41,8 @@ def learn_background(
     Damaged scans of a recording or folder are left out, with a warning.
 
     Args:
-        scans: point files or arrays (n, 3) m, in the order of time, or anything that `open_source` takes; of more than
-            60 an even choice is read.
+        scans: point files or arrays (n, 3) m, one or several in the order of time, or anything that `open_source`
+            takes; of more than 60 an even choice is read.
         columns: values a row of .bin files, see `read_points`.
         topic, meta: of recordings, as of `open_source`.
 
@@ -150,7 +150,9 @@ def _unpacked(number: np.ndarray) -> np.ndarray:
 
 def _sources(scans: Any, columns: int | None, topic: str | None, meta: str | os.PathLike | None) -> list:
     """An even choice of scans that `_points` reads."""
-    sources = listed(scans)
+    # one array is one scan, not as many as it has rows
+    is_array = getattr(scans, "ndim", None) == 2 or getattr(getattr(scans, "dtype", None), "names", None)
+    sources = [scans] if is_array else listed(scans)
     if not sources:
         raise InputError("background: expected a file of static points or scans of one recording, got none")
     if not any(isinstance(source, str | os.PathLike) and not is_single_scan(source) for source in sources):

@@ -67,7 +67,7 @@ def detect(
     points: "str | os.PathLike | ArrayLike",
     *,
     sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
-    up: str | Sequence[float] = "z",
+    up: str | Sequence[float] | None = "z",
     columns: int | None = None,
     max_range: float | None = None,
     min_score: float | None = None,
@@ -79,7 +79,7 @@ def detect(
     Args:
         points: a point file, or (n, 3+) m in any frame.
         sensor_origin: (x, y, z) m in that frame, or "unknown"; None means 0, 0, 0.
-        up: what is up there, as in `predict`.
+        up: what is up there, as in `predict`; None means z.
         columns: values a row of a .bin file.
         max_range: how far from the sensor people are searched, m, level, None for 40; of an unknown sensor everywhere.
         min_score: people with a lower score are left out; None for the detector's own, at which about one false person
@@ -96,6 +96,7 @@ def detect(
     Raises:
         InputError: a file that cannot be read, or an option of another type.
     """
+    up = "z" if up is None else up
     rotation_from_up(up)
     search = search_options(min_score, max_range, max_people, background, columns)
     origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)
@@ -111,15 +112,19 @@ def detect(
 
 
 def search_options(
-    min_score: float | None,
-    max_range: float | None,
-    max_people: int | None,
+    min_score: Any,
+    max_range: Any,
+    max_people: Any,
     background: Any,
     columns: int | None,
     topic: str | None = None,
     meta: str | os.PathLike | None = None,
 ) -> Search:
     """A search with its background read; max_range None: the default. Raises InputError."""
+    # arrays without axes are numbers too
+    min_score, max_range, max_people = (
+        value.item() if getattr(value, "shape", None) == () else value for value in (min_score, max_range, max_people)
+    )
     max_range = MAX_RANGE if max_range is None else max_range
     search = Search(max_range=max_range, min_score=min_score, max_people=max_people)
     if background is None:

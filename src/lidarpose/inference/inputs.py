@@ -117,6 +117,7 @@ def as_points(points: Any, what: str = "points") -> np.ndarray:
     """
     if isinstance(points, str | os.PathLike):
         raise InputError(f"{what} must be an (n, 3) array, got a path: use lidarpose.predict({str(points)!r})")
+    is_records = getattr(getattr(points, "dtype", None), "names", None) is not None
     points = _by_name(points, what)
     try:
         # masked is no point
@@ -133,6 +134,13 @@ def as_points(points: Any, what: str = "points") -> np.ndarray:
     if array.dtype.kind not in "fiu":
         raise InputError(f"{what} must be an (n, 3) array of numbers, got {array.dtype} of shape {array.shape}")
     looks_transposed, looks_depth = is_transposed(array.shape), is_image(array.shape)
+    if array.ndim == 3 and array.shape[2] >= 3:
+        # a scan in rows of beams, or several people: only the caller knows
+        one_scan = "ravel()" if is_records else f"reshape(-1, {array.shape[2]})"
+        raise InputError(
+            f"expected (n, 3 or more) {what}, got {array.shape}: one scan is points.{one_scan}, several people "
+            "list(points)"
+        )
     if array.ndim != 2 or array.shape[1] < 3 or looks_transposed or looks_depth:
         remedy = ": give points.T" if looks_transposed else ""
         remedy = ": of a depth image give the points that its pixels are" if looks_depth else remedy

@@ -1,9 +1,11 @@
 """`predict`: the people of a file or an array. The steps of one scan: read, search, load, pose."""
 
+import inspect
 import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,21 +18,24 @@ from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.inference.results import Poses
 from lidarpose.inference.scan import Scan, pose_scan, read_scan
-from lidarpose.io.boxes import read_boxes
-from lidarpose.models import DEFAULT
+from lidarpose.io.boxes import Boxes, read_boxes
+from lidarpose.models import BUNDLED, DEFAULT
 from lidarpose.sample import Box
+from lidarpose.skeleton import Skeleton
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 # a file of less than this across is taken for a crop, m
 CROP_SIZE = 4.0
+# of directions that are up: `detect` states them to three decimals
+_SAME_UP = 2e-3
 
 
 def predict(
     path: "str | os.PathLike | ArrayLike",
     *,
-    boxes: "str | os.PathLike | dict | Box | list | tuple | np.ndarray | None" = None,
+    boxes: "str | os.PathLike | dict | Box | list | tuple | np.ndarray | Poses | None" = None,
     calib: str | os.PathLike | None = None,
     crop: bool = False,
     find: bool = False,
@@ -39,7 +44,7 @@ def predict(
     max_people: int | None = None,
     background: "str | os.PathLike | Sequence | np.ndarray | None" = None,
     sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
-    skeleton: str | None = None,
+    skeleton: str | Skeleton | None = None,
     up: str | Sequence[float] | None = None,
     columns: int | None = None,
     model: "Predictor | str | os.PathLike | Callable[[], Predictor]" = DEFAULT,
@@ -56,15 +61,16 @@ def predict(
         find: people are searched for, with min_score, max_range (None: 40 m), max_people and background as in `detect`.
             Without boxes, crop and find a file of less than 4 m across is taken as a crop, any other is searched.
         sensor_origin: (x, y, z) m in the file's frame, or "unknown"; None means unknown for a crop and 0, 0, 0 else.
-        skeleton: a name, or None for smpl24, or for the network's own where it has other joints.
+        skeleton: one, or its name; None for smpl24, or for the network's own where it has other joints.
         up: the file's up axis, "z", "y" or "x", with a minus where it points down ("-y": cameras), or for a sensor
             mounted askew the direction that is up, (x, y, z) or "x,y,z" in the file's frame. None: as `detect` and
             `predict` wrote into a file of boxes, else z.
         columns: values a row of a .bin.
         model: a predictor, what `load` takes (with its defaults), or a function that gives the predictor when needed.
+            Bundled networks are loaded once and kept by name; a file is loaded anew, since it may have changed.
 
     Raises:
-        InputError: one line that says what to do.
+        InputError: one line that says what to do. An array without points is no error: nobody is in it.
     """
     options = (min_score, max_range, max_people, background)
     check_choice(boxes, crop, find or any(option is not None for option in options), calib)
@@ -73,11 +79,11 @@ def predict(
     if up is None:
         up = "z" if input_boxes is None else input_boxes.up
     rotation_from_up(up)
+    if input_boxes is not None:
+        check_up(input_boxes, up)
     scan = Scan(points=np.zeros((0, 3)), boxes=input_boxes, origin=as_origin(sensor_origin), up=up_text(up))
     scan = read_scan(scan, path, columns)
-    if not len(scan.points):
-        raise InputError("expected points (n, 3) in meters, got none, or only 0,0,0 and NaN, which are no returns")
-    find = find or boxes is None and not crop and is_wide(scan)
+    find = find or boxes is None and not crop and (not len(scan.points) or is_wide(scan))
     if not find and any(option is not None for option in options):
         note = f"taken as one person, since under {CROP_SIZE:g} m across, and not searched: find looks for people"
         scan = replace(scan, warnings=(*scan.warnings, note))
@@ -93,8 +99,34 @@ def predict(
 
 
 def predictor_of(model: "Predictor | str | os.PathLike | Callable[[], Predictor]") -> "Predictor":
-    """What `predict` takes as its model, ready to use."""
-    return model if isinstance(model, Predictor) else model() if callable(model) else load(model)
+    """What `predict` takes as its model, ready to use. Raises InputError for anything else."""
+    if isinstance(model, str) and model in BUNDLED:
+        return _bundled(model)
+    predictor: object = model
+    if isinstance(model, str | os.PathLike):
+        predictor = load(model)
+    # a network of torch can be called too
+    elif callable(model) and not hasattr(model, "forward") and _needs_nothing(model):
+        predictor = model()
+    if not isinstance(predictor, Predictor):
+        raise InputError(
+            "model: expected a predictor, weights by name or path, or a function without arguments that gives a "
+            f"predictor, got {type(predictor).__name__}: make one by lidarpose.load"
+        )
+    return predictor
+
+
+@lru_cache(maxsize=len(BUNDLED))
+def _bundled(name: str) -> Predictor:
+    return load(name)
+
+
+def _needs_nothing(function: Callable) -> bool:
+    try:
+        inspect.signature(function).bind()
+    except TypeError:
+        return False
+    return True
 
 
 def predict_scan(
@@ -103,7 +135,7 @@ def predict_scan(
     *,
     search: "Search | None" = None,
     known: "KnownPlaces | None" = None,
-    skeleton: str | None = None,
+    skeleton: str | Skeleton | None = None,
     progress: bool = False,
 ) -> tuple[Scan, Poses]:
     """The steps of one scan: people are searched for where `search` is given, else they are the scan's boxes or its
@@ -135,6 +167,13 @@ def is_wide(scan: Scan) -> bool:
     # a map of 10^8 points is not turned for nothing
     upright_points = scan.points if scan.up in UP_AXES else scan.clouds()[0]
     return bool(np.ptp(upright_points, axis=0).max() >= CROP_SIZE)
+
+
+def check_up(boxes: Boxes, up: str | Sequence[float]) -> None:
+    """Raises InputError where boxes say that something else is up than was given."""
+    difference = rotation_from_up(boxes.up)[2] - rotation_from_up(up)[2]
+    if boxes.up != "z" and np.abs(difference).max() > _SAME_UP:
+        raise InputError(f"the boxes say that up is {boxes.up}, not {up_text(up)}: give up {boxes.up}")
 
 
 def check_choice(boxes: object, crop: bool, searched: bool, calib: object) -> None:

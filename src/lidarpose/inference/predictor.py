@@ -41,13 +41,13 @@ from lidarpose.models.checkpoint import read_header
 from lidarpose.models.decode import decoder
 from lidarpose.models.voxelize import WINDOW
 from lidarpose.sample import MIN_POINTS, PER_PERSON, Box, Pose, within_reach
-from lidarpose.skeleton import SMPL24, Skeleton
-from lidarpose.skeleton import skeleton as skeleton_of
+from lidarpose.skeleton import SMPL24, Skeleton, as_skeleton
 from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.live import filter_track
 from lidarpose.tracking.smoothing import smooth
 
 if TYPE_CHECKING:
+    import torch
     from numpy.typing import ArrayLike
 
 BACKENDS = ("onnx", "torch")
@@ -60,7 +60,7 @@ _SURE, _SAME = 0.6, 0.3
 def load(
     weights: str | os.PathLike = DEFAULT,
     *,
-    device: str = "cpu",
+    device: "str | torch.device | None" = "cpu",
     backend: str | None = None,
     decode: str = "window",
     compile: bool = False,
@@ -71,13 +71,14 @@ def load(
 
     Args:
         weights: a name of bundled weights, or a path.
-        device: "cpu", or "cuda" by backend torch.
+        device: "cpu", or "cuda" by backend torch, also as torch's; None means cpu.
         backend: "onnx" (ONNX Runtime, on the CPU) or "torch"; None takes onnx for bundled weights and .onnx files,
             torch for other paths and devices.
         decode: how heatmaps are read, "window" (the mean about the mode), "argmax" or "dark" (the released DAPT
             code's); where two peaks are equally high, rounding decides.
         compile: by `torch.compile`, backend torch only.
-        threads: of ONNX Runtime, None for all processors; backend onnx only.
+        threads: of ONNX Runtime, backend onnx only; None for the processors that the process may use, at most 8 and at
+            most what the environment variable OMP_NUM_THREADS says.
         tta: test-time augmentation, the number of transforms of each person (1 to 8), averaged with the pass that
             centers the cloud. A person costs that pass and one for each transform, so 1 takes two passes, 4 take five.
 
@@ -87,6 +88,7 @@ def load(
     """
     decoder(decode)
     tta_transforms(tta)
+    device = "cpu" if device is None else str(device)
     if threads is not None:
         threads = check_int("threads", threads, least=1)
     if backend is not None:
@@ -135,7 +137,7 @@ _Cloud = _Array | Sequence[Sequence[float]]
 
 class _Options(TypedDict, total=False):
     sensor_origin: "np.ndarray | Sequence[float] | str | None"
-    skeleton: str | None
+    skeleton: str | Skeleton | None
     progress: bool
 
 
@@ -147,15 +149,15 @@ class Predictor(PoseEstimator):
         self.model: dict[str, str | int] = {"name": name, "version": self.header.version, "backend": backend.name}
         self.model |= {"decode": decode} | ({"tta": tta} if tta > 1 else {})
 
-    def in_skeleton(self, name: str | None) -> Skeleton:
-        """A skeleton by name; None is smpl24 where the network has its joints, else the network's own.
+    def in_skeleton(self, name: str | Skeleton | None) -> Skeleton:
+        """A skeleton, by name too; None is smpl24 where the network has its joints, else the network's own.
 
         Raises InputError for an unknown name, or one of a joint that the network lacks.
         """
         network_skeleton = self.skeleton
         if name is None:
             return SMPL24 if set(SMPL24.joints) <= set(network_skeleton.joints) else network_skeleton
-        skeleton = skeleton_of(name)
+        skeleton = as_skeleton(name)
         network_skeleton.map_to(skeleton)
         return skeleton
 
@@ -186,7 +188,7 @@ class Predictor(PoseEstimator):
         self,
         points: _Cloud,
         *,
-        boxes: "str | os.PathLike | dict | Box | list | tuple | np.ndarray",
+        boxes: "str | os.PathLike | dict | Box | list | tuple | np.ndarray | Poses",
         **options: Unpack[_Options],
     ) -> Poses: ...
 
@@ -198,13 +200,14 @@ class Predictor(PoseEstimator):
         Args:
             points (arrays): x, y, z in meters, z up, any frame, each cloud one person, ground and clutter allowed;
                 more columns are ignored, those of tables and records are taken by name. A cloud of under 5 different
-                points gets a result without joints and a warning.
+                points gets a result without joints and a warning. Arrays (a, b, 3) are refused: one scan or several
+                people?
             boxes (as in `lidarpose.predict`): the people of a whole scan; where they say what is up, it need not be z.
             find (bool): they are searched for, as by `lidarpose.detect`, whose result is for `boxes` where anything
                 about the search is to be chosen.
             sensor_origin (array or str): (3,) m, where the sensor stood in that frame, or "unknown"; None means
                 0, 0, 0 with boxes and find, and unknown without.
-            skeleton (str): see `in_skeleton`.
+            skeleton (str or Skeleton): see `in_skeleton`.
             clips (Clips): which of a list's clouds are frames of one person, for networks of clips, by default none:
                 a cloud then fills a clip.
 
@@ -241,7 +244,7 @@ class Predictor(PoseEstimator):
         clouds: "Sequence[ArrayLike]",
         times: "Sequence[float] | np.ndarray | None" = None,
         sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
-        skeleton: str | None = None,
+        skeleton: str | Skeleton | None = None,
         live: bool = False,
         progress: bool = False,
     ) -> Poses:
@@ -259,7 +262,7 @@ class Predictor(PoseEstimator):
             InputError: as `predict` does, and for other times.
         """
         self.in_skeleton(skeleton)
-        if not _is_many(clouds):
+        if not _is_many(clouds) and getattr(clouds, "ndim", 0) != 3:
             raise InputError("predict_clip: expected a list of clouds, one a frame, got one cloud: use predict")
         seconds = clip_times(times, len(clouds))
         clips = Clips.of_run(len(clouds)) if len(clouds) and getattr(self.backend, "frames", 1) > 1 else None
@@ -279,7 +282,7 @@ class Predictor(PoseEstimator):
         self,
         clouds: Sequence[np.ndarray],
         origin: np.ndarray | None,
-        skeleton: str | None = None,
+        skeleton: str | Skeleton | None = None,
         progress: bool = False,
         *,
         clips: Clips | None = None,
@@ -431,9 +434,7 @@ def _steady_warnings(person: PersonPose, pose: Pose | None) -> tuple[str, ...]:
 
 def _is_many(points) -> bool:
     """A list of clouds, rather than one cloud, be it written as a list of rows."""
-    if isinstance(points, list | tuple):
-        return len(points) == 0 or not _is_row(points[0])
-    return getattr(points, "ndim", 0) == 3
+    return isinstance(points, list | tuple) and (len(points) == 0 or not _is_row(points[0]))
 
 
 def _is_row(value) -> bool:

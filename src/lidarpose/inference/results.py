@@ -73,7 +73,8 @@ class PersonPose:
 
     @property
     def visible(self) -> np.ndarray:
-        """(J,): probability that the sensor sees the joint; None where the network does not say."""
+        """(J,): probability that a point of the body lies within 18 cm of the joint; None where the network does not
+        say."""
         return self._of_pose("visible")
 
     @property
@@ -123,7 +124,8 @@ class PersonPose:
         """The entry of this person under "people"."""
         return {
             "id": self.id,
-            "box": self.box and self.box.to_dict(),
+            # "up" stands beside the people
+            "box": self.box and replace(self.box, up=None).to_dict(),
             "score": None if self.score is None else round(self.score, 4),
             "mounted": self.mounted,
             "num_points": self.num_points,
@@ -153,6 +155,10 @@ class PersonPose:
         """The person from the front and the side, as PNG; also written to `path` where given."""
         return self.alone().picture(path)
 
+    def html(self, path: str | Path | None = None, *, title: str = "") -> str:
+        """As `Poses.html`."""
+        return self.alone().html(path, title=title)
+
     def to_dataframe(self) -> "pandas.DataFrame":
         """A row a joint: see `Poses.to_dataframe`."""
         return self.alone().to_dataframe()
@@ -180,7 +186,8 @@ class Poses(Sequence[PersonPose]):
     """The people of one call, in the order of the boxes or arrays. A sequence of `PersonPose`.
 
     warnings concern the whole input; timing_ms: what took how long; up: the frame's up axis, which pictures need. Where
-    people were searched for, scan (n, 3) m is all that was searched, and origin (3,) m the sensor's place or None.
+    people were searched for, scan (n, 3) m is all that was searched, and origin (3,) m the sensor's place or None: who
+    keeps many results and needs no pictures of scans, keeps `dataclasses.replace(poses, scan=None)`.
     """
 
     people: tuple[PersonPose, ...]
@@ -207,7 +214,10 @@ class Poses(Sequence[PersonPose]):
         if isinstance(index, slice):
             return replace(self, people=self.people[index])
         if isinstance(index, str):
-            matches = [person for person in self.people if str(person.id) == index]
+            named_people = [person for person in self.people if person.id is not None]
+            matches = [person for person in named_people if str(person.id) == index]
+            if self.people and not named_people:
+                raise KeyError(f"nobody has the id {index!r}: ids are not set, take people by place, as [0]")
             if not matches:
                 raise KeyError(f"nobody has the id {index!r}: ids are {[person.id for person in self.people]}")
             return matches[0]

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lidarpose.errors import check_int
 from lidarpose.geometry import rotation_from_up, rotation_of_boxes, upright_axis
 from lidarpose.inference.checks import check_scan, origin_warning, rows_inside, unit_warning
 from lidarpose.inference.inputs import as_points, only_returns
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from lidarpose.inference.predictor import Predictor
+    from lidarpose.skeleton import Skeleton
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -93,6 +95,8 @@ def read_scan(scan: Scan, points: str | os.PathLike | ArrayLike, columns: int | 
     """The scan with the returns of a file, its name and notes, or those of an array (n, 3+) m. Raises InputError for a
     file without any."""
     source = os.fsdecode(points) if isinstance(points, str | os.PathLike) else None
+    if source is None and columns is not None:
+        check_int("columns", columns, least=3, hint=" (x y z first)")
     cloud = Cloud(points=as_points(points)) if source is None else read_points(source, columns=columns)
     returns, notes = only_returns(cloud.points)
     if source is not None and not len(returns):
@@ -101,7 +105,9 @@ def read_scan(scan: Scan, points: str | os.PathLike | ArrayLike, columns: int | 
     return replace(scan, points=returns, warnings=(*cloud.warnings, *notes), source=source)
 
 
-def pose_scan(scan: Scan, predictor: Predictor, *, skeleton: str | None = None, progress: bool = False) -> Poses:
+def pose_scan(
+    scan: Scan, predictor: Predictor, *, skeleton: str | Skeleton | None = None, progress: bool = False
+) -> Poses:
     """Poses of the scan's people in the input's frame, with warnings; `timing_ms` has "crop" and "predict"."""
     start = time.perf_counter()
     clouds = scan.clouds()

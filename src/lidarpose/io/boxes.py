@@ -12,16 +12,19 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, SupportsIndex, overload
+from typing import TYPE_CHECKING, Any, SupportsIndex, overload
 
 import numpy as np
 
 from lidarpose.arrays import to_numpy
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, rotation_from_up
-from lidarpose.io.files import FormatError, file_error, lined_json, read_bytes, shorten, write_atomic
+from lidarpose.io.files import FormatError, check_suffix, file_error, lined_json, read_bytes, shorten, write_atomic
 from lidarpose.io.npz import load_array
 from lidarpose.sample import FARTHEST, Box, box_id
+
+if TYPE_CHECKING:
+    from lidarpose.inference.results import Poses
 
 # nobody writes more than two full turns in radians; 30, 90 or 180 are degrees
 _MAX_YAW = 4 * math.pi
@@ -72,7 +75,9 @@ class Boxes(list[Box]):
 
     def to_dict(self) -> dict:
         """The document of the schema lidarpose.boxes/1, which `read_boxes` reads."""
-        people = [{"id": box.id, **box.to_dict(), "score": box.score, "mounted": box.mounted} for box in self]
+        # "up" stands beside the people
+        boxes = [replace(box, up=None) for box in self]
+        people = [{"id": box.id, **box.to_dict(), "score": box.score, "mounted": box.mounted} for box in boxes]
         return {
             "schema": SCHEMA,
             "source": self.source,
@@ -89,11 +94,12 @@ class Boxes(list[Box]):
         return lined_json(self.to_dict(), "people") + "\n"
 
     def save(self, path: str | os.PathLike) -> None:
-        """Writes `to_json` to a file, whole or not at all."""
+        """Writes `to_json` to a .json, whole or not at all."""
+        check_suffix(path, ".json")
         write_atomic(path, self.to_json())
 
 
-def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike | None = None) -> Boxes:
+def read_boxes(source: "str | os.PathLike | _Content | Poses", *, calib: str | os.PathLike | None = None) -> Boxes:
     """The boxes of people, in the frame of the points, meters and radians.
 
     Args:
@@ -101,9 +107,9 @@ def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike
             of which pedestrians, sitting people and cyclists are read, moved to the LiDAR's frame). Content is
             `{"people": [...]}` or the bare list, of which each entry is a `Box`, a row [x, y, z, l, w, h, yaw] or a
             dict: `center` [x, y, z], `size` [length, width, height], `yaw` about z (0 where it is absent), and as id
-            `id`, else `track`, else None, and `score` (0 to 1) and `mounted` (true or false) where they are that; other
-            keys are ignored. A pose stands for its `box`, as in what `predict` writes. An array or tensor (n, 7)
-            has such rows.
+            `id`, else `track`, else None, and `score` (0 to 1), `mounted` (true or false) and `up` where they are that;
+            other keys are ignored. A pose stands for its `box`, as in what `predict` writes, and `Poses` for those of
+            their people. An array or tensor (n, 7) has such rows.
         calib: KITTI's calibration file; None for `../calib/N.txt` beside a label.
 
     Returns:
@@ -115,6 +121,10 @@ def read_boxes(source: str | os.PathLike | _Content, *, calib: str | os.PathLike
             of one id are an error, since results are told apart by it.
     """
     source = to_numpy(source)
+    if hasattr(source, "people"):
+        poses: Any = source
+        people = [p.to_dict() if p.box is None else replace(p.box, id=p.id) for p in poses.people]
+        source = {"schema": SCHEMA, "up": poses.up, "people": people}
     try:
         content = source if isinstance(source, _Content) else _load_file(source, calib)
         boxes = [_box(entry, f"people[{i}]") for i, entry in enumerate(_entries(content))]
@@ -292,6 +302,11 @@ def _box(entry: object, where: str) -> Box:
         raise FormatError(f"{where}.yaw: expected radians, got {yaw:g}; if it is in degrees, multiply by pi / 180")
     # of other detectors a score may be anything, and nothing depends on it
     score = _number(entry.get("score"))
+    up = None
+    with suppress(InputError):
+        if isinstance(entry.get("up"), str):
+            rotation_from_up(entry["up"])
+            up = entry["up"]
     mounted = entry.get("mounted")
     return Box(
         center=np.array(center),
@@ -300,6 +315,7 @@ def _box(entry: object, where: str) -> Box:
         id=id,
         score=score if score is not None and 0 <= score <= 1 else None,
         mounted=bool(mounted) if isinstance(mounted, bool | np.bool_) else None,
+        up=up,
     )
 
 

@@ -16,6 +16,8 @@ import math
 import os
 import struct
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
@@ -131,6 +133,19 @@ def build(config: Any) -> nn.Module:
     return NETWORKS[config.kind].part("network")(config)
 
 
+@contextmanager
+def _float32() -> Iterator[None]:
+    """Whatever torch's default type is, float32 meanwhile."""
+    import torch
+
+    default_type = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(default_type)
+
+
 @dataclass(frozen=True, kw_only=True)
 class SafetensorsFile:
     """A safetensors file that is neither cut off nor something else.
@@ -185,7 +200,7 @@ class SafetensorsFile:
         if config.layers > len(shapes):
             problem = f"has {len(shapes)} tensors, too few for {config.layers} layers by {source}: {remedy}"
             raise file_error(self.path, problem)
-        with torch.device("meta"):
+        with _float32(), torch.device("meta"):
             expected = build(config).state_dict()
         if missing_names := [name for name in expected if name not in shapes]:
             raise file_error(self.path, f"tensor {missing_names[0]} is missing, which {source} has: {remedy}")
@@ -196,7 +211,9 @@ class SafetensorsFile:
                 problem = f"tensor {name} should be {tuple(value.shape)} by {source}, got {shapes[name]}: {remedy}"
                 raise file_error(self.path, problem)
         state = self.load(expected)
-        network = build(config)
+        # random weights come before the file's: who draws random numbers elsewhere does not see it
+        with _float32(), torch.random.fork_rng(devices=[]):
+            network = build(config)
         network.load_state_dict(state)
         return network.eval()
 

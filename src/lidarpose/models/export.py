@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from lidarpose._version import __version__
 from lidarpose.errors import InputError, LidarPoseError, check_name, missing_extra
 from lidarpose.io.files import atomic_path, check_not_input, check_suffix, check_writable, content_digest, write_atomic
+from lidarpose.models import weights_path
 from lidarpose.models.checkpoint import DIGEST, ENTRY, Header, load_checkpoint
 from lidarpose.models.detector.detector_config import INPUTS, OUTPUT
 from lidarpose.models.detector.network import DetectorNet
@@ -40,18 +41,20 @@ _WORTH = 64
 
 
 def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = "onnx") -> None:
-    """Writes the checkpoint at `weights` as a file of another format, computing in float32, whole or not at all.
+    """Writes a checkpoint as a file of another format, computing in float32, whole or not at all.
 
     Args:
+        weights: a name of bundled weights, or the path of a checkpoint.
         format: "onnx", a self-contained file that ONNX Runtime and this package run without torch, no larger than the
             checkpoint where that keeps float16; or "torch", a program (.pt2) for `torch.export.load`. Both take any
-            number of people and points; `models/onnx.py` tells the inputs.
+            number of people and points; docs/use.md, "Exported networks", tells inputs and outputs.
 
     Raises:
         InputError: a file that is no checkpoint of this package's own networks, and an `out` that ends in another
             suffix than `FORMATS` says. MissingExtra: without onnx.
     """
     check_name("format", format, FORMATS)
+    weights = weights_path(weights)
     check_not_input(out, weights)
     check_suffix(out, FORMATS[format])
     network, header = load_checkpoint(weights)

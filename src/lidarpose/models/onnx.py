@@ -52,10 +52,13 @@ def input_name(name: str) -> str:
 
 
 def usable_threads() -> int:
-    """Processors that this process may use, `_MOST_THREADS` at the most."""
+    """Processors that this process may use, `_MOST_THREADS` at the most, and what OMP_NUM_THREADS says."""
     # macOS and Windows cannot be asked
     processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(processors, _MOST_THREADS)
+    # a list is of nested regions, the outermost first
+    bound = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()
+    most = int(bound) if bound.isascii() and bound.isdecimal() else 0
+    return min(processors, _MOST_THREADS, most or _MOST_THREADS)
 
 
 def runtime() -> ModuleType:

@@ -1,10 +1,11 @@
 """`predict_recording`: the people of every frame of a folder or recording, posed and, if asked, joined over time."""
 
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import Any, TypedDict, Unpack
 
 import numpy as np
@@ -12,8 +13,8 @@ import numpy as np
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_from_up, up_text
 from lidarpose.inference.detection import DetectedScan, detect_places, least_score, other_up_axis, search_options
-from lidarpose.inference.inputs import as_origin, only_returns
-from lidarpose.inference.predict_scan import check_choice, is_wide, predict_scan, predictor_of
+from lidarpose.inference.inputs import as_origin, as_points, only_returns
+from lidarpose.inference.predict_scan import check_choice, check_up, is_wide, predict_scan, predictor_of
 from lidarpose.inference.predictor import Predictor
 from lidarpose.inference.results import Poses
 from lidarpose.inference.scan import Scan
@@ -78,15 +79,15 @@ class PosingOptions(TypedDict, total=False):
     max_people: int | None
     background: "str | os.PathLike | Sequence | np.ndarray | None"
     sensor_origin: "np.ndarray | Sequence[float] | str | None"
-    skeleton: str | None
-    up: str | Sequence[float]
+    skeleton: str | Skeleton | None
+    up: str | Sequence[float] | None
     track: bool
     live: bool
     model: "Predictor | str | os.PathLike | Callable[[], Predictor]"
 
 
 def predict_recording(
-    source: "str | os.PathLike | Sequence[str | os.PathLike] | FrameSource",
+    source: "str | os.PathLike | Iterable[str | os.PathLike] | FrameSource | Iterable[Frame | DamagedFrame]",
     *,
     columns: int | None = None,
     topic: str | None = None,
@@ -99,9 +100,12 @@ def predict_recording(
 ) -> Iterator[FramePoses]:
     """Poses of the people of each frame of a recording, one frame after the other.
 
+    Sources are read in another thread, one frame ahead; who leaves early does not wait for it.
+
     Args:
         source: files, folders or recordings as `open_source` takes them, with columns, topic, meta, rate, start, end
-            and every; or a source.
+            and every; or a source, or any iterable of `Frame`, as of a running sensor, whose arrays may be used again
+            for the next frame.
         **posing: how frames are posed: boxes, calib, crop, find, min_score, max_range, max_people, background,
             sensor_origin, skeleton, up, track, live and model. boxes as of `FrameBoxes`; track: people are joined over
             time, and people known need no verification; live: with tracks, whose poses are made steady by the past
@@ -111,15 +115,37 @@ def predict_recording(
         `FramePoses`, of damaged frames too.
 
     Raises:
-        InputError: options that contradict each other, or a source that cannot be read at all.
+        InputError: options that contradict each other, a source that cannot be read at all, and after the last frame
+            boxes of which no frame had any.
     """
     if unknown := set(posing) - set(PosingOptions.__annotations__):
         raise TypeError(f"predict_recording() got an unexpected keyword argument {min(unknown)!r}")
-    if not (hasattr(source, "frames") and hasattr(source, "name")):
-        source_options: dict[str, Any] = {"topic": topic, "meta": meta, "rate": rate, "start": start, "end": end}
-        source = open_source(source, columns=columns, every=every, **source_options)
-    predictor = FramePredictor(columns=columns, topic=topic, meta=meta, name=source.name, **posing)
-    return predictor.predict_all(source.frames())
+    choice: dict[str, Any] = {"rate": rate, "start": start, "end": end, "every": every}
+    paths, frames = _frames_among(source)
+    name = getattr(source, "name", None)
+    if frames is None:
+        opened = open_source(paths, columns=columns, topic=topic, meta=meta, **choice)
+        name, frames = opened.name, opened.frames()
+    elif options := [option for option, value in choice.items() if value != (1 if option == "every" else None)]:
+        raise InputError(f"{options[0]} is for paths, got frames: give it to open_source, or leave frames out yourself")
+    predictor = FramePredictor(columns=columns, topic=topic, meta=meta, name=name, **posing)
+    return predictor.predict_all(frames)
+
+
+def _frames_among(source: Any) -> tuple[Any, Iterator[Frame | DamagedFrame] | None]:
+    """The paths that are given as a source, or the frames of one or of an iterable."""
+    if hasattr(source, "frames") and hasattr(source, "name"):
+        return None, source.frames()
+    if isinstance(source, str | bytes | os.PathLike) or not isinstance(source, Iterable):
+        return source, None
+    items = iter(source)
+    first = next(items, "")
+    if isinstance(first, Frame | DamagedFrame):
+        return None, chain([first], items)
+    if not isinstance(first, str | os.PathLike):
+        kind = type(first).__name__
+        raise InputError(f"source: expected paths or frames, got {kind}: make a lidarpose.Frame of each scan")
+    return [first, *items] if first else [], None
 
 
 class FramePredictor:
@@ -142,8 +168,8 @@ class FramePredictor:
         max_people: int | None = None,
         background: "str | os.PathLike | Sequence | np.ndarray | None" = None,
         sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
-        skeleton: str | None = None,
-        up: str | Sequence[float] = "z",
+        skeleton: str | Skeleton | None = None,
+        up: str | Sequence[float] | None = "z",
         columns: int | None = None,
         topic: str | None = None,
         meta: str | os.PathLike | None = None,
@@ -155,6 +181,7 @@ class FramePredictor:
         search_arguments = (min_score, max_range, max_people, background)
         is_searched = find or any(option is not None for option in search_arguments)
         check_choice(boxes, crop, is_searched, calib)
+        up = "z" if up is None else up
         rotation_from_up(up)
         self.up, self.name, self.skeleton = up_text(up), name, skeleton
         self.boxes = None if boxes is None else FrameBoxes(boxes, calib=calib)
@@ -199,11 +226,18 @@ class FramePredictor:
             frame = next(frames, None)
             return None if frame is None else (frame, self._prepared(frame))
 
-        with ThreadPoolExecutor(1) as pool:
+        last = None
+        pool = ThreadPoolExecutor(1)
+        try:
             future = pool.submit(prepare)
             while (prepared_frame := future.result()) is not None:
                 future = pool.submit(prepare)
+                last = prepared_frame[0].index, prepared_frame[0].id
                 yield self._predicted(*prepared_frame)
+        finally:
+            # the next frame of a running sensor may never come
+            pool.shutdown(wait=False, cancel_futures=True)
+        self.check_boxes(last)
 
     def predict(self, frame: Frame | DamagedFrame) -> FramePoses:
         """The people of the next frame."""
@@ -248,14 +282,15 @@ class FramePredictor:
         return frame_poses(poses=replace(poses, source=self.name))
 
     def _scan(self, frame: Frame) -> Scan:
-        points, notes = only_returns(frame.points)
+        # a copy: results keep points, and a driver may fill the same array with the next frame
+        points, notes = only_returns(as_points(frame.points))
         scan = Scan(points=points, up=self.up)
         if self.boxes is not None:
             boxes = self.boxes.of(frame)
             if boxes is None:
                 notes += ["no boxes are given for this frame"]
-            elif boxes.up not in ("z", self.up):
-                raise InputError(f"the boxes say that up is {boxes.up}, not {self.up}: give up {boxes.up}")
+            else:
+                check_up(boxes, self.up)
             scan = replace(scan, boxes=boxes or [])
         elif self._is_crop is None and len(points):
             self._is_crop = not is_wide(scan)

@@ -179,18 +179,24 @@ class Tracker:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> "Tracker":
-        """The tracker whose `state()` this is: it goes on as that one would."""
-        tracker = cls(max_gap=state["max_gap"])
-        tracker.jumps_back, tracker._time, tracker._next_id = state["jumps_back"], state["time"], state["next_id"]
-        empty_tracks = tracker._tracks
-        tracker._tracks = _Tracks(
-            **{
-                name: np.array(values, getattr(empty_tracks, name).dtype).reshape(
-                    -1, *getattr(empty_tracks, name).shape[1:]
-                )
-                for name, values in state["tracks"].items()
-            }
-        )
+        """The tracker whose `state()` this is: it goes on as that one would. Raises InputError for anything else."""
+        try:
+            tracker = cls(max_gap=state["max_gap"])
+            tracker.jumps_back, tracker._time, tracker._next_id = state["jumps_back"], state["time"], state["next_id"]
+            empty_tracks = tracker._tracks
+            tracker._tracks = _Tracks(
+                **{
+                    name: np.array(values, getattr(empty_tracks, name).dtype).reshape(
+                        -1, *getattr(empty_tracks, name).shape[1:]
+                    )
+                    for name, values in state["tracks"].items()
+                }
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise InputError(
+                f"expected the state of a tracker, got {reprlib.repr(state)} ({type(error).__name__}: {error}): give "
+                "what Tracker.state() returned"
+            ) from None
         return tracker
 
     def _elapsed(self, time: float) -> _Tracks:

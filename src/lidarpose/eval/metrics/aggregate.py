@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from lidarpose.arrays import to_numpy
 from lidarpose.errors import InputError, check_int, check_name
-from lidarpose.skeleton import Skeleton, skeleton
+from lidarpose.skeleton import Skeleton, as_skeleton
 
 # how people and joints are averaged: over people the mean of each one's joints, or over all joints alike
 AVERAGES = ("person", "joint")
@@ -73,11 +73,6 @@ def as_table(table: ArrayLike) -> np.ndarray:
     if np.isinf(table).any():
         raise InputError("a table of scores must be finite, or NaN where a joint has no label; got infinity")
     return table[:, None] if table.ndim == 1 else table
-
-
-def as_skeleton(of: Skeleton | str) -> Skeleton:
-    """A skeleton, by name too."""
-    return skeleton(of) if isinstance(of, str) else of
 
 
 def check_positive(name: str, value: float) -> None:

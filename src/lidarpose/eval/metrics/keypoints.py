@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lidarpose.errors import InputError
-from lidarpose.eval.metrics.aggregate import Score, as_flags, as_numbers, as_skeleton, check_positive, mean
+from lidarpose.eval.metrics.aggregate import Score, as_flags, as_numbers, check_positive, mean
 from lidarpose.eval.metrics.joint_errors import checked_poses, joint_errors
-from lidarpose.skeleton import WAYMO14, Skeleton
+from lidarpose.skeleton import WAYMO14, Skeleton, as_skeleton
 from lidarpose.tracking.assignment import assign_plain
 
 # spread of each joint in units of the box's scale; twice COCO's sigmas, the head's center by the same method

@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from lidarpose.errors import InputError, LidarPoseError, MissingExtra, check_finite, check_int
+from lidarpose.geometry import is_rotation
 from lidarpose.io.files import FormatError, file_error, one_line, shorten
 
 # frames a second where a source has no times
@@ -42,15 +43,34 @@ class Frame(Sweep):
     """One frame of a source: a `Sweep` without the rows that are no returns, and its place in the source.
 
     Args:
-        points: (n, 3) float64 m, finite.
+        points: (n, 3) float64 m, finite. Of frames that you make `predict_recording` drops what is no return.
         index: its number in the source, from 0; damaged frames count.
         id: its name in the source, e.g. the stem of its file.
         time: s; from `index` and the rate where the source has no times.
+
+    Raises:
+        InputError: `T_world_sensor` is no rigid transform (4, 4).
     """
 
     index: int
     id: str
     time: float | None = None
+
+    def __post_init__(self):
+        if self.T_world_sensor is None:
+            return
+        try:
+            T = np.asarray(self.T_world_sensor, float)
+        except (TypeError, ValueError):
+            T = np.zeros(0)
+        is_finite = T.shape == (4, 4) and np.isfinite(T).all()
+        if not (is_finite and is_rotation(T[:3, :3]) and np.allclose(T[3], [0, 0, 0, 1])):
+            actual = shorten(repr(np.round(T, 3).tolist()), 90)
+            raise InputError(
+                f"Frame.T_world_sensor: expected (4, 4), a rotation and a place in meters over 0 0 0 1, got {actual}: "
+                "give None where the sensor's pose is not known"
+            )
+        object.__setattr__(self, "T_world_sensor", T)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -284,16 +304,16 @@ class FrameSource:
 def _read(lazy_frame: LazyFrame, index: int, time: float | None) -> Frame | DamagedFrame:
     try:
         sweep = lazy_frame.read()
+        points = np.asarray(sweep.points, np.float64)
+        # finite, and not 0, 0, 0
+        distance = np.abs(points) @ np.ones(3)
+        is_return = (distance > 0) & (distance < np.inf)
+        ring = None if sweep.ring is None else sweep.ring[is_return]
+        returns = vars(sweep) | {"points": points[is_return], "ring": ring}
+        return Frame(**returns, index=index, id=lazy_frame.id, time=time)
     except MissingExtra:
         raise
     except Exception as error:
         is_explained = isinstance(error, LidarPoseError | FormatError)
         reason = str(error) if is_explained else f"cannot be read ({shorten(f'{type(error).__name__}: {error}')})"
         return DamagedFrame(index=index, id=lazy_frame.id, time=time, error=one_line(reason))
-    points = np.asarray(sweep.points, np.float64)
-    # finite, and not 0, 0, 0
-    distance = np.abs(points) @ np.ones(3)
-    is_return = (distance > 0) & (distance < np.inf)
-    ring = None if sweep.ring is None else sweep.ring[is_return]
-    returns = vars(sweep) | {"points": points[is_return], "ring": ring}
-    return Frame(**returns, index=index, id=lazy_frame.id, time=time)
