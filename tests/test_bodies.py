@@ -7,7 +7,8 @@ import pytest
 from motion_files import joints_of
 
 from lidarpose.body.mocap.motion import Motion
-from lidarpose.body.rig import clothing
+from lidarpose.body.pose_prior.clearance import cleared
+from lidarpose.body.rig import clothing, load_rig
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth import bodies
@@ -145,3 +146,98 @@ def test_people_without_clothes_wear_none(monkeypatch):
     np.testing.assert_array_equal(bare.joints[..., :2], dressed.joints[..., :2])
     monkeypatch.setattr(bodies, "clothing", lambda rng, count, rig: clothing(rng, count) * 0)
     np.testing.assert_array_equal(Generator(scene=SCENES["paper"])._bodies(SEED, 0).vertices, bare.vertices)
+
+
+def folded_arms(frames=12):
+    """Somebody whose hands and wrists are in the belly of anybody who is not thin, and who breathes."""
+    someone = motion(frames=frames)
+    for side, sign in (("left", 1), ("right", -1)):
+        down = -sign * (1.35 + 0.05 * np.sin(np.arange(frames)))
+        someone.rotations[:, SMPL24.index(f"{side}_shoulder")] = rotation_about("x", down)
+        # the forearms go level across the belly
+        across = rotation_about("x", sign * 1.35) @ rotation_about("z", -sign * (np.pi - 0.45))
+        someone.rotations[:, SMPL24.index(f"{side}_elbow")] = across
+    return someone
+
+
+def wrists_inside(body, rows):
+    """How far (rows, 2) m the wrists are behind the front of the trunk at their height: above 0 inside."""
+    depths = []
+    trunk = np.isin(body.face_part, [1 + SMPL24.index(name) for name in ("pelvis", "spine1", "spine2", "spine3")])
+    for row in rows:
+        points = body.vertices[row][np.unique(body.faces[trunk])]
+        for side in ("left", "right"):
+            wrist = body.joints[row, JOINTS[f"{side}_wrist"]]
+            near = np.abs(points[:, 1:] - wrist[1:]).max(1) < 0.06
+            depths.append(points[near, 0].max() - wrist[0] if near.any() else 0.0)
+    return np.array(depths).reshape(-1, 2)
+
+
+def test_captured_arms_are_outside_the_drawn_body():
+    bank = PoseBank.of_motion(folded_arms())
+    before, after = (draw_bodies(bank, 1.0, 60, SEED, 0, clear_limbs=on) for on in (False, True))
+    inside, left = (wrists_inside(people, range(60)).max(1) for people in (before, after))
+    assert (inside > 0.04).mean() > 0.5 and (left > 0.04).mean() < 0.05
+    # everything else is as it was, up to where the soles are, and the arms of those who had room
+    hidden = [JOINTS[f"{side}_{name}"] for side in ("left", "right") for name in ("elbow", "wrist", "hand")]
+    others = np.setdiff1d(np.arange(26), hidden)
+    np.testing.assert_allclose(after.joints[:, others], before.joints[:, others], atol=0.06)
+    moved = np.linalg.norm(after.joints - before.joints, axis=-1)[:, hidden]
+    assert (moved < 0.3).all()
+    # folded arms stay folded: hands in front of the trunk, no farther away than a hand is thick
+    wrists = after.joints[:, [JOINTS["left_wrist"], JOINTS["right_wrist"]]]
+    assert (wrists[..., 0].min(1) > before.joints[:, JOINTS["spine1"], 0]).all() and np.median(left) > -0.06
+    # a pose goes on as it did
+    for row in range(5):
+        way = [people.moved(row)[1] - people.joints[row] for people in (before, after)]
+        np.testing.assert_allclose(way[0], way[1], atol=0.03)
+
+
+def test_people_with_room_about_them_keep_their_pose():
+    # arms ahead and hanging, away from the body
+    bank = PoseBank.of_motion(motion())
+    before, after = (draw_bodies(bank, 0.5, 60, SEED, 0, clear_limbs=on) for on in (False, True))
+    same = np.abs(after.joints - before.joints).max((1, 2)) == 0
+    assert same.mean() > 0.7
+    # who is not captured stays as the prior drew them
+    prior = np.isnan(before.places[:, 0])
+    assert same[prior].all() and 0.3 < prior.mean() < 0.7
+
+
+def test_corrected_clips_move_evenly():
+    bank = PoseBank.of_motion(folded_arms(40))
+    hands = [JOINTS[f"{side}_hand"] for side in ("left", "right")]
+    for seed in range(3):
+        before, after = (
+            draw_moving_bodies(bank, 1.0, 2, 9, np.random.default_rng(seed), clear_limbs=on)[0] for on in (False, True)
+        )
+        shift = (after.joints - after.joints[:, :1] - (before.joints - before.joints[:, :1]))[:, hands]
+        assert np.abs(np.diff(shift, axis=0)).max() < 0.05
+        assert (wrists_inside(after, range(9)) < 0.04).all()
+
+
+def test_shanks_stand_apart():
+    rig = load_rig()
+    people = rig.rest(np.zeros((2, rig.coefficients.shape[1])))
+    pose = np.tile(np.eye(3, dtype=np.float32), (2, 1, 24, 1, 1))
+    for side, sign in (("left", 1), ("right", -1)):
+        pose[0, :, SMPL24.index(f"{side}_hip")] = rotation_about("x", -sign * 0.1)
+    after = cleared(rig, people, np.zeros(people.vertices.shape[:2], np.float32), pose, np.arange(2), is_clip=False)
+    ankle = [
+        joints_of(poses[:, 0])[0, [SMPL24.index("left_ankle"), SMPL24.index("right_ankle")], 1]
+        for poses in (pose, after)
+    ]
+    assert ankle[0][0] - ankle[0][1] < 0.05 < 0.055 < ankle[1][0] - ankle[1][1] < 0.1
+    np.testing.assert_array_equal(after[1], pose[1])
+
+
+def test_limbs_are_cleared_in_wide_alone():
+    assert {name for name, scene in SCENES.items() if scene.clear_limbs} == {"wide"}
+    bank = PoseBank.of_motion(folded_arms())
+    off, on = (
+        Generator(scene=replace(SCENES["wild"], clear_limbs=share), bank=bank, captured=1.0)._bodies(SEED, 0)
+        for share in (0.0, 1.0)
+    )
+    wide = Generator(scene=replace(SCENES["wide"], unusual=0.0), bank=bank, captured=1.0)._bodies(SEED, 0)
+    np.testing.assert_array_equal(on.joints, wide.joints)
+    assert np.abs(on.joints - off.joints).max() > 0.05

@@ -11,6 +11,7 @@ from lidarpose.body.mocap import load_motion
 from lidarpose.body.mocap.motion import Motion, facing_x
 from lidarpose.body.mocap.smpl_poses import load_betas
 from lidarpose.body.pose_prior.activities import KINDS
+from lidarpose.body.pose_prior.clearance import cleared
 from lidarpose.body.pose_prior.sampling import sample_clips, sample_rotations
 from lidarpose.body.rig import RestBody, Rig, clothing, load_rig, mean_adult_joints, pose_bodies
 from lidarpose.body.smpl import load_body
@@ -160,6 +161,7 @@ def draw_bodies(
     clothes: float = 1.0,
     mix: dict[str, float] | None = None,
     rig: Rig | None = None,
+    clear_limbs: bool = False,
 ) -> Bodies:
     """The people of a block; a function of (seed, block) and of where poses come from.
 
@@ -168,6 +170,7 @@ def draw_bodies(
         count: number of bodies.
         moving: False is faster; then nobody goes anywhere.
         clothes, mix: see `SceneConfig` and `sample_rotations`; rig: the body, None: the shipped one.
+        clear_limbs: see `SceneConfig`; how people move on is corrected as the pose is.
     """
     rng = np.random.default_rng([seed, RandomStream.BLOCK, block])
     rig = load_rig() if rig is None else rig
@@ -185,6 +188,8 @@ def draw_bodies(
         kinds = np.where(is_captured, "captured", kinds)
         places = np.where(is_captured[:, None], bank.places[bank_rows], np.nan)
     rest_bodies, cloth_offsets = rig.draw_people(rng, count), clothing(rng, count, rig) * np.float32(clothes)
+    if clear_limbs and bank is not None:
+        poses = cleared(rig, rest_bodies, cloth_offsets, poses, np.flatnonzero(is_captured), is_clip=False)
     vertices, joints, low, high = _dressed(
         rig, rest_bodies, cloth_offsets, poses[:, 0], np.zeros((count, 3), np.float32)
     )
@@ -227,13 +232,14 @@ def draw_moving_bodies(
     to_last: bool = False,
     mix: dict[str, float] | None = None,
     rig: Rig | None = None,
+    clear_limbs: bool = False,
 ) -> list[Bodies]:
     """The frames of `count` people who move, at `CLIP_HZ`.
 
     Args:
         bank: captured poses, or None.
         captured: chance of a clip of the bank instead of the prior's.
-        clothes, tempo, mix: see `SceneConfig` and `sample_clips`.
+        clothes, tempo, mix, clear_limbs: see `SceneConfig` and `sample_clips`.
         to_last: the last frame is on the origin and faces +x, instead of the first.
         rig: the body, None: the shipped one.
     """
@@ -256,6 +262,10 @@ def draw_moving_bodies(
         )
     people = rig.draw_people(rng, count)
     cloth_offsets = clothing(rng, count, rig) * np.float32(clothes)
+    if clear_limbs and prior_count < count:
+        rotations = np.stack([clip_rotations for clip_rotations, *_ in motion])
+        rotations = cleared(rig, people, cloth_offsets, rotations, np.arange(count - prior_count), is_clip=True)
+        motion = [(clip_rotations, *rest) for clip_rotations, (_, *rest) in zip(rotations, motion, strict=True)]
     return [
         _moving_body(
             rig,

@@ -115,7 +115,7 @@ class Generator:
         # neighbors share a block; two suffice for a reader that crosses from one to the next
         draw_block = partial(
             draw_bodies, self.bank, self.captured, BLOCK, moving=moving, clothes=self.config.clothes, mix=self._mix,
-            rig=self.rig,
+            rig=self.rig, clear_limbs=bool(self.config.clear_limbs),
         )  # fmt: skip
         return lru_cache(maxsize=2)(draw_block)
 
@@ -133,6 +133,7 @@ class Generator:
             moving = draw_moving_bodies(
                 self.bank, self.captured, len(rows), MOST_FRAMES, rng, clothes=self.config.clothes,
                 tempo=self.config.tempo, to_last=True, mix=self._mix, rig=self.rig,
+                clear_limbs=bool(self.config.clear_limbs),
             )  # fmt: skip
             return draws, dict(zip(rows, moving, strict=True))
 
@@ -164,7 +165,7 @@ class Generator:
         rng = np.random.default_rng([seed, RandomStream.CLIP, index])
         bodies = draw_moving_bodies(
             self.bank, self.captured, 1, frames, rng, clothes=self.config.clothes, tempo=self.config.tempo,
-            mix=self._mix, rig=self.rig,
+            mix=self._mix, rig=self.rig, clear_limbs=bool(self.config.clear_limbs),
         )[0]  # fmt: skip
         block, row = self._bodies(seed, index // BLOCK), index % BLOCK
         return self._observe(bodies, range(frames), block, row, rng, hard, in_clip=True)

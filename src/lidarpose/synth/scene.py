@@ -45,8 +45,8 @@ _STEEPEST = pi / 4
 # fields that are between 0 and 1
 _SHARES = frozenset(
     "clutter occluder company unusual tempo merged double_rate accumulated inverted integration sparse crowded "
-    "recorded hard mask ground_window mask_keep missing_part intensity_dropout beam_divergence dapt_compat loose "
-    "cut".split()
+    "recorded clear_limbs hard mask ground_window mask_keep missing_part intensity_dropout beam_divergence dapt_compat "
+    "loose cut".split()
 )
 
 
@@ -151,6 +151,8 @@ class SceneConfig:
         crop: errors of the crop's box.
         recorded: 1: captured people stay where they were recorded, as without the paper's scene sampling; 0: they are
             placed at random.
+        clear_limbs: 1: forearms, hands and shanks that a captured pose puts inside the drawn body, which may be wider
+            than who was captured, are turned out of it; 0: they stay there.
         clothes: how far cloth and hair stand off the skin, relative to the street's; 0: bare but for skirts and hats,
             which `carry` draws.
         hard: difficulty in [0, 1]; scales what hides a person or spoils their crop, not the sensor's own noise.
@@ -182,6 +184,7 @@ class SceneConfig:
     noise: NoiseConfig
     crop: CropErrors = CropErrors()
     recorded: float = 0.0
+    clear_limbs: float = 0.0
     clothes: float = 1.0
     hard: float = 1.0
 
@@ -309,7 +312,8 @@ SCENES = {
 }
 
 
-# unusual poses, clouds of several scans, hung sensors, few rings and two people in one crop besides
+# unusual poses, clouds of several scans, hung sensors, few rings and two people in one crop besides, and limbs of
+# captured people outside the drawn body
 SCENES["wide"] = replace(
     SCENES["wild"],
     name="wide",
@@ -320,6 +324,7 @@ SCENES["wide"] = replace(
     integration=0.5,
     sparse=0.12,
     crowded=0.05,
+    clear_limbs=1.0,
 )
 
 

@@ -81,14 +81,15 @@ def _bones() -> np.ndarray:
     return np.ascontiguousarray((rest_joints - rest_joints[parents])[..., None], np.float32)
 
 
-def body_frames(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """rotations (n, 24, 3, 3) local -> global rotations (n, 24, 3, 3) and joints (n, 24, 3) m of the mean adult.
+def body_frames(rotations: np.ndarray, bones: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """rotations (n, 24, 3, 3) local -> global rotations (n, 24, 3, 3) and joints (n, 24, 3) m of the mean adult, or of
+    bodies with bones (n, 24, 3, 1) m, see `_bones`.
 
     `rig.forward_kinematics` a level of the tree at a time, float32.
     """
     # rotation and bone in one 3 x 4 matrix: half the products
     local_frames = np.empty((len(rotations), 24, 3, 4), np.float32)
-    local_frames[..., :3], local_frames[..., 3:] = rotations, _bones()
+    local_frames[..., :3], local_frames[..., 3:] = rotations, _bones() if bones is None else bones
     frames = local_frames.copy()
     for rows, parents in _LEVELS:
         parent_frames = frames[:, parents]
@@ -98,9 +99,12 @@ def body_frames(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return frames[..., :3], frames[..., 3]
 
 
-def capsule_ends(rotations: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """The capsules' ends (n, C, 2, 3) m of posed bodies, from `body_frames`."""
-    return joints[:, _JOINT, None] + _ENDS @ np.swapaxes(rotations[:, _JOINT], -1, -2)
+def capsule_ends(
+    rotations: np.ndarray, joints: np.ndarray, joint: np.ndarray = _JOINT, ends: np.ndarray = _ENDS
+) -> np.ndarray:
+    """The capsules' ends (n, C, 2, 3) m of posed bodies, from `body_frames`; joint (C,) carries a capsule, whose ends
+    (n or 1, C, 2, 3) m are seen from it at rest."""
+    return joints[:, joint, None] + ends @ np.swapaxes(rotations[:, joint], -1, -2)
 
 
 def undersides(ends: np.ndarray) -> np.ndarray:
@@ -109,10 +113,11 @@ def undersides(ends: np.ndarray) -> np.ndarray:
     return lowest_points.reshape(len(ends), 2 * len(_JOINT), 3)
 
 
-def self_collision(ends: np.ndarray) -> np.ndarray:
-    """How deep parts that should not touch are in each other, (n, Q) m, negative where they are apart."""
-    a, b = ends[:, _PAIRS[:, 0]], ends[:, _PAIRS[:, 1]]
-    return _RADIUS[_PAIRS].sum(1) - _segment_distance(a, b)
+def self_collision(ends: np.ndarray, radius: np.ndarray = _RADIUS, pairs: np.ndarray = _PAIRS) -> np.ndarray:
+    """How deep parts that should not touch are in each other, (n, Q) m, negative where they are apart; radius (C,) or
+    (n, C) m, pairs (Q, 2) of capsules."""
+    a, b = ends[:, pairs[:, 0]], ends[:, pairs[:, 1]]
+    return radius[..., pairs].sum(-1) - _segment_distance(a, b)
 
 
 def hovering(ends: np.ndarray, kind: np.ndarray) -> np.ndarray:
@@ -131,8 +136,14 @@ def mass_center(joints: np.ndarray) -> np.ndarray:
 
 
 def _segment_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Least distance (...) of segments a and b (..., 2, 3): nearest points of the lines, clamped (Ericson,
-    Real-Time Collision Detection, 5.1.9)."""
+    """Least distance (...) of segments a and b (..., 2, 3)."""
+    difference = between_segments(a, b)[0]
+    return np.sqrt((difference * difference) @ np.ones(3, np.float32))
+
+
+def between_segments(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The way (..., 3) from segment b to a, both (..., 2, 3), where they are nearest, and the share (...) of a there:
+    nearest points of the lines, clamped (Ericson, Real-Time Collision Detection, 5.1.9)."""
     start, other_start = a[..., 0, :], b[..., 0, :]
     u, v, w = a[..., 1, :] - start, b[..., 1, :] - other_start, start - other_start
     ones = np.ones(3, np.float32)
@@ -140,8 +151,7 @@ def _segment_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     s = np.clip((uv * vw - uw * vv) / np.maximum(uu * vv - uv * uv, 1e-9), 0, 1)
     t = np.clip((uv * s + vw) / vv, 0, 1)
     s = np.clip((uv * t - uw) / uu, 0, 1)
-    difference = w + s[..., None] * u - t[..., None] * v
-    return np.sqrt((difference * difference) @ ones)
+    return w + s[..., None] * u - t[..., None] * v, s
 
 
 @cache
