@@ -14,7 +14,7 @@ from lidarpose.lidar.raycast import Hits, scan, scan_pattern
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import Box
 from lidarpose.synth.acquisition import SINGLE_SCAN, Acquisition
-from lidarpose.synth.bodies import Bodies
+from lidarpose.synth.bodies import FRAME_TIME, Bodies
 from lidarpose.synth.environment.mesh import Mesh, union
 from lidarpose.synth.noise import direction_mask, laser_mask
 from lidarpose.synth.noise_kernels import lose_returns
@@ -86,24 +86,17 @@ class Scene:
         """Where the body is."""
         return self.place.on_props(self.props)
 
-    @property
-    def is_smeared(self) -> bool:
-        """Whether the sensor takes so long for a frame that people move meanwhile."""
-        return isinstance(self.sensor, RayPattern) and self.sensor.duration > 0
-
     def meshes(self, bodies: Bodies, row: int, lag: float = 0.0) -> list[Mesh]:
-        """All triangles, level frame: body `row` first, then its props, then the background. lag: by how much of the
-        way that it goes within a frame the body has moved on."""
-        place, vertices, joints = self.body_place, bodies.vertices[row], bodies.joints[row]
-        if lag:
-            vertices, joints = bodies.between(row, lag)
-        later_body = bodies.between(row, 1 + lag) if self.is_smeared else None
-        later_vertices = None if later_body is None else place.of_body(later_body[0])
-        meshes = [Mesh(place.of_body(vertices), bodies.faces, bodies.face_part, later_vertices)]
+        """All triangles, level frame: body `row` first, which is that of the frame's middle, then its props, then the
+        background. lag: by how much of the way that it goes within a frame the body has moved on."""
+        place = self.body_place
+        states = [bodies.between(row, lag + time) for time in looks(self.sensor)]
+        body_vertices = [place.of_body(vertices) for vertices, _ in states]
+        meshes = [Mesh(body_vertices[0], bodies.faces, bodies.face_part, *body_vertices[1:])]
         for prop in self.props:
-            later_vertices = None if later_body is None else place.of_body(prop.place(later_body[1]).vertices)
-            mesh = prop.place(joints)
-            meshes.append(Mesh(place.of_body(mesh.vertices), mesh.faces, prop.face_part, later_vertices))
+            prop_meshes = [prop.place(joints) for _, joints in states]
+            vertices = [place.of_body(mesh.vertices) for mesh in prop_meshes]
+            meshes.append(Mesh(vertices[0], prop_meshes[0].faces, prop.face_part, *vertices[1:]))
         return meshes + self.background
 
     def seen_from(self, at: np.ndarray, **changes: Any) -> "Scene":
@@ -146,6 +139,12 @@ class SimulatedScan:
     points: np.ndarray
     ring: np.ndarray
     part: np.ndarray
+
+
+def looks(device: Sensor | RayPattern) -> tuple[float, ...]:
+    """When a sensor begins and ends to look at somebody, in `FRAME_TIME` from the frame's middle; (0,): at once."""
+    half = device.duration / FRAME_TIME / 2 if isinstance(device, RayPattern) else 0.0
+    return (-half, half) if half else (0.0,)
 
 
 def label_box(vertices: np.ndarray, yaw: float, id: int) -> Box:
