@@ -279,6 +279,33 @@ def test_points_of_a_rosette_lie_about_the_pose(name):
     assert len(back) > 300 and abs(back.mean()) < 0.02 and np.ptp(back) > 0.08
 
 
+@pytest.mark.parametrize("azimuth", [0.5, -0.5, 2.6, -2.6])
+def test_a_stack_sees_people_half_a_turn_apart(azimuth):
+    """Its lower sensor is half a turn behind on one side, ahead on the other; the pose is that of the middle."""
+    actor, step = strider([0.4, 0.0, 0.0]), 0.4
+    where = scene("av2", azimuth, config=CLEAN)
+    found = simulate_scan(where, where.meshes(actor, 0), np.random.default_rng(0))
+    # the back of somebody who walks off: each sensor sees a plane
+    along = local(found.points, where)[:, 0] + 0.15
+    is_late = where.sensor.ring_lags[found.ring] > 0
+    first, second = (np.median(along[own & (np.abs(along) < 0.14)]) for own in (~is_late, is_late))
+    assert min(is_late.sum(), (~is_late).sum()) > 50
+    side = 1 if azimuth < 0 else -1
+    assert (first, second) == pytest.approx((-side * step / 4, side * step / 4), abs=0.01)
+    twice = replace(where, sensor=replace(where.sensor, turn_time=0.05))
+    quick, slow = (
+        np.ptp([np.mean(v[:, :2], 0) for v in (m.vertices, m.later)], axis=0)
+        for m in (twice.meshes(actor, 0)[0], where.meshes(actor, 0)[0])
+    )
+    np.testing.assert_allclose(2 * quick, slow, atol=1e-5)
+
+
+def test_people_of_a_stack_move():
+    bodies = Generator(scene=replace(CLEAN, sensors=("av2",)))._bodies(SEED, 0)
+    row = bodies.kinds.index("walk")
+    assert bodies.between(row, 0.25)[1][0, 0] - bodies.joints[row, 0, 0] > 0.01
+
+
 def test_a_rosette_goes_on_with_its_pattern_from_frame_to_frame():
     actor, where = goer(still=True), scene("livox-avia", 0.16, config=CLEAN)
     first, again, second = (

@@ -18,7 +18,6 @@ from lidarpose.data.clips import window_points
 from lidarpose.errors import InputError, check_int
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.presets import sensor
-from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.sample import CLIP_FRAMES, Box, PersonInfo, Pose, Sample, center_of
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import noise
@@ -34,6 +33,7 @@ from lidarpose.synth.simulate import (
     SimulatedScan,
     count_alone,
     draw_conditions,
+    looks,
     scan_background,
     simulate,
     simulate_scan,
@@ -111,7 +111,10 @@ class Generator:
     @cached_property
     def _bodies(self) -> Callable[[int, int], Bodies]:
         """(seed, block) -> its bodies."""
-        moving = bool(self.config.merged) or any(isinstance(sensor(name), RayPattern) for name in self.config.sensors)
+        # the same wherever somebody stands
+        moving = bool(self.config.merged) or any(
+            len(looks(sensor(name), np.zeros(3))) > 1 for name in self.config.sensors
+        )
         # neighbors share a block; two suffice for a reader that crosses from one to the next
         draw_block = partial(
             draw_bodies, self.bank, self.captured, BLOCK, moving=moving, clothes=self.config.clothes, mix=self._mix,

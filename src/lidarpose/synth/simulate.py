@@ -90,7 +90,7 @@ class Scene:
         """All triangles, level frame: body `row` first, which is that of the frame's middle, then its props, then the
         background. lag: by how much of the way that it goes within a frame the body has moved on."""
         place = self.body_place
-        states = [bodies.between(row, lag + time) for time in looks(self.sensor)]
+        states = [bodies.between(row, lag + time) for time in looks(self.sensor, self.place.feet)]
         body_vertices = [place.of_body(vertices) for vertices, _ in states]
         meshes = [Mesh(body_vertices[0], bodies.faces, bodies.face_part, *body_vertices[1:])]
         for prop in self.props:
@@ -141,9 +141,15 @@ class SimulatedScan:
     part: np.ndarray
 
 
-def looks(device: Sensor | RayPattern) -> tuple[float, ...]:
-    """When a sensor begins and ends to look at somebody, in `FRAME_TIME` from the frame's middle; (0,): at once."""
-    half = device.duration / FRAME_TIME / 2 if isinstance(device, RayPattern) else 0.0
+def looks(device: Sensor | RayPattern, feet: np.ndarray) -> tuple[float, ...]:
+    """When a sensor looks at somebody at `feet` (3,) m, in `FRAME_TIME` from the middle: a rosette's frame begins and
+    ends, a stack's first and last rings pass. (0,): all at once."""
+    if isinstance(device, RayPattern):
+        half = device.duration / FRAME_TIME / 2
+    else:
+        # frames begin behind the sensor: rings that lag into the next one have passed in this one, a turn before
+        is_ahead = np.arctan2(feet[1], feet[0]) / (2 * pi) + 0.5 + device.lag > 1
+        half = (device.lag - (is_ahead and device.lag > 0)) * device.turn_time / FRAME_TIME / 2
     return (-half, half) if half else (0.0,)
 
 
@@ -245,17 +251,26 @@ def _cast(scene: Scene, meshes: list[Mesh], frame: int, *, margin: float = 0.0) 
     body_vertices = sum(len(mesh.vertices) for mesh in meshes if id(mesh) in window_mesh_ids)
     mesh = union(meshes)
     mesh = replace(mesh, vertices=place.to_sensor(mesh.vertices))
+    moved = None if mesh.later is None else place.to_sensor(mesh.later)
     margin += scene.config.margin + np.arctan2(scene.config.around, place.distance)
     if isinstance(sensor, Sensor):
-        body, divergence = mesh.vertices[:body_vertices], scene.conditions.divergence
-        hits = scan(mesh.vertices, mesh.faces, sensor, divergence=divergence, window_vertices=body, margin=margin)
+        body = mesh.vertices[:body_vertices]
+        hits = scan(
+            mesh.vertices,
+            mesh.faces,
+            sensor,
+            divergence=scene.conditions.divergence,
+            window_vertices=body if moved is None else np.concatenate([body, moved[:body_vertices]]),
+            margin=margin,
+            moved=moved,
+        )
         return hits, mesh
     hits = scan_pattern(
         mesh.vertices,
         mesh.faces,
         sensor,
         (scene.conditions.phase + frame) % sensor.frames,
-        moved=place.to_sensor(mesh.later) if mesh.later is not None else None,
+        moved=moved,
         body_vertices=body_vertices,
         margin=margin,
     )

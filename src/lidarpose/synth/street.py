@@ -305,16 +305,16 @@ def _scan_turn(
 ) -> StreetFrame:
     people = []
     for bodies, place in walkers:
-        vertices = [place.of_body(bodies.between(frame, time)[0]) for time in looks(device)]
+        vertices = [place.of_body(bodies.between(frame, time)[0]) for time in looks(device, place.feet)]
         people.append(Mesh(vertices[0], bodies.faces, bodies.face_part, *vertices[1:]))
     scene = union([*people, scenery])
     R_sensor_level = rotation_about("y", -device.tilt).astype(np.float32)
     mesh = Mesh(scene.vertices @ R_sensor_level.T, scene.faces)
+    end_vertices = (scene.vertices if scene.later is None else scene.later) @ R_sensor_level.T
     if isinstance(device, RayPattern):
-        end_vertices = (scene.vertices if scene.later is None else scene.later) @ R_sensor_level.T
         hits = scan_pattern(mesh.vertices, mesh.faces, device, frame % device.frames, moved=end_vertices)
     else:
-        hits = scan(mesh.vertices, mesh.faces, device)
+        hits = scan(mesh.vertices, mesh.faces, device, moved=end_vertices)
     conditions = ScanConditions(sigma=device.range_sigma, bias=_RING_BIAS, intensity_dropout=_INTENSITY_DROPOUT)
     points, returned = add_sensor_noise(hits, mesh, device, conditions, rng, ring_normals=ring_normals)
     face, joints = hits.face[returned], [place.of_body(bodies.joints[frame]) for bodies, place in walkers]
