@@ -280,14 +280,16 @@ def _second_person(block: Bodies, row: int, place: Place, rng: np.random.Generat
 
 
 def _draw_sample(scene: Scene, bodies: Bodies, row: int, frame: int, rng: np.random.Generator) -> Sample:
-    return _crop(scene, bodies, row, simulate(scene, bodies, row, rng, frame=frame), rng)
+    box = _box(scene, bodies, row, rng) if scene.config.box_window else None
+    return _crop(scene, bodies, row, simulate(scene, bodies, row, rng, frame=frame, box=box), rng, box)
 
 
 def _draw_clip_frame(scene: Scene, bodies: Bodies, row: int, frame: int, rng: np.random.Generator) -> Sample:
     """The same with the pose's rotations and the clouds about the person."""
     meshes = scene.meshes(bodies, row)
-    scan = simulate_scan(scene, meshes, rng, frame=frame)
-    sample = _crop(scene, bodies, row, scan, rng)
+    box = _box(scene, bodies, row, rng) if scene.config.box_window else None
+    scan = simulate_scan(scene, meshes, rng, frame=frame, box=box)
+    sample = _crop(scene, bodies, row, scan, rng, box)
     other_points = scan.points[~cast("Box", sample.box).contains(scan.points)]
     return replace(
         sample,
@@ -304,13 +306,22 @@ def _smpl_pose(place: Place, bodies: Bodies, row: int) -> np.ndarray:
     return axis_angles[0].astype(np.float32)
 
 
-def _crop(scene: Scene, bodies: Bodies, row: int, scan: SimulatedScan, rng: np.random.Generator) -> Sample:
-    """The points in a box as a detector draws it."""
-    config, place, acquisition = scene.config, scene.body_place, scene.acquisition
+def _box(scene: Scene, bodies: Bodies, row: int, rng: np.random.Generator) -> Box:
+    """A box as a detector draws it, of two people in crowded crops."""
+    config, place = scene.config, scene.body_place
     box = noise.draw_box(config.crop, config.hard, _extent(scene, bodies, row, rng), place, rng, bodies.heading[row])
-    if acquisition.crowded:
+    if scene.acquisition.crowded:
         body_vertices = place.of_body(bodies.vertices[row])
         box = noise.box_of_two(box, body_vertices, scene.background[-1].vertices, rng)
+    return box
+
+
+def _crop(
+    scene: Scene, bodies: Bodies, row: int, scan: SimulatedScan, rng: np.random.Generator, box: Box | None = None
+) -> Sample:
+    """The points in a box; None: it is drawn after the scan."""
+    config, acquisition = scene.config, scene.acquisition
+    box = _box(scene, bodies, row, rng) if box is None else box
     points, ring, part = scan.points, scan.ring, scan.part
     clutter_draw, part_draw = rng.random(2)
     if clutter_draw < config.noise.clutter * config.hard:
@@ -335,7 +346,7 @@ def _crop(scene: Scene, bodies: Bodies, row: int, scan: SimulatedScan, rng: np.r
         center=center_of(points) if len(points) and not acquisition.crowded else box.center,
         part=part,
         ring=ring,
-        pose=Pose(joints=place.of_body(bodies.joints[row]), skeleton=BODY26, frame="sensor"),
+        pose=Pose(joints=scene.body_place.of_body(bodies.joints[row]), skeleton=BODY26, frame="sensor"),
         box=box,
         second_person_points=other_count,
         source=acquisition.source(config.name, scene.sensor.name),

@@ -45,8 +45,8 @@ _STEEPEST = pi / 4
 # fields that are between 0 and 1
 _SHARES = frozenset(
     "clutter occluder company unusual tempo merged double_rate accumulated inverted integration sparse crowded "
-    "recorded hard mask ground_window mask_keep missing_part intensity_dropout beam_divergence dapt_compat loose "
-    "cut".split()
+    "recorded hard mask ground_window box_window mask_keep missing_part intensity_dropout beam_divergence dapt_compat "
+    "loose cut".split()
 )
 
 
@@ -131,6 +131,7 @@ class SceneConfig:
         around: the same, m.
         ground_window: 1: the window of beams, and with it the laser mask, is about the body and the ground, as in the
             paper's Eq. 3; 0: about the body alone, as in the released code.
+        box_window: 1: the window of beams holds the crop's box too, whatever is in it; 0: a large box has an empty rim.
         clutter: things near the person.
         occluder: something in front.
         company: a second person in or before the crop.
@@ -166,6 +167,7 @@ class SceneConfig:
     margin: float = 0.0
     around: float = 0.0
     ground_window: float = 0.0
+    box_window: float = 0.0
     clutter: float = 0.0
     occluder: float = 0.0
     company: float = 0.0
@@ -309,10 +311,11 @@ SCENES = {
 }
 
 
-# unusual poses, clouds of several scans, hung sensors, few rings and two people in one crop besides
+# unusual poses, clouds of several scans, hung sensors, few rings and two people in one crop besides; boxes are full
 SCENES["wide"] = replace(
     SCENES["wild"],
     name="wide",
+    box_window=1.0,
     unusual=0.3,
     merged=0.06,
     accumulated=0.06,

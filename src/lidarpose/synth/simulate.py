@@ -16,6 +16,7 @@ from lidarpose.sample import Box
 from lidarpose.synth.acquisition import SINGLE_SCAN, Acquisition
 from lidarpose.synth.bodies import FRAME_TIME, Bodies
 from lidarpose.synth.environment.mesh import Mesh, union
+from lidarpose.synth.environment.mesh import box as box_mesh
 from lidarpose.synth.noise import direction_mask, laser_mask
 from lidarpose.synth.noise_kernels import lose_returns
 from lidarpose.synth.place import Place
@@ -180,9 +181,12 @@ def _between(ends: tuple[float, float], share: float) -> float:
     return ends[0] + share * (ends[1] - ends[0])
 
 
-def simulate(scene: Scene, bodies: Bodies, row: int, rng: np.random.Generator, *, frame: int = 0) -> SimulatedScan:
-    """The cloud of body `row`: what the scene's sensor returns, and all that is added to it."""
-    return _added_up(scene.scans(bodies, row, frame), rng)
+def simulate(
+    scene: Scene, bodies: Bodies, row: int, rng: np.random.Generator, *, frame: int = 0, box: Box | None = None
+) -> SimulatedScan:
+    """The cloud of body `row`: what the scene's sensor returns, and all that is added to it; `box` as in
+    `simulate_scan`."""
+    return _added_up(scene.scans(bodies, row, frame), rng, box)
 
 
 def simulate_still(scene: Scene, thing: Mesh, rng: np.random.Generator) -> SimulatedScan:
@@ -196,12 +200,13 @@ def simulate_still(scene: Scene, thing: Mesh, rng: np.random.Generator) -> Simul
 
 
 def _added_up(
-    view_scans: Iterable[tuple[Scene, list[Mesh], int, np.ndarray]], rng: np.random.Generator
+    view_scans: Iterable[tuple[Scene, list[Mesh], int, np.ndarray]], rng: np.random.Generator, box: Box | None = None
 ) -> SimulatedScan:
     """Scans as in `Scene.scans` in the frame of the first one."""
     scans: list[SimulatedScan] = []
     for view_scene, meshes, frame, position in view_scans:
-        scan = simulate_scan(view_scene, meshes, rng, frame=frame)
+        view_box = None if box is None else replace(box, center=box.center - position)
+        scan = simulate_scan(view_scene, meshes, rng, frame=frame, box=view_box)
         scans.append(replace(scan, points=scan.points + position.astype(np.float32)) if scans else scan)
     if len(scans) == 1:
         return scans[0]
@@ -209,16 +214,19 @@ def _added_up(
     return SimulatedScan(**arrays)
 
 
-def simulate_scan(scene: Scene, meshes: list[Mesh], rng: np.random.Generator, *, frame: int = 0) -> SimulatedScan:
+def simulate_scan(
+    scene: Scene, meshes: list[Mesh], rng: np.random.Generator, *, frame: int = 0, box: Box | None = None
+) -> SimulatedScan:
     """What the scene's sensor returns.
 
     Args:
         meshes: all triangles in the level frame; the window of beams is about the first one, the body, or about body
             and ground where the scene says so.
         frame: how many frames after a pattern's first one.
+        box: that the window of beams holds too, level frame.
     """
     sensor = scene.sensor
-    hits, mesh = _cast(scene, meshes, frame)
+    hits, mesh = _cast(scene, meshes, frame, box=box)
     points, returned = add_sensor_noise(hits, mesh, sensor, scene.conditions, rng)
     # a union has parts
     ring, part = hits.ring[returned], cast("np.ndarray", mesh.part)[hits.face[returned]]
@@ -241,12 +249,21 @@ def scan_background(scene: Scene, body: Mesh, frame: int) -> np.ndarray:
     return scene.place.to_level(hits.points)
 
 
-def _cast(scene: Scene, meshes: list[Mesh], frame: int, *, margin: float = 0.0) -> tuple[Hits, Mesh]:
-    """The hits, and all meshes as one, in the sensor's frame. margin rad: beams beyond those of the scene."""
+def _cast(
+    scene: Scene, meshes: list[Mesh], frame: int, *, margin: float = 0.0, box: Box | None = None
+) -> tuple[Hits, Mesh]:
+    """The hits, and all meshes as one, in the sensor's frame. margin rad: beams beyond those of the scene; box: that
+    they hold too."""
     place, sensor = scene.place, scene.sensor
     # the ground is the first thing of the background; what the window is about comes first
     ground = scene.background[:1] if scene.config.ground_window else []
     window_mesh_ids = {id(mesh) for mesh in (meshes[0], *ground)}
+    if box is not None:
+        # the window is wider than its meshes by `around`, across a corner too
+        size = np.maximum(box.size - np.sqrt(2) * scene.config.around, 0.0)
+        window_mesh = box_mesh(size).moved(box.center - [0, 0, size[2] / 2], box.yaw)
+        meshes = [replace(window_mesh, faces=window_mesh.faces[:0]), *meshes]
+        window_mesh_ids.add(id(meshes[0]))
     meshes = sorted(meshes, key=lambda mesh: id(mesh) not in window_mesh_ids)
     body_vertices = sum(len(mesh.vertices) for mesh in meshes if id(mesh) in window_mesh_ids)
     mesh = union(meshes)
