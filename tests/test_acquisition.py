@@ -58,7 +58,7 @@ def walkers(count, last=MOST_FRAMES - 1):
 
 
 def test_people_without_conditions_are_those_of_the_same_scene_without_shares():
-    wide, wild = Generator(scene=replace(WIDE, unusual=0.0, box_window=0.0)), Generator(scene=WILD)
+    wide, wild = Generator(scene=replace(WIDE, unusual=0.0, box_window=0.0, apart=0.0)), Generator(scene=WILD)
     held = 0
     for index in range(64):
         person, same = wide.person(SEED, index), wild.person(SEED, index)
@@ -388,6 +388,30 @@ def test_the_window_is_about_the_box_of_the_sample_in_every_scan(window, monkeyp
         # other sensors have it in frames of their own
         assert {tuple(box.size) for box in found} == {tuple(box.size) for box in drawn_boxes if window}
         assert not window or np.array_equal(found[0].center, drawn_boxes[0].center)
+
+
+def test_second_people_stand_clear_of_the_first():
+    """As seen along the line between them: no vertex of the other is before one of the first that is near that line."""
+    block, depths, ways = draw_bodies(None, 0.0, 64, SEED, 0, moving=False), {}, []
+    for apart in (0.0, 1.0):
+        config, depths[apart] = replace(CLEAN, apart=apart), []
+        for row in range(40):
+            scene = drawn(config, Acquisition(sensors=("os1-64",), crowded=True), block, row, seed=row)
+            body, other = scene.meshes(block, row)[0].vertices, scene.background[-1].vertices
+            near = other[((other > body.min(0)) & (other < body.max(0))).all(1)]
+            ahead = other.mean(0)[:2] - body.mean(0)[:2]
+            beyond = [
+                (point[:2] - body[np.linalg.norm(body - point, axis=1) < 0.06, :2].mean(0)) @ ahead
+                for point in near
+                if (np.linalg.norm(body - point, axis=1) < 0.06).any()
+            ]
+            # how much of the other lies inside the first one's surface
+            depths[apart].append(np.mean(np.array(beyond) < 0) * len(beyond) / len(other) if beyond else 0.0)
+            ways.append(other.mean(0))
+    assert np.mean(np.array(depths[0.0]) > 0.02) > 0.15 and np.mean(np.array(depths[1.0]) > 0.02) < 0.03
+    moved = np.linalg.norm(np.array(ways[40:]) - ways[:40], axis=1)
+    # who stood clear stays, and nobody goes far
+    assert np.median(moved) < 0.15 and moved.max() < 1.2 and (moved == 0).sum() > 5
 
 
 def test_a_box_of_two_holds_both_and_its_center_is_nearer_to_the_first():

@@ -231,7 +231,8 @@ def _draw_scene(
         background.append(occluder_mesh)
     still_count = len(background)
     if (rng.random() < config.company * config.hard) or acquisition.crowded:
-        background.append(_second_person(block, row, place, rng, close=acquisition.crowded))
+        first_body = place.of_body(bodies.vertices[first_row]) if config.apart else None
+        background.append(_second_person(block, row, place, rng, close=acquisition.crowded, first_body=first_body))
     props = []
     kind = bodies.kinds[first_row]
     # what carries somebody, or is pushed, is there however easy the scene is
@@ -258,10 +259,15 @@ _BEFORE = 0.3
 _BESIDE, _NEARER = (0.4, 1.0), (0.4, 2.5)
 # how far apart two people in one crop are, m
 _CLOSE = (0.35, 0.8)
+# two bodies are told apart by what is in cells so large, as seen along the line between them, m
+_CELL, _CELLS = 0.08, 48
 
 
-def _second_person(block: Bodies, row: int, place: Place, rng: np.random.Generator, *, close: bool) -> Mesh:
-    """Another body of the block, an arm's length away or between the sensor and the person; `close`: always beside."""
+def _second_person(
+    block: Bodies, row: int, place: Place, rng: np.random.Generator, *, close: bool, first_body: np.ndarray | None
+) -> Mesh:
+    """Another body of the block, an arm's length away or between the sensor and the person; `close`: always beside;
+    first_body: (V, 3) m, the person's vertices, from which the other is moved away until clear; None: it stays."""
     other_row = (row + rng.integers(1, len(block.vertices))) % len(block.vertices)
     before_draw, gap, angle, lateral_share, yaw = rng.random(5)
     direction = place.feet[:2] / max(np.hypot(*place.feet[:2]), 1e-6)
@@ -274,9 +280,25 @@ def _second_person(block: Bodies, row: int, place: Place, rng: np.random.Generat
         distance = least_distance + gap * (most_distance - least_distance)
         shift = distance * np.array([np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)])
     other_place = Place(feet=place.feet + [*shift, 0], yaw=2 * np.pi * yaw, distance=place.distance)
-    return Mesh(
-        other_place.of_body(block.vertices[other_row]), block.faces, np.full(len(block.faces), _OTHER, np.uint8)
-    )
+    vertices = other_place.of_body(block.vertices[other_row])
+    if first_body is not None:
+        vertices = _moved_clear(vertices, first_body, place.feet, shift / max(np.hypot(*shift), 1e-6))
+    return Mesh(vertices, block.faces, np.full(len(block.faces), _OTHER, np.uint8))
+
+
+def _moved_clear(vertices: np.ndarray, body: np.ndarray, feet: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Vertices (V, 3) m, moved along `direction` (2,), of length 1, until they are beyond a `body` (W, 3) that stands
+    at `feet` (3,), in every cell as seen along it."""
+    across = np.array([-direction[1], direction[0]])
+    reach = np.full((2, _CELLS * _CELLS), -np.inf)
+    for sign, points, row in ((1, body, 0), (-1, vertices, 1)):
+        offset = points.astype(float) - feet
+        # the body's middle is that of the cells
+        cells = np.stack([offset[:, :2] @ across / _CELL + _CELLS / 2, offset[:, 2] / _CELL + 2], 1)
+        columns, rows = cells.astype(int).clip(0, _CELLS - 1).T
+        np.maximum.at(reach[row], rows * _CELLS + columns, sign * (offset[:, :2] @ direction))
+    overlap = max(float(reach.sum(0).max()), 0.0)
+    return vertices + (overlap * np.array([*direction, 0.0])).astype(np.float32)
 
 
 def _draw_sample(scene: Scene, bodies: Bodies, row: int, frame: int, rng: np.random.Generator) -> Sample:

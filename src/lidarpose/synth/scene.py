@@ -44,7 +44,7 @@ class RandomStream(IntEnum):
 _STEEPEST = pi / 4
 # fields that are between 0 and 1
 _SHARES = frozenset(
-    "clutter occluder company unusual tempo merged double_rate accumulated inverted integration sparse crowded "
+    "clutter occluder company apart unusual tempo merged double_rate accumulated inverted integration sparse crowded "
     "recorded hard mask ground_window box_window mask_keep missing_part intensity_dropout beam_divergence dapt_compat "
     "loose cut".split()
 )
@@ -135,6 +135,7 @@ class SceneConfig:
         clutter: things near the person.
         occluder: something in front.
         company: a second person in or before the crop.
+        apart: 1: a second person stands clear of the first; 0: the two may overlap.
         unusual: share of people, of those not captured, who do what the default mix of poses has hardly any of: squat,
             kick, throw, hop, pick something up, sit and lie on the floor and so on.
         carry: how often something is carried or used, relative to the street's habit.
@@ -171,6 +172,7 @@ class SceneConfig:
     clutter: float = 0.0
     occluder: float = 0.0
     company: float = 0.0
+    apart: float = 0.0
     unusual: float = 0.0
     carry: float = 0.0
     tempo: float = 0.0
@@ -316,6 +318,7 @@ SCENES["wide"] = replace(
     SCENES["wild"],
     name="wide",
     box_window=1.0,
+    apart=1.0,
     unusual=0.3,
     merged=0.06,
     accumulated=0.06,
