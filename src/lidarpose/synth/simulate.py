@@ -259,9 +259,11 @@ def _cast(
     ground = scene.background[:1] if scene.config.ground_window else []
     window_mesh_ids = {id(mesh) for mesh in (meshes[0], *ground)}
     if box is not None:
-        # the window is wider than its meshes by `around`, across a corner too
+        # the window is wider than its meshes by `around`, across a corner too; nothing is seen below the feet
         size = np.maximum(box.size - np.sqrt(2) * scene.config.around, 0.0)
-        window_mesh = box_mesh(size).moved(box.center - [0, 0, size[2] / 2], box.yaw)
+        top, bottom = box.center[2] + size[2] / 2, max(box.center[2] - size[2] / 2, place.feet[2])
+        size[2] = max(top - bottom, 0.0)
+        window_mesh = box_mesh(size).moved([*box.center[:2], bottom], box.yaw)
         meshes = [replace(window_mesh, faces=window_mesh.faces[:0]), *meshes]
         window_mesh_ids.add(id(meshes[0]))
     meshes = sorted(meshes, key=lambda mesh: id(mesh) not in window_mesh_ids)
