@@ -13,6 +13,7 @@ from lidarpose.lidar.presets import sensor
 from lidarpose.sample import SEEN, Box, LabeledSample
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import generator
+from lidarpose.synth import simulate as simulate_module
 from lidarpose.synth.acquisition import MOST_FRAMES, Acquisition, draw_acquisition
 from lidarpose.synth.bodies import draw_bodies, draw_moving_bodies
 from lidarpose.synth.generator import BLOCK, Generator
@@ -57,7 +58,7 @@ def walkers(count, last=MOST_FRAMES - 1):
 
 
 def test_people_without_conditions_are_those_of_the_same_scene_without_shares():
-    wide, wild = Generator(scene=replace(WIDE, unusual=0.0)), Generator(scene=WILD)
+    wide, wild = Generator(scene=replace(WIDE, unusual=0.0, box_window=0.0, apart=0.0)), Generator(scene=WILD)
     held = 0
     for index in range(64):
         person, same = wide.person(SEED, index), wild.person(SEED, index)
@@ -338,6 +339,79 @@ def test_crowded_crops_hold_two_and_the_center_says_who_is_meant():
         shown = augmented(stored, Augmentation(refined=0.0), np.random.default_rng(index))
         np.testing.assert_allclose(shown.joints, sample.pose.joints - sample.center, atol=1e-5)
     assert np.median(others) > 40
+
+
+def seen_in(scene, block, row, box, window, **changes):
+    """How many beams meet the second person, and anything in a box."""
+    wider = replace(scene, config=replace(scene.config, **changes))
+    hits, mesh = simulate_module._cast(wider, wider.meshes(block, row), 0, box=window)
+    is_inside = box.contains(scene.place.to_level(hits.points))
+    return np.count_nonzero(mesh.part[hits.face] == generator._OTHER), np.count_nonzero(is_inside)
+
+
+@pytest.mark.parametrize("name", ["os1-64", "livox-mid360"])
+@pytest.mark.parametrize("crowded", [True, False])
+def test_the_window_of_beams_holds_the_box_and_the_second_person(name, crowded):
+    block = draw_bodies(None, 0.0, 32, SEED, 0, moving=False)
+    calm = replace(
+        WIDE, sensors=(name,), distance=(3.0, 9.0), median_points=0, company=0.0, crop=replace(WIDE.crop, loose=1.0)
+    )
+    found = []
+    for row in range(16):
+        scene = drawn(calm, Acquisition(sensors=(name,), crowded=crowded), block, row, seed=row)
+        box = generator._box(scene, block, row, np.random.default_rng(row))
+        windows = [(None, {}), (box, {}), (None, {"around": 3.0})]
+        found.append([seen_in(scene, block, row, box, window, **changes) for window, changes in windows])
+    (others, inside), (window_others, window_inside), (all_others, all_inside) = np.sum(found, 0)
+    assert window_others == all_others and (all_others > 500) == crowded
+    assert window_inside > 0.995 * all_inside > inside
+
+
+@pytest.mark.parametrize("window", [0.0, 1.0])
+def test_the_window_is_about_the_box_of_the_sample_in_every_scan(window, monkeypatch):
+    boxes, cast = [], simulate_module._cast
+
+    def recorded(scene, meshes, frame, *, margin=0.0, box=None):
+        boxes.append(box)
+        return cast(scene, meshes, frame, margin=margin, box=box)
+
+    monkeypatch.setattr(simulate_module, "_cast", recorded)
+    config = replace(WIDE, **dict.fromkeys(SHARES, 0.0), box_window=window)
+    merged, clips = (
+        Generator(scene=replace(config, merged=share), measure=False, redraw=False) for share in (1.0, 0.0)
+    )
+    for draw in (lambda: [merged.person(SEED, 0)], lambda: clips.clip(SEED, 0, frames=2)):
+        boxes.clear()
+        drawn_boxes = [person.sample.box for person in draw()]
+        found = [box for box in boxes if box is not None]
+        assert len(boxes) > 1 and bool(found) == bool(window)
+        # other sensors have it in frames of their own
+        assert {tuple(box.size) for box in found} == {tuple(box.size) for box in drawn_boxes if window}
+        assert not window or np.array_equal(found[0].center, drawn_boxes[0].center)
+
+
+def test_second_people_stand_clear_of_the_first():
+    """As seen along the line between them: no vertex of the other is before one of the first that is near that line."""
+    block, depths, ways = draw_bodies(None, 0.0, 64, SEED, 0, moving=False), {}, []
+    for apart in (0.0, 1.0):
+        config, depths[apart] = replace(CLEAN, apart=apart), []
+        for row in range(40):
+            scene = drawn(config, Acquisition(sensors=("os1-64",), crowded=True), block, row, seed=row)
+            body, other = scene.meshes(block, row)[0].vertices, scene.background[-1].vertices
+            near = other[((other > body.min(0)) & (other < body.max(0))).all(1)]
+            ahead = other.mean(0)[:2] - body.mean(0)[:2]
+            beyond = [
+                (point[:2] - body[np.linalg.norm(body - point, axis=1) < 0.06, :2].mean(0)) @ ahead
+                for point in near
+                if (np.linalg.norm(body - point, axis=1) < 0.06).any()
+            ]
+            # how much of the other lies inside the first one's surface
+            depths[apart].append(np.mean(np.array(beyond) < 0) * len(beyond) / len(other) if beyond else 0.0)
+            ways.append(other.mean(0))
+    assert np.mean(np.array(depths[0.0]) > 0.02) > 0.15 and np.mean(np.array(depths[1.0]) > 0.02) < 0.03
+    moved = np.linalg.norm(np.array(ways[40:]) - ways[:40], axis=1)
+    # who stood clear stays, and nobody goes far
+    assert np.median(moved) < 0.15 and moved.max() < 1.2 and (moved == 0).sum() > 5
 
 
 def test_a_box_of_two_holds_both_and_its_center_is_nearer_to_the_first():

@@ -5,6 +5,7 @@ import pytest
 from raycast_meshes import body, ground, join
 from reference.raycast_reference import cast_ray_list_reference, merge_echoes_reference, window_ranges, window_rays
 
+from lidarpose.errors import InputError
 from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.raycast import footprint, scan
 from lidarpose.lidar.scan_kernels import strongest_echo
@@ -146,6 +147,27 @@ def test_origins_at_one_height_are_one_sensor():
     apart = scan(body.vertices, body.faces, replace(AV2, origin_heights=np.zeros(64)))
     np.testing.assert_array_equal(apart.ring, together.ring)
     np.testing.assert_allclose(apart.points, together.points, atol=1e-6)
+
+
+def test_the_second_sensor_of_a_stack_sees_what_has_moved():
+    body, step = box_at(1.1), np.array([0.0, 0.3, 0.0])
+    both = np.concatenate([body.vertices, body.vertices + step])
+    hits = scan(body.vertices, body.faces, AV2, window_vertices=both, moved=body.vertices + step)
+    for way, lag in ((0.0, 0.0), (1.0, 0.5)):
+        still = scan(body.vertices + way * step, body.faces, AV2, window_vertices=both)
+        own, there = AV2.ring_lags[hits.ring] == lag, AV2.ring_lags[still.ring] == lag
+        np.testing.assert_array_equal(hits.ring[own], still.ring[there])
+        np.testing.assert_allclose(hits.points[own], still.points[there], atol=1e-5)
+        assert own.sum() > 80
+
+
+def test_rings_lag_at_one_origin_too():
+    body = box_at(1.1)
+    flat = replace(AV2, origin_heights=None)
+    assert [share for _, share, _, _ in flat.origins] == [0.0, 1.0] and flat.lag == 0.5
+    assert sum(len(rings) for _, _, _, rings in flat.origins) == flat.rows
+    with pytest.raises(InputError, match="moved must hold the vertices once more"):
+        scan(body.vertices, body.faces, flat, moved=np.zeros((3, 3)))
 
 
 def test_divergent_beams_of_several_origins():

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from walkers import HEADINGS, bone_distance, goer
+from walkers import HEADINGS, bone_distance, goer, strider
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
@@ -248,6 +248,62 @@ def test_pose_box_and_body_of_a_frame_are_in_one_place(props):
             assert sample.box.contains(person + [0, 0, 0.3] * (person[:, 2:] < 0.2)).all()
             joints = where.place.of_body(actor.joints[frame]) + [0, 0, 0.25 if props else 0.0]
             np.testing.assert_allclose(sample.pose.joints, joints, atol=1e-5)
+
+
+@pytest.mark.parametrize("lag", [0.0, -0.4])
+def test_the_pose_is_that_of_the_middle_of_a_rosette_s_frame(lag):
+    actor = strider([0.3, 0.1, 0.0])
+    at_once, over_time = (
+        scene(name, 0.16, config=CLEAN, props=[CLOTH]).meshes(actor, 0, lag) for name in ("dapt64", "livox-avia")
+    )
+    assert len(over_time) == 2 and all(mesh.later is None for mesh in at_once)
+    c, s = np.cos(0.16), np.sin(0.16)
+    for there, mesh in zip(at_once, over_time, strict=True):
+        np.testing.assert_allclose((mesh.vertices + mesh.later) / 2, there.vertices, atol=1e-5)
+        way = np.broadcast_to([c * 0.3 - s * 0.1, s * 0.3 + c * 0.1, 0.0], mesh.vertices.shape)
+        np.testing.assert_allclose(mesh.later - mesh.vertices, way, atol=1e-5)
+    stood = scene("dapt64", 0.16, config=CLEAN).meshes(actor, 0)[0].vertices.mean(0)
+    np.testing.assert_allclose(at_once[0].vertices.mean(0) - stood, lag * way[0], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["livox-avia", "livox-mid360", "livox-mid100"])
+def test_points_of_a_rosette_lie_about_the_pose(name):
+    actor = strider([0.3, 0.0, 0.0])
+    where = scene(name, 0.16, config=CLEAN)
+    points = np.concatenate(
+        [simulate_scan(where, where.meshes(actor, 0), np.random.default_rng(0), frame=k).points for k in range(4)]
+    )
+    # what is seen of somebody who walks off is the back: a plane, half of the way before and behind its place
+    along = local(points, where)[:, 0] + 0.15
+    back = along[np.abs(along) < 0.16]
+    assert len(back) > 300 and abs(back.mean()) < 0.02 and np.ptp(back) > 0.08
+
+
+@pytest.mark.parametrize("azimuth", [0.5, -0.5, 2.6, -2.6])
+def test_a_stack_sees_people_half_a_turn_apart(azimuth):
+    """Its lower sensor is half a turn behind on one side, ahead on the other; the pose is that of the middle."""
+    actor, step = strider([0.4, 0.0, 0.0]), 0.4
+    where = scene("av2", azimuth, config=CLEAN)
+    found = simulate_scan(where, where.meshes(actor, 0), np.random.default_rng(0))
+    # the back of somebody who walks off: each sensor sees a plane
+    along = local(found.points, where)[:, 0] + 0.15
+    is_late = where.sensor.ring_lags[found.ring] > 0
+    first, second = (np.median(along[own & (np.abs(along) < 0.14)]) for own in (~is_late, is_late))
+    assert min(is_late.sum(), (~is_late).sum()) > 50
+    side = 1 if azimuth < 0 else -1
+    assert (first, second) == pytest.approx((-side * step / 4, side * step / 4), abs=0.01)
+    twice = replace(where, sensor=replace(where.sensor, turn_time=0.05))
+    quick, slow = (
+        np.ptp([np.mean(v[:, :2], 0) for v in (m.vertices, m.later)], axis=0)
+        for m in (twice.meshes(actor, 0)[0], where.meshes(actor, 0)[0])
+    )
+    np.testing.assert_allclose(2 * quick, slow, atol=1e-5)
+
+
+def test_people_of_a_stack_move():
+    bodies = Generator(scene=replace(CLEAN, sensors=("av2",)))._bodies(SEED, 0)
+    row = bodies.kinds.index("walk")
+    assert bodies.between(row, 0.25)[1][0, 0] - bodies.joints[row, 0, 0] > 0.01
 
 
 def test_a_rosette_goes_on_with_its_pattern_from_frame_to_frame():

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from walkers import HEADINGS, goer
+from walkers import HEADINGS, goer, strider
 
 from lidarpose.errors import InputError
 from lidarpose.lidar.presets import sensor
@@ -190,6 +190,17 @@ def test_a_rosette_goes_on_with_its_pattern():
     turn = (sensor("livox-avia"), still, [walker])
     first, second = (module._scan_turn(*turn, frame, np.zeros(256, np.float32), RNG(0)).points for frame in (0, 1))
     assert first.shape != second.shape or np.abs(first - second).max() > 0.01
+
+
+def test_joints_and_box_of_a_street_are_those_of_the_middle_of_a_rosette_s_frame():
+    nobody, place = quad(0.1, np.zeros(2)).moved((0, 0, -30)), replace(WALKER, yaw=0.0)
+    turn = (sensor("livox-avia"), nobody, [(strider([0.4, 0.0, 0.0]), place)])
+    frame = module._scan_turn(*turn, 0, np.zeros(256, np.float32), RNG(0))
+    # the back: a plane, half of the way before and behind its place
+    back = frame.points[:, 0] - (frame.joints[0, 0, 0] - 0.15)
+    back = back[np.abs(back) < 0.25]
+    assert len(back) > 100 and abs(back.mean()) < 0.03 and np.ptp(back) > 0.3
+    np.testing.assert_allclose(frame.boxes[0].center[:2], place.feet[:2], atol=1e-4)
 
 
 def test_the_parts_of_a_street_s_sample_are_its_own_person_s():

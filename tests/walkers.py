@@ -1,5 +1,7 @@
 """Shared by tests of scenes: a box that goes and turns, and volumes, distances to bones."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from lidarpose.geometry import rotation_about
@@ -26,6 +28,12 @@ def goer(still=False):
         moved=lambda frame: (vertices[frame], joints[frame]), kinds=("walk",) * 3, faces=mesh.faces,
         face_part=np.full(12, 3, np.uint8),
     )  # fmt: skip
+
+
+def strider(step):
+    """The same one, who stands at all frames and goes `step` (3,) m within each."""
+    still, way = goer(still=True), np.array(step, np.float32)
+    return replace(still, moved=lambda frame: (still.vertices[frame] + way, still.joints[frame] + way))
 
 
 def piece_volumes(mesh):

@@ -102,13 +102,15 @@ _SENSORS = (
     ),
     # Argoverse 2 (Wilson et al. 2021): two VLP-32C stacked on the roof, one upside down: rings at the table's
     # angles and at their negatives. In its sweeps the second one's beams meet 11 cm below the first's, and the
-    # ground lies 2 m below. That its columns lie half a step further is a stand-in for a free phase.
+    # ground lies 2 m below. Both turn the same way and look away from each other: one passes a person half a turn
+    # after the other. That its columns lie half a step further is a stand-in for a free phase.
     _spinning(
         "av2",
         np.concatenate([_VLP_32C, -_VLP_32C])[_AV2_ORDER],
         1800,
         azimuth_offsets=np.repeat([0.0, _turn(3600)], 32)[_AV2_ORDER],
         origin_heights=np.repeat([0.0, -0.11], 32)[_AV2_ORDER],
+        ring_lags=np.repeat([0.0, 0.5], 32)[_AV2_ORDER],
         range_min=1.0,
         range_max=200.0,
         height=2.0,

@@ -137,6 +137,7 @@ def scan(
     pulse: float = PULSE,
     window_vertices: np.ndarray | None = None,
     margin: float = 0.0,
+    moved: np.ndarray | None = None,
 ) -> Hits:
     """What the sensor sees inside the smallest window of beams that holds a body. Paper: Eq. 3 (no margin).
 
@@ -159,6 +160,9 @@ def scan(
         pulse: m, how far apart in range two echoes must be to be told apart.
         window_vertices: (M, 3) m, the body alone; all vertices if not given.
         margin: rad that the window is wider on each side.
+        moved: (V, 3) m, where the vertices are when the last of the sensor's `ring_lags` passes them, `vertices` when
+            the first one does, on straight lines; None: they stand still. The window holds `window_vertices` alone:
+            give both places.
 
     Raises InputError.
     """
@@ -174,10 +178,12 @@ def scan(
     body = vertices if window_vertices is None else _as_points("window_vertices", window_vertices)
     if sensor.origins:
         options: dict[str, Any] = {"divergence": divergence, "sub_beams": sub_beams, "pulse": pulse, "margin": margin}
+        way = np.zeros(3) if moved is None else _as_moved(moved, vertices) - vertices
         parts = []
-        for height, origin_sensor, _ in sensor.origins:
+        for height, share, origin_sensor, _ in sensor.origins:
             origin = np.array([0, 0, height])
-            parts.append(scan(vertices - origin, faces, origin_sensor, window_vertices=body - origin, **options))
+            place = vertices + share * way - origin
+            parts.append(scan(place, faces, origin_sensor, window_vertices=body - origin, **options))
         return _join_origins(sensor, parts)
     window = (0, 0, 0, 0)
     if len(body):
@@ -213,7 +219,7 @@ def _join_origins(sensor: Sensor, parts: list[Hits]) -> Hits:
     starts = [(part.column0 - base_column + turn_columns // 2) % turn_columns - turn_columns // 2 for part in parts]
     first_column = min(starts)
     points, column, ring, window_rings = [], [], [], []
-    for part, start, (height, _, rings) in zip(parts, starts, sensor.origins, strict=True):
+    for part, start, (height, _, _, rings) in zip(parts, starts, sensor.origins, strict=True):
         points.append(part.points + np.array([0, 0, height], np.float32))
         column.append(part.column + np.int32(start - first_column))
         ring.append(rings[part.ring].astype(np.int32))
@@ -350,10 +356,7 @@ def cast_ray_list(
         return ray_list(vertices, faces, directions, None, None)
     if time is None:
         raise InputError("moved vertices need the rays' times: pass time (N,) in [0, 1]")
-    moved = _as_points("moved", moved)
-    if moved.shape != vertices.shape:
-        raise InputError(f"moved must hold the vertices once more, {vertices.shape}, got {moved.shape}")
-    return ray_list(vertices, faces, directions, moved - vertices, time)
+    return ray_list(vertices, faces, directions, _as_moved(moved, vertices) - vertices, time)
 
 
 # --- checks of arguments: arrays come out in one type each, so that compiled code is compiled once
@@ -378,6 +381,14 @@ def _as_mesh(vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise InputError(f"faces must index the {len(vertices)} vertices from 0, got {faces.min()} to {faces.max()}")
     return vertices, np.array(faces, np.int32, order="C")
+
+
+def _as_moved(moved: Any, vertices: np.ndarray) -> np.ndarray:
+    """A copy (V, 3) float64 of where `vertices` (V, 3) have moved to."""
+    moved = _as_points("moved", moved)
+    if moved.shape != vertices.shape:
+        raise InputError(f"moved must hold the vertices once more, {vertices.shape}, got {moved.shape}")
+    return moved
 
 
 def _as_times(time: np.ndarray, count: int) -> np.ndarray:

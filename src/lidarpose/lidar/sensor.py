@@ -33,7 +33,9 @@ class Sensor:
     rad: a ring's beam leaves at its column's azimuth plus this (None: all rings in line); range_min, range_max m:
     nearer and farther surfaces return nothing; range_sigma m: standard deviation of the range; dropout: share of
     returns lost at random; height m above the ground; tilt rad about y, positive looks down; origin_heights (E,) m:
-    how far above the sensor's origin a ring's beams leave, for stacks of several sensors (None: all from the origin).
+    how far above the sensor's origin a ring's beams leave, for stacks of several sensors (None: all from the origin);
+    ring_lags (E,) in [0, 1): by what share of a turn a ring passes a place after the first ones, for stacks whose
+    sensors look different ways (None: all at once); turn_time s: of a turn.
 
     Offsets are split into whole columns, which only say when a beam fires, and the rest, which says where: columns
     are numbered by azimuth, as in an image whose rows have been shifted into line.
@@ -51,6 +53,8 @@ class Sensor:
     height: float = 1.7
     tilt: float = 0.0
     origin_heights: np.ndarray | None = None
+    ring_lags: np.ndarray | None = None
+    turn_time: float = 0.1
 
     def __post_init__(self):
         elevations = _frozen("elevations", self.elevations, _ANGLES)
@@ -64,13 +68,25 @@ class Sensor:
         if (np.diff(elevations) < 0).any():
             raise InputError("Sensor.elevations must ascend: sort them, and the azimuth offsets with them")
         object.__setattr__(self, "elevations", elevations)
-        for name, kind in (("azimuth_offsets", _ANGLES), ("origin_heights", "heights in meters")):
+        kinds = (
+            ("azimuth_offsets", _ANGLES),
+            ("origin_heights", "heights in meters"),
+            ("ring_lags", "shares of a turn"),
+        )
+        for name, kind in kinds:
             if getattr(self, name) is None:
                 continue
             values = _frozen(name, getattr(self, name), kind)
             if values.shape != elevations.shape:
                 raise InputError(f"Sensor.{name} must be {elevations.shape}, one a ring, got {values.shape}")
             object.__setattr__(self, name, values)
+        if self.ring_lags is not None and not 0 <= self.ring_lags.min() <= self.ring_lags.max() < 1:
+            raise InputError(
+                f"Sensor.ring_lags must be in [0, 1), got {self.ring_lags.min():g} to {self.ring_lags.max():g}"
+            )
+        check_finite("Sensor.turn_time", self.turn_time)
+        if self.turn_time <= 0:
+            raise InputError(f"Sensor.turn_time must be above 0 s, got {self.turn_time}")
         check_finite("Sensor.azimuth_step", self.azimuth_step)
         column_count = 2 * np.pi / self.azimuth_step if self.azimuth_step > 0 else 0
         if column_count < 1 or abs(column_count - round(column_count)) > 1e-3:
@@ -116,18 +132,26 @@ class Sensor:
         return tuple((float(shift), np.flatnonzero(ring == i)) for i, shift in enumerate(shifts))
 
     @cached_property
-    def origins(self) -> tuple[tuple[float, "Sensor", np.ndarray], ...]:
-        """(height m, the sensor of its rings alone, their numbers) of each origin; none if all beams share one."""
-        if self.origin_heights is None:
+    def lag(self) -> float:
+        """By what share of a turn the last rings pass a place after the first ones."""
+        return 0.0 if self.ring_lags is None else float(np.ptp(self.ring_lags))
+
+    @cached_property
+    def origins(self) -> tuple[tuple[float, float, "Sensor", np.ndarray], ...]:
+        """(height m, share of `lag`, the sensor of its rings alone, their numbers) of beams that share an origin and
+        pass a place together; none if all do."""
+        if self.origin_heights is None and not self.lag:
             return ()
+        heights = np.zeros(self.rows) if self.origin_heights is None else self.origin_heights
+        delays = np.zeros(self.rows) if self.ring_lags is None else self.ring_lags - self.ring_lags.min()
         origins = []
-        for height in np.unique(self.origin_heights):
-            rings = np.flatnonzero(self.origin_heights == height)
+        for height, delay in np.unique(np.stack([heights, delays], 1), axis=0):
+            rings = np.flatnonzero((heights == height) & (delays == delay))
             offsets = None if self.azimuth_offsets is None else self.azimuth_offsets[rings]
             origin_sensor = replace(
-                self, elevations=self.elevations[rings], azimuth_offsets=offsets, origin_heights=None
+                self, elevations=self.elevations[rings], azimuth_offsets=offsets, origin_heights=None, ring_lags=None
             )
-            origins.append((float(height), origin_sensor, rings))
+            origins.append((float(height), float(delay / (self.lag or 1)), origin_sensor, rings))
         return tuple(origins)
 
     def window(self, left: float, right: float, low: float, high: float) -> Window:

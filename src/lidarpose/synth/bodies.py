@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import ceil
 from pathlib import Path
 
@@ -25,7 +26,7 @@ try:
 except ImportError as error:  # pragma: no cover - numba is an optional extra
     raise MissingExtra("synthesis", "synth") from error
 
-# how long a rosette's frame lasts, s: how far bodies are moved on for it
+# how long a frame lasts, s, and how far bodies are moved on for it
 FRAME_TIME = 0.1
 # frames a second of clips
 CLIP_HZ = 10.0
@@ -140,6 +141,8 @@ class Bodies:
     def between(self, row: int, share: float) -> tuple[np.ndarray, np.ndarray]:
         """Vertices (V, 3) and joints (26, 3) m of a body after a `share` of `FRAME_TIME`, moving evenly; below 0:
         before, above 1: after."""
+        if share == 0:
+            return self.vertices[row], self.joints[row]
         end_state = self.moved(row)
         if share == 1:
             return end_state
@@ -199,6 +202,8 @@ def draw_bodies(
     low[:, 2], high[:, 2] = 0, high[:, 2] - lift
     step = step * _stride_ratio(rest_bodies, kinds)
 
+    # asked for twice: for when a frame begins and when it ends
+    @lru_cache(maxsize=1)
     def moved(row: int) -> tuple[np.ndarray, np.ndarray]:
         rows = slice(row, row + 1)
         person = RestBody(vertices=rest_bodies.vertices[rows], joints=rest_bodies.joints[rows])

@@ -18,7 +18,6 @@ from lidarpose.data.clips import window_points
 from lidarpose.errors import InputError, check_int
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.presets import sensor
-from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.sample import CLIP_FRAMES, Box, PersonInfo, Pose, Sample, center_of
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import noise
@@ -34,6 +33,7 @@ from lidarpose.synth.simulate import (
     SimulatedScan,
     count_alone,
     draw_conditions,
+    looks,
     scan_background,
     simulate,
     simulate_scan,
@@ -111,7 +111,10 @@ class Generator:
     @cached_property
     def _bodies(self) -> Callable[[int, int], Bodies]:
         """(seed, block) -> its bodies."""
-        moving = bool(self.config.merged) or any(isinstance(sensor(name), RayPattern) for name in self.config.sensors)
+        # the same wherever somebody stands
+        moving = bool(self.config.merged) or any(
+            len(looks(sensor(name), np.zeros(3))) > 1 for name in self.config.sensors
+        )
         # neighbors share a block; two suffice for a reader that crosses from one to the next
         draw_block = partial(
             draw_bodies, self.bank, self.captured, BLOCK, moving=moving, clothes=self.config.clothes, mix=self._mix,
@@ -229,7 +232,8 @@ def _draw_scene(
         background.append(occluder_mesh)
     still_count = len(background)
     if (rng.random() < config.company * config.hard) or acquisition.crowded:
-        background.append(_second_person(block, row, place, rng, close=acquisition.crowded))
+        first_body = place.of_body(bodies.vertices[first_row]) if config.apart else None
+        background.append(_second_person(block, row, place, rng, close=acquisition.crowded, first_body=first_body))
     props = []
     kind = bodies.kinds[first_row]
     # what carries somebody, or is pushed, is there however easy the scene is
@@ -256,10 +260,15 @@ _BEFORE = 0.3
 _BESIDE, _NEARER = (0.4, 1.0), (0.4, 2.5)
 # how far apart two people in one crop are, m
 _CLOSE = (0.35, 0.8)
+# two bodies are told apart by what is in cells so large, as seen along the line between them, m
+_CELL, _CELLS = 0.08, 48
 
 
-def _second_person(block: Bodies, row: int, place: Place, rng: np.random.Generator, *, close: bool) -> Mesh:
-    """Another body of the block, an arm's length away or between the sensor and the person; `close`: always beside."""
+def _second_person(
+    block: Bodies, row: int, place: Place, rng: np.random.Generator, *, close: bool, first_body: np.ndarray | None
+) -> Mesh:
+    """Another body of the block, an arm's length away or between the sensor and the person; `close`: always beside;
+    first_body: (V, 3) m, the person's vertices, from which the other is moved away until clear; None: it stays."""
     other_row = (row + rng.integers(1, len(block.vertices))) % len(block.vertices)
     before_draw, gap, angle, lateral_share, yaw = rng.random(5)
     direction = place.feet[:2] / max(np.hypot(*place.feet[:2]), 1e-6)
@@ -272,20 +281,38 @@ def _second_person(block: Bodies, row: int, place: Place, rng: np.random.Generat
         distance = least_distance + gap * (most_distance - least_distance)
         shift = distance * np.array([np.cos(2 * np.pi * angle), np.sin(2 * np.pi * angle)])
     other_place = Place(feet=place.feet + [*shift, 0], yaw=2 * np.pi * yaw, distance=place.distance)
-    return Mesh(
-        other_place.of_body(block.vertices[other_row]), block.faces, np.full(len(block.faces), _OTHER, np.uint8)
-    )
+    vertices = other_place.of_body(block.vertices[other_row])
+    if first_body is not None:
+        vertices = _moved_clear(vertices, first_body, place.feet, shift / max(np.hypot(*shift), 1e-6))
+    return Mesh(vertices, block.faces, np.full(len(block.faces), _OTHER, np.uint8))
+
+
+def _moved_clear(vertices: np.ndarray, body: np.ndarray, feet: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Vertices (V, 3) m, moved along `direction` (2,), of length 1, until they are beyond a `body` (W, 3) that stands
+    at `feet` (3,), in every cell as seen along it."""
+    across = np.array([-direction[1], direction[0]])
+    reach = np.full((2, _CELLS * _CELLS), -np.inf)
+    for sign, points, row in ((1, body, 0), (-1, vertices, 1)):
+        offset = points.astype(float) - feet
+        # the body's middle is that of the cells
+        cells = np.stack([offset[:, :2] @ across / _CELL + _CELLS / 2, offset[:, 2] / _CELL + 2], 1)
+        columns, rows = cells.astype(int).clip(0, _CELLS - 1).T
+        np.maximum.at(reach[row], rows * _CELLS + columns, sign * (offset[:, :2] @ direction))
+    overlap = max(float(reach.sum(0).max()), 0.0)
+    return vertices + (overlap * np.array([*direction, 0.0])).astype(np.float32)
 
 
 def _draw_sample(scene: Scene, bodies: Bodies, row: int, frame: int, rng: np.random.Generator) -> Sample:
-    return _crop(scene, bodies, row, simulate(scene, bodies, row, rng, frame=frame), rng)
+    box = _box(scene, bodies, row, rng) if scene.config.box_window else None
+    return _crop(scene, bodies, row, simulate(scene, bodies, row, rng, frame=frame, box=box), rng, box)
 
 
 def _draw_clip_frame(scene: Scene, bodies: Bodies, row: int, frame: int, rng: np.random.Generator) -> Sample:
     """The same with the pose's rotations and the clouds about the person."""
     meshes = scene.meshes(bodies, row)
-    scan = simulate_scan(scene, meshes, rng, frame=frame)
-    sample = _crop(scene, bodies, row, scan, rng)
+    box = _box(scene, bodies, row, rng) if scene.config.box_window else None
+    scan = simulate_scan(scene, meshes, rng, frame=frame, box=box)
+    sample = _crop(scene, bodies, row, scan, rng, box)
     other_points = scan.points[~cast("Box", sample.box).contains(scan.points)]
     return replace(
         sample,
@@ -302,13 +329,22 @@ def _smpl_pose(place: Place, bodies: Bodies, row: int) -> np.ndarray:
     return axis_angles[0].astype(np.float32)
 
 
-def _crop(scene: Scene, bodies: Bodies, row: int, scan: SimulatedScan, rng: np.random.Generator) -> Sample:
-    """The points in a box as a detector draws it."""
-    config, place, acquisition = scene.config, scene.body_place, scene.acquisition
+def _box(scene: Scene, bodies: Bodies, row: int, rng: np.random.Generator) -> Box:
+    """A box as a detector draws it, of two people in crowded crops."""
+    config, place = scene.config, scene.body_place
     box = noise.draw_box(config.crop, config.hard, _extent(scene, bodies, row, rng), place, rng, bodies.heading[row])
-    if acquisition.crowded:
+    if scene.acquisition.crowded:
         body_vertices = place.of_body(bodies.vertices[row])
         box = noise.box_of_two(box, body_vertices, scene.background[-1].vertices, rng)
+    return box
+
+
+def _crop(
+    scene: Scene, bodies: Bodies, row: int, scan: SimulatedScan, rng: np.random.Generator, box: Box | None = None
+) -> Sample:
+    """The points in a box; None: it is drawn after the scan."""
+    config, acquisition = scene.config, scene.acquisition
+    box = _box(scene, bodies, row, rng) if box is None else box
     points, ring, part = scan.points, scan.ring, scan.part
     clutter_draw, part_draw = rng.random(2)
     if clutter_draw < config.noise.clutter * config.hard:
@@ -333,7 +369,7 @@ def _crop(scene: Scene, bodies: Bodies, row: int, scan: SimulatedScan, rng: np.r
         center=center_of(points) if len(points) and not acquisition.crowded else box.center,
         part=part,
         ring=ring,
-        pose=Pose(joints=place.of_body(bodies.joints[row]), skeleton=BODY26, frame="sensor"),
+        pose=Pose(joints=scene.body_place.of_body(bodies.joints[row]), skeleton=BODY26, frame="sensor"),
         box=box,
         second_person_points=other_count,
         source=acquisition.source(config.name, scene.sensor.name),

@@ -44,9 +44,9 @@ class RandomStream(IntEnum):
 _STEEPEST = pi / 4
 # fields that are between 0 and 1
 _SHARES = frozenset(
-    "clutter occluder company unusual tempo merged double_rate accumulated inverted integration sparse crowded "
-    "recorded clear_limbs hard mask ground_window mask_keep missing_part intensity_dropout beam_divergence dapt_compat "
-    "loose cut".split()
+    "clutter occluder company apart unusual tempo merged double_rate accumulated inverted integration sparse crowded "
+    "recorded clear_limbs hard mask ground_window box_window mask_keep missing_part intensity_dropout beam_divergence "
+    "dapt_compat loose cut".split()
 )
 
 
@@ -131,9 +131,11 @@ class SceneConfig:
         around: the same, m.
         ground_window: 1: the window of beams, and with it the laser mask, is about the body and the ground, as in the
             paper's Eq. 3; 0: about the body alone, as in the released code.
+        box_window: 1: the window of beams holds the crop's box too, whatever is in it; 0: a large box has an empty rim.
         clutter: things near the person.
         occluder: something in front.
         company: a second person in or before the crop.
+        apart: 1: a second person stands clear of the first; 0: the two may overlap.
         unusual: share of people, of those not captured, who do what the default mix of poses has hardly any of: squat,
             kick, throw, hop, pick something up, sit and lie on the floor and so on.
         carry: how often something is carried or used, relative to the street's habit.
@@ -168,9 +170,11 @@ class SceneConfig:
     margin: float = 0.0
     around: float = 0.0
     ground_window: float = 0.0
+    box_window: float = 0.0
     clutter: float = 0.0
     occluder: float = 0.0
     company: float = 0.0
+    apart: float = 0.0
     unusual: float = 0.0
     carry: float = 0.0
     tempo: float = 0.0
@@ -312,11 +316,13 @@ SCENES = {
 }
 
 
-# unusual poses, clouds of several scans, hung sensors, few rings and two people in one crop besides, and limbs of
-# captured people outside the drawn body
+# unusual poses, clouds of several scans, hung sensors, few rings and two people in one crop besides; limbs of captured
+# people are outside the drawn body, second people clear of the first, and boxes full
 SCENES["wide"] = replace(
     SCENES["wild"],
     name="wide",
+    box_window=1.0,
+    apart=1.0,
     unusual=0.3,
     merged=0.06,
     accumulated=0.06,

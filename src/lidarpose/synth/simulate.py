@@ -14,8 +14,9 @@ from lidarpose.lidar.raycast import Hits, scan, scan_pattern
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import Box
 from lidarpose.synth.acquisition import SINGLE_SCAN, Acquisition
-from lidarpose.synth.bodies import Bodies
+from lidarpose.synth.bodies import FRAME_TIME, Bodies
 from lidarpose.synth.environment.mesh import Mesh, union
+from lidarpose.synth.environment.mesh import box as box_mesh
 from lidarpose.synth.noise import direction_mask, laser_mask
 from lidarpose.synth.noise_kernels import lose_returns
 from lidarpose.synth.place import Place
@@ -86,24 +87,17 @@ class Scene:
         """Where the body is."""
         return self.place.on_props(self.props)
 
-    @property
-    def is_smeared(self) -> bool:
-        """Whether the sensor takes so long for a frame that people move meanwhile."""
-        return isinstance(self.sensor, RayPattern) and self.sensor.duration > 0
-
     def meshes(self, bodies: Bodies, row: int, lag: float = 0.0) -> list[Mesh]:
-        """All triangles, level frame: body `row` first, then its props, then the background. lag: by how much of the
-        way that it goes within a frame the body has moved on."""
-        place, vertices, joints = self.body_place, bodies.vertices[row], bodies.joints[row]
-        if lag:
-            vertices, joints = bodies.between(row, lag)
-        later_body = bodies.between(row, 1 + lag) if self.is_smeared else None
-        later_vertices = None if later_body is None else place.of_body(later_body[0])
-        meshes = [Mesh(place.of_body(vertices), bodies.faces, bodies.face_part, later_vertices)]
+        """All triangles, level frame: body `row` first, which is that of the frame's middle, then its props, then the
+        background. lag: by how much of the way that it goes within a frame the body has moved on."""
+        place = self.body_place
+        states = [bodies.between(row, lag + time) for time in looks(self.sensor, self.place.feet)]
+        body_vertices = [place.of_body(vertices) for vertices, _ in states]
+        meshes = [Mesh(body_vertices[0], bodies.faces, bodies.face_part, *body_vertices[1:])]
         for prop in self.props:
-            later_vertices = None if later_body is None else place.of_body(prop.place(later_body[1]).vertices)
-            mesh = prop.place(joints)
-            meshes.append(Mesh(place.of_body(mesh.vertices), mesh.faces, prop.face_part, later_vertices))
+            prop_meshes = [prop.place(joints) for _, joints in states]
+            vertices = [place.of_body(mesh.vertices) for mesh in prop_meshes]
+            meshes.append(Mesh(vertices[0], prop_meshes[0].faces, prop.face_part, *vertices[1:]))
         return meshes + self.background
 
     def seen_from(self, at: np.ndarray, **changes: Any) -> "Scene":
@@ -148,6 +142,18 @@ class SimulatedScan:
     part: np.ndarray
 
 
+def looks(device: Sensor | RayPattern, feet: np.ndarray) -> tuple[float, ...]:
+    """When a sensor looks at somebody at `feet` (3,) m, in `FRAME_TIME` from the middle: a rosette's frame begins and
+    ends, a stack's first and last rings pass. (0,): all at once."""
+    if isinstance(device, RayPattern):
+        half = device.duration / FRAME_TIME / 2
+    else:
+        # frames begin behind the sensor: rings that lag into the next one have passed in this one, a turn before
+        is_ahead = np.arctan2(feet[1], feet[0]) / (2 * pi) + 0.5 + device.lag > 1
+        half = (device.lag - (is_ahead and device.lag > 0)) * device.turn_time / FRAME_TIME / 2
+    return (-half, half) if half else (0.0,)
+
+
 def label_box(vertices: np.ndarray, yaw: float, id: int) -> Box:
     """The label of a body: the box around its vertices (V, 3) m along a heading of `yaw` rad, `_BOX_ROOM` added."""
     aligned_vertices = vertices.astype(float) @ rotation_about("z", yaw)
@@ -175,9 +181,12 @@ def _between(ends: tuple[float, float], share: float) -> float:
     return ends[0] + share * (ends[1] - ends[0])
 
 
-def simulate(scene: Scene, bodies: Bodies, row: int, rng: np.random.Generator, *, frame: int = 0) -> SimulatedScan:
-    """The cloud of body `row`: what the scene's sensor returns, and all that is added to it."""
-    return _added_up(scene.scans(bodies, row, frame), rng)
+def simulate(
+    scene: Scene, bodies: Bodies, row: int, rng: np.random.Generator, *, frame: int = 0, box: Box | None = None
+) -> SimulatedScan:
+    """The cloud of body `row`: what the scene's sensor returns, and all that is added to it; `box` as in
+    `simulate_scan`."""
+    return _added_up(scene.scans(bodies, row, frame), rng, box)
 
 
 def simulate_still(scene: Scene, thing: Mesh, rng: np.random.Generator) -> SimulatedScan:
@@ -191,12 +200,13 @@ def simulate_still(scene: Scene, thing: Mesh, rng: np.random.Generator) -> Simul
 
 
 def _added_up(
-    view_scans: Iterable[tuple[Scene, list[Mesh], int, np.ndarray]], rng: np.random.Generator
+    view_scans: Iterable[tuple[Scene, list[Mesh], int, np.ndarray]], rng: np.random.Generator, box: Box | None = None
 ) -> SimulatedScan:
     """Scans as in `Scene.scans` in the frame of the first one."""
     scans: list[SimulatedScan] = []
     for view_scene, meshes, frame, position in view_scans:
-        scan = simulate_scan(view_scene, meshes, rng, frame=frame)
+        view_box = None if box is None else replace(box, center=box.center - position)
+        scan = simulate_scan(view_scene, meshes, rng, frame=frame, box=view_box)
         scans.append(replace(scan, points=scan.points + position.astype(np.float32)) if scans else scan)
     if len(scans) == 1:
         return scans[0]
@@ -204,16 +214,19 @@ def _added_up(
     return SimulatedScan(**arrays)
 
 
-def simulate_scan(scene: Scene, meshes: list[Mesh], rng: np.random.Generator, *, frame: int = 0) -> SimulatedScan:
+def simulate_scan(
+    scene: Scene, meshes: list[Mesh], rng: np.random.Generator, *, frame: int = 0, box: Box | None = None
+) -> SimulatedScan:
     """What the scene's sensor returns.
 
     Args:
         meshes: all triangles in the level frame; the window of beams is about the first one, the body, or about body
             and ground where the scene says so.
         frame: how many frames after a pattern's first one.
+        box: that the window of beams holds too, level frame.
     """
     sensor = scene.sensor
-    hits, mesh = _cast(scene, meshes, frame)
+    hits, mesh = _cast(scene, meshes, frame, box=box)
     points, returned = add_sensor_noise(hits, mesh, sensor, scene.conditions, rng)
     # a union has parts
     ring, part = hits.ring[returned], cast("np.ndarray", mesh.part)[hits.face[returned]]
@@ -236,27 +249,47 @@ def scan_background(scene: Scene, body: Mesh, frame: int) -> np.ndarray:
     return scene.place.to_level(hits.points)
 
 
-def _cast(scene: Scene, meshes: list[Mesh], frame: int, *, margin: float = 0.0) -> tuple[Hits, Mesh]:
-    """The hits, and all meshes as one, in the sensor's frame. margin rad: beams beyond those of the scene."""
+def _cast(
+    scene: Scene, meshes: list[Mesh], frame: int, *, margin: float = 0.0, box: Box | None = None
+) -> tuple[Hits, Mesh]:
+    """The hits, and all meshes as one, in the sensor's frame. margin rad: beams beyond those of the scene; box: that
+    they hold too."""
     place, sensor = scene.place, scene.sensor
     # the ground is the first thing of the background; what the window is about comes first
     ground = scene.background[:1] if scene.config.ground_window else []
     window_mesh_ids = {id(mesh) for mesh in (meshes[0], *ground)}
+    if box is not None:
+        # the window is wider than its meshes by `around`, across a corner too; nothing is seen below the feet
+        size = np.maximum(box.size - np.sqrt(2) * scene.config.around, 0.0)
+        top, bottom = box.center[2] + size[2] / 2, max(box.center[2] - size[2] / 2, place.feet[2])
+        size[2] = max(top - bottom, 0.0)
+        window_mesh = box_mesh(size).moved([*box.center[:2], bottom], box.yaw)
+        meshes = [replace(window_mesh, faces=window_mesh.faces[:0]), *meshes]
+        window_mesh_ids.add(id(meshes[0]))
     meshes = sorted(meshes, key=lambda mesh: id(mesh) not in window_mesh_ids)
     body_vertices = sum(len(mesh.vertices) for mesh in meshes if id(mesh) in window_mesh_ids)
     mesh = union(meshes)
     mesh = replace(mesh, vertices=place.to_sensor(mesh.vertices))
+    moved = None if mesh.later is None else place.to_sensor(mesh.later)
     margin += scene.config.margin + np.arctan2(scene.config.around, place.distance)
     if isinstance(sensor, Sensor):
-        body, divergence = mesh.vertices[:body_vertices], scene.conditions.divergence
-        hits = scan(mesh.vertices, mesh.faces, sensor, divergence=divergence, window_vertices=body, margin=margin)
+        body = mesh.vertices[:body_vertices]
+        hits = scan(
+            mesh.vertices,
+            mesh.faces,
+            sensor,
+            divergence=scene.conditions.divergence,
+            window_vertices=body if moved is None else np.concatenate([body, moved[:body_vertices]]),
+            margin=margin,
+            moved=moved,
+        )
         return hits, mesh
     hits = scan_pattern(
         mesh.vertices,
         mesh.faces,
         sensor,
         (scene.conditions.phase + frame) % sensor.frames,
-        moved=place.to_sensor(mesh.later) if mesh.later is not None else None,
+        moved=moved,
         body_vertices=body_vertices,
         margin=margin,
     )

@@ -25,7 +25,7 @@ from lidarpose.synth.environment import mesh as shapes
 from lidarpose.synth.environment.mesh import Mesh, shape, union
 from lidarpose.synth.place import Place
 from lidarpose.synth.scene import RandomStream
-from lidarpose.synth.simulate import ScanConditions, add_sensor_noise, label_box
+from lidarpose.synth.simulate import ScanConditions, add_sensor_noise, label_box, looks
 
 # furniture stands so far behind the kerb, and half of the street's length that is built, m
 _RAIL, _LENGTH = 0.45, 45.0
@@ -47,7 +47,7 @@ _OFF, _GROWN, _TURNED = 0.06, (0.0, 0.2), 0.08
 class StreetFrame:
     """One turn of the sensor. points (n, 3) float32 m; ring (n,); person (n,) int16: index into `boxes`, -1 = none;
     part (n,) uint8 as in `Sample`; boxes: of all P people, seen or not, their ids the track ids; joints (P, 26, 3)
-    float32 m, body26. All in the level frame at the sensor."""
+    float32 m, body26; boxes and joints are those of the frame's middle. All in the level frame at the sensor."""
 
     points: np.ndarray
     ring: np.ndarray
@@ -303,19 +303,18 @@ def _scan_turn(
     ring_normals: np.ndarray,
     rng: np.random.Generator,
 ) -> StreetFrame:
-    is_smeared = isinstance(device, RayPattern) and device.duration > 0
     people = []
     for bodies, place in walkers:
-        later_vertices = place.of_body(bodies.moved(frame)[0]) if is_smeared else None
-        people.append(Mesh(place.of_body(bodies.vertices[frame]), bodies.faces, bodies.face_part, later_vertices))
+        vertices = [place.of_body(bodies.between(frame, time)[0]) for time in looks(device, place.feet)]
+        people.append(Mesh(vertices[0], bodies.faces, bodies.face_part, *vertices[1:]))
     scene = union([*people, scenery])
     R_sensor_level = rotation_about("y", -device.tilt).astype(np.float32)
     mesh = Mesh(scene.vertices @ R_sensor_level.T, scene.faces)
+    end_vertices = (scene.vertices if scene.later is None else scene.later) @ R_sensor_level.T
     if isinstance(device, RayPattern):
-        end_vertices = (scene.vertices if scene.later is None else scene.later) @ R_sensor_level.T
         hits = scan_pattern(mesh.vertices, mesh.faces, device, frame % device.frames, moved=end_vertices)
     else:
-        hits = scan(mesh.vertices, mesh.faces, device)
+        hits = scan(mesh.vertices, mesh.faces, device, moved=end_vertices)
     conditions = ScanConditions(sigma=device.range_sigma, bias=_RING_BIAS, intensity_dropout=_INTENSITY_DROPOUT)
     points, returned = add_sensor_noise(hits, mesh, device, conditions, rng, ring_normals=ring_normals)
     face, joints = hits.face[returned], [place.of_body(bodies.joints[frame]) for bodies, place in walkers]

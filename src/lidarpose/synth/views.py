@@ -44,7 +44,7 @@ def _merged_views(
         rate, lags = scene.config.double_rate, [lag]
         # a table of an odd number of columns has no half
         if isinstance(device, Sensor) and device.columns % 2 == 0 and rate > 0 and rng.random() < rate:
-            device = replace(device, azimuth_step=2 * device.azimuth_step)
+            device = replace(device, azimuth_step=2 * device.azimuth_step, turn_time=device.turn_time / 2)
             lags.append(lag - 0.5 if lag > 0 else lag + 0.5)
         mount = turn.T if sensor_place.R_sensor_level is None else sensor_place.R_sensor_level @ turn.T
         view_scene = scene.seen_from(

@@ -24,7 +24,7 @@ class Mesh:
         vertices: (V, 3) float32 m.
         faces: (F, 3) int32.
         part: (F,) uint8 of the body that a face belongs to, 0: not the person; None: all 0.
-        later: (V, 3) m, the vertices when the sensor's frame ends; None: they stand still.
+        later: (V, 3) m, the vertices when the sensor last looks at them; None: they stand still.
     """
 
     vertices: np.ndarray
