@@ -390,6 +390,7 @@ def test_the_window_is_about_the_box_of_the_sample_in_every_scan(window, monkeyp
         assert not window or np.array_equal(found[0].center, drawn_boxes[0].center)
 
 
+@pytest.mark.long
 def test_second_people_stand_clear_of_the_first():
     """As seen along the line between them: no vertex of the other is before one of the first that is near that line."""
     block, depths, ways = draw_bodies(None, 0.0, 64, SEED, 0, moving=False), {}, []
