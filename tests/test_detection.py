@@ -202,8 +202,10 @@ def test_boxes_of_a_tilted_scan_say_what_is_up(model, scene, tmp_path, axis):
         errors = np.linalg.norm(again.to_numpy() - searched.to_numpy(), axis=-1).mean(1)
         assert len(again) == len(searched) and np.median(errors) < 0.03
     np.testing.assert_array_equal(model.predict(points, boxes=boxes).to_numpy(), again.to_numpy())
-    # but what is said counts
-    assert lidarpose.predict(path, boxes=boxes, up="z", model=model).up == "z"
+    # but what is said counts, unless it is another axis
+    assert lidarpose.predict(path, boxes=boxes, up=axis, model=model).up == axis
+    with pytest.raises(InputError, match="the boxes say that up is"):
+        lidarpose.predict(path, boxes=boxes, up="x", model=model)
 
 
 def test_arrows_of_a_tilted_scan_show_where_people_face(model, scene):

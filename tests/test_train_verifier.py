@@ -161,7 +161,7 @@ def test_all_of_the_network_learns_to_tell_people(quick_crops):
     assert network.config.size == "verifier" and network.config.person
     arrays = objective.collate([an_example(0, 16), an_example(1, 16)])
     optimizer = torch.optim.AdamW(network.parameters(), lr=3e-3)
-    for _ in range(60):
+    for _ in range(100):
         optimizer.zero_grad()
         terms = objective.terms(network, arrays)
         (terms["person"] + terms["mounted"]).backward()

@@ -89,7 +89,9 @@ def test_transforms_are_different_and_the_first_is_the_identity():
 
 
 def people(count):
-    generator = Generator(scene=scene_config("wild"), measure=False)
+    # sensors to which people stand still: `tiny` was trained when poses of others were those of a frame's beginning
+    sensors = ("os1-128", "hdl-64e", "vlp-32c", "pandar64")
+    generator = Generator(scene=replace(scene_config("wild"), sensors=sensors), measure=False)
     samples = [generator.person(4711, k).sample for k in range(count)]
     return [sample.points for sample in samples], np.stack([sample.pose.joints for sample in samples])
 

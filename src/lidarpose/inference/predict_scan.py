@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 CROP_SIZE = 4.0
 # of directions that are up: `detect` states them to three decimals
 _SAME_UP = 2e-3
+# and of the same axis, as far as scans are leveled: 45 degrees
+_SAME_AXIS = 0.77
 
 
 def predict(
@@ -80,7 +82,8 @@ def predict(
         up = "z" if input_boxes is None else input_boxes.up
     rotation_from_up(up)
     if input_boxes is not None:
-        check_up(input_boxes, up)
+        # of a tilted scan boxes say how it was leveled, which is still the same axis
+        check_up(input_boxes, up, most=_SAME_AXIS)
     scan = Scan(points=np.zeros((0, 3)), boxes=input_boxes, origin=as_origin(sensor_origin), up=up_text(up))
     scan = read_scan(scan, path, columns)
     find = find or boxes is None and not crop and (not len(scan.points) or is_wide(scan))
@@ -169,10 +172,11 @@ def is_wide(scan: Scan) -> bool:
     return bool(np.ptp(upright_points, axis=0).max() >= CROP_SIZE)
 
 
-def check_up(boxes: Boxes, up: str | Sequence[float]) -> None:
-    """Raises InputError where boxes say that something else is up than was given."""
+def check_up(boxes: Boxes, up: str | Sequence[float], *, most: float = _SAME_UP) -> None:
+    """Raises InputError where boxes say that something else is up than was given. most: how far both directions may be
+    apart, as unit vectors."""
     difference = rotation_from_up(boxes.up)[2] - rotation_from_up(up)[2]
-    if boxes.up != "z" and np.abs(difference).max() > _SAME_UP:
+    if boxes.up != "z" and np.linalg.norm(difference) > most:
         raise InputError(f"the boxes say that up is {boxes.up}, not {up_text(up)}: give up {boxes.up}")
 
 
