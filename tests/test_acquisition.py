@@ -356,13 +356,13 @@ def test_the_window_of_beams_holds_the_box_and_the_second_person(name, crowded):
     calm = replace(
         WIDE, sensors=(name,), distance=(3.0, 9.0), median_points=0, company=0.0, crop=replace(WIDE.crop, loose=1.0)
     )
-    found = []
+    counts = []
     for row in range(16):
         scene = drawn(calm, Acquisition(sensors=(name,), crowded=crowded), block, row, seed=row)
         box = generator._box(scene, block, row, np.random.default_rng(row))
         windows = [(None, {}), (box, {}), (None, {"around": 3.0})]
-        found.append([seen_in(scene, block, row, box, window, **changes) for window, changes in windows])
-    (others, inside), (window_others, window_inside), (all_others, all_inside) = np.sum(found, 0)
+        counts.append([seen_in(scene, block, row, box, window, **changes) for window, changes in windows])
+    (others, inside), (window_others, window_inside), (all_others, all_inside) = np.sum(counts, 0)
     assert window_others == all_others and (all_others > 500) == crowded
     assert window_inside > 0.995 * all_inside > inside
 
@@ -383,11 +383,11 @@ def test_the_window_is_about_the_box_of_the_sample_in_every_scan(window, monkeyp
     for draw in (lambda: [merged.person(SEED, 0)], lambda: clips.clip(SEED, 0, frames=2)):
         boxes.clear()
         drawn_boxes = [person.sample.box for person in draw()]
-        found = [box for box in boxes if box is not None]
-        assert len(boxes) > 1 and bool(found) == bool(window)
+        window_boxes = [box for box in boxes if box is not None]
+        assert len(boxes) > 1 and bool(window_boxes) == bool(window)
         # other sensors have it in frames of their own
-        assert {tuple(box.size) for box in found} == {tuple(box.size) for box in drawn_boxes if window}
-        assert not window or np.array_equal(found[0].center, drawn_boxes[0].center)
+        assert {tuple(box.size) for box in window_boxes} == {tuple(box.size) for box in drawn_boxes if window}
+        assert not window or np.array_equal(window_boxes[0].center, drawn_boxes[0].center)
 
 
 @pytest.mark.long

@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from lidarpose.errors import InputError, MissingExtra, missing_extra
-from lidarpose.inference.backend import Raw, estimates
+from lidarpose.inference.backend import Raw, bundled_backend, estimates
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.inference.tta import IDENTITY
 from lidarpose.io.files import content_digest
@@ -339,6 +339,8 @@ def test_devices_are_taken_as_torch_s_and_none_is_the_cpu():
 
 
 def test_a_runtime_that_cannot_be_loaded_is_not_the_file_s_fault(monkeypatch):
+    # a network that is open needs nothing of it
+    bundled_backend.cache_clear()
     import_module = mock.Mock()
     monkeypatch.setattr(onnx, "import_module", import_module)
     for error in (ImportError("DLL load failed:\nnot found"), OSError("libgomp.so.1: cannot open")):

@@ -284,10 +284,10 @@ def test_a_stack_sees_people_half_a_turn_apart(azimuth):
     """Its lower sensor is half a turn behind on one side, ahead on the other; the pose is that of the middle."""
     actor, step = strider([0.4, 0.0, 0.0]), 0.4
     where = scene("av2", azimuth, config=CLEAN)
-    found = simulate_scan(where, where.meshes(actor, 0), np.random.default_rng(0))
+    scan_result = simulate_scan(where, where.meshes(actor, 0), np.random.default_rng(0))
     # the back of somebody who walks off: each sensor sees a plane
-    along = local(found.points, where)[:, 0] + 0.15
-    is_late = where.sensor.ring_lags[found.ring] > 0
+    along = local(scan_result.points, where)[:, 0] + 0.15
+    is_late = where.sensor.ring_lags[scan_result.ring] > 0
     first, second = (np.median(along[own & (np.abs(along) < 0.14)]) for own in (~is_late, is_late))
     assert min(is_late.sum(), (~is_late).sum()) > 50
     side = 1 if azimuth < 0 else -1

@@ -8,7 +8,7 @@ Runtime, here, and torch (`torch_backend`).
 
 import os
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Protocol, cast
 
@@ -16,6 +16,7 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.io.files import content_digest, file_error
+from lidarpose.models import weights_file
 from lidarpose.models.checkpoint import Header, read_header
 from lidarpose.models.config import BIN, NetworkConfig
 from lidarpose.models.decode import Decoder, out_of_range, sigmoid
@@ -104,6 +105,12 @@ class OnnxBackend:
         inputs = voxelize_people(clouds, view, self._config).arrays()
         values = self.session.run(self._outputs, {input_name(name): array for name, array in inputs.items()})
         return Raw.from_pose(dict(zip(self._outputs, values, strict=True)))
+
+
+@cache
+def bundled_backend(name: str) -> OnnxBackend:
+    """The bundled network of a name, on all usable threads; opened once for all who run it."""
+    return OnnxBackend(weights_file(f"{name}.onnx"))
 
 
 def exported_beside(path: str | os.PathLike, *, threads: int | None = None) -> OnnxBackend:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, Protocol, TypedDict, Unpack, overload
 import numpy as np
 
 from lidarpose.errors import InputError, check_int, check_name, first_names, missing_extra
-from lidarpose.inference.backend import Backend, OnnxBackend, exported_beside
+from lidarpose.inference.backend import Backend, OnnxBackend, bundled_backend, exported_beside
 from lidarpose.inference.checks import (
     UPSIDE_DOWN,
     is_lying,
@@ -107,6 +107,9 @@ def load(
     elif not is_plain:
         option = "torch.compile" if compile else f"device {device!r}"
         raise InputError(f"{option} needs the backend torch and a .safetensors file, got the backend onnx")
+    elif is_bundled and threads is None:
+        # which the search for people runs too
+        network_backend = bundled_backend(path.stem)
     elif is_bundled or is_exported:
         network_backend = OnnxBackend(path if is_exported else path.with_suffix(".onnx"), threads=threads)
     else:
@@ -298,8 +301,8 @@ class Predictor(PoseEstimator):
             pelvises: (N, 3) m, nearly, where each cloud shows one person alone: the pass that finds them is spared.
             box_centers: (N, 3) m of the boxes that cut the clouds out: where a cloud shows two people, who is nearer to
                 the center is meant.
-            is_scored: whether boxes say how sure it is that somebody is there, which is told by more than the points
-                in them: then nothing is said of it.
+            is_scored: whether boxes say how sure it is that somebody is there, by more than the points in them: then
+                nothing is said of it.
             check_upside_down: whether those whose pose is unsure are looked at upside down too, to warn of it, which
                 costs as much as the pose.
         """

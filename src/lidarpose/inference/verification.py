@@ -6,15 +6,14 @@ Legend: D detections.
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 
 from lidarpose.geometry import distance_to_segments, rotation_about, rows_near
-from lidarpose.inference.backend import Backend, OnnxBackend, Raw, estimates
+from lidarpose.inference.backend import Backend, Raw, bundled_backend, estimates
 from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.tta import IDENTITY, apply
-from lidarpose.models import DEFAULT, VERIFIER, weights_file
+from lidarpose.models import DEFAULT, VERIFIER
 from lidarpose.models.decode import decoder, sigmoid
 from lidarpose.models.detector.detector import Detections
 from lidarpose.sample import MIN_POINTS, Box, Pose, facing_yaw
@@ -58,9 +57,8 @@ _NOBODY = 1 / 3
 _DECIMALS = 4
 
 
-@cache
 def _bundled(name: str) -> Backend:
-    return OnnxBackend(weights_file(f"{name}.onnx"))
+    return bundled_backend(name)
 
 
 def verification_features(detections: Detections, points: np.ndarray, origin: np.ndarray | None) -> np.ndarray:

@@ -260,7 +260,7 @@ _BEFORE = 0.3
 _BESIDE, _NEARER = (0.4, 1.0), (0.4, 2.5)
 # how far apart two people in one crop are, m
 _CLOSE = (0.35, 0.8)
-# two bodies are told apart by what is in cells so large, as seen along the line between them, m
+# the cells in which two bodies are compared, as seen along the line between them, m
 _CELL, _CELLS = 0.08, 48
 
 
