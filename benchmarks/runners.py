@@ -192,20 +192,22 @@ class Onnx(Runner):
         self.parameters = ours.parameters
         self.voxelize = ours.voxelize
         self.file, self.backend = onnx, backend
-        self.session = onnx.open_onnx(path, threads=threads)[0]
+        self.session, self.threads = onnx.open_onnx(path)[0], threads
         self.decoder = decode.decoder("window")
         # parts are of no use to the predictor: what is not asked for is not computed
         self.outputs = [name for name in onnx.OUTPUTS if name != "part"]
 
     def tables(self, people):
-        arrays = self.voxelize(people).arrays()
-        return {self.file.input_name(name): array for name, array in arrays.items()}
+        parts = [people[rows] for rows in self.backend.person_parts(len(people), self.threads)]
+        pyramids = [self.voxelize(part).arrays() for part in parts]
+        return [{self.file.input_name(name): array for name, array in arrays.items()} for arrays in pyramids]
 
     def joints(self, tables):
         return self.decode(self.run(tables))
 
-    def run(self, tables: dict[str, np.ndarray]) -> list[np.ndarray]:
-        return self.session.run(self.outputs, tables)
+    def run(self, tables: list[dict[str, np.ndarray]]) -> list[np.ndarray]:
+        values = self.file.map_in_threads(lambda arrays: self.session.run(self.outputs, arrays), tables, self.threads)
+        return [np.concatenate(arrays) for arrays in zip(*values, strict=True)]
 
     def decode(self, values: list[np.ndarray]) -> np.ndarray:
         raw = self.backend.Raw.from_pose(dict(zip(self.outputs, values, strict=True)))

@@ -14,13 +14,15 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from lidarpose.errors import InputError, MissingExtra, missing_extra
-from lidarpose.inference.backend import Raw, bundled_backend, estimates
+from lidarpose.inference.backend import OnnxBackend, Raw, bundled_backend, estimates, person_parts
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.inference.tta import IDENTITY
 from lidarpose.io.files import content_digest
-from lidarpose.models import DEFAULT, bundled_path, decode, layers, onnx
+from lidarpose.models import DEFAULT, bundled_path, decode, layers, onnx, weights_file
 from lidarpose.models.checkpoint import Header, read_header, save_checkpoint
 from lidarpose.models.config import BIN, NetworkConfig
 from lidarpose.models.dapt.dapt_config import DaptConfig
@@ -323,13 +325,35 @@ def test_a_wrong_choice_is_one_line(case):
 def test_threads():
     assert 1 <= usable_threads() <= 8
     for asked, used in ((3, 3), (None, usable_threads())):
-        assert load(threads=asked).backend.session.get_session_options().intra_op_num_threads == used
+        assert load(threads=asked).backend.threads == used
 
 
-@pytest.mark.parametrize("given, most", [("1", 1), ("2,4", 2), ("0", 8), ("many", 8), ("", 8), ("99", 8)])
-def test_one_setting_bounds_the_threads_of_all_networks(monkeypatch, given, most):
+@given(st.integers(0, 200), st.integers(1, 16))
+def test_people_are_spread_evenly_over_threads(count, threads):
+    rows = [range(count)[part] for part in person_parts(count, threads)]
+    assert [row for part in rows for row in part] == list(range(count))
+    sizes = [len(part) for part in rows]
+    assert max(sizes) <= 8 and max(sizes) - min(sizes) <= 1
+    assert len(sizes) % threads == 0 or len(sizes) == max(count, 1) < threads
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_people_of_a_batch_are_posed_as_alone(threads):
+    backend = OnnxBackend(weights_file("tiny.onnx"), threads=threads)
+    rng = np.random.default_rng(0)
+    clouds = [rng.normal(0, 0.3, (n, 3)) for n in (5, 400, 0, 60, 61, 62, 7, 200, 90, 30, 12)]
+    view = rng.normal(size=(len(clouds), 5))
+    together = backend.run(clouds, view)
+    for i, cloud in enumerate(clouds):
+        alone = backend.run([cloud], view[i : i + 1])
+        np.testing.assert_allclose(together.vote[i], alone.vote[0], atol=1e-5)
+        np.testing.assert_allclose(together.heatmaps[2][i], alone.heatmaps[2][0], atol=1e-3)
+
+
+@pytest.mark.parametrize("setting, most", [("1", 1), ("2,4", 2), ("0", 8), ("many", 8), ("", 8), ("99", 8)])
+def test_one_setting_bounds_the_threads_of_all_networks(monkeypatch, setting, most):
     monkeypatch.setattr(onnx.os, "sched_getaffinity", lambda _: range(64), raising=False)
-    monkeypatch.setenv("OMP_NUM_THREADS", given)
+    monkeypatch.setenv("OMP_NUM_THREADS", setting)
     assert usable_threads() == most
 
 

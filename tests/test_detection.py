@@ -570,6 +570,15 @@ def test_who_cannot_reach_the_least_score_is_neither_verified_nor_posed(monkeypa
         owned |= set(rows.tolist())
 
 
+def test_candidates_are_spread_over_threads():
+    scene = detection_scene(5, 5)
+    alone, spread = (Detector(threads=n).detect(scene.points, scene.origin, limit=40) for n in (1, 3))
+    for name in ("centers", "sizes", "logit", "score", "mounted"):
+        np.testing.assert_allclose(getattr(spread, name), getattr(alone, name), atol=1e-4)
+    # nobody to look at
+    assert len(Detector(threads=3).detect(np.zeros((0, 3)), scene.origin)) == 0
+
+
 @pytest.fixture(scope="module")
 def hidden():
     """A scene whose person 6, 0.8 m from another, has no detection, as if taken for one with the other."""

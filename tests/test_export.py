@@ -129,7 +129,7 @@ class Halved(torch.nn.Module):
 def test_a_module_becomes_onnx_of_free_length_that_tells_only_what_it_is_told():
     module = Halved()
     content = module_to_onnx(module, (torch.ones(3, 5, 8),), ({0: "rows"},), ["x"], ["sum", "half"], {"note": "a note"})
-    session = open_session(content, threads=1)
+    session = open_session(content)
     assert session.get_modelmeta().custom_metadata_map == {"note": "a note"}
     assert [value.shape for value in session.get_inputs()] == [["rows", 5, 8]]
     assert b"test_export.py" not in content
@@ -167,7 +167,7 @@ def test_float16_weights_stay_float16(exported):
     assert len(packed) < len(whole) - 1.5 * parameters
     arrays = voxelize_people(*people(300, 5, 900), header.config).arrays()
     given = {input_name(name): array for name, array in arrays.items()}
-    for ours, due in zip(*(open_session(file, threads=1).run(None, given) for file in (packed, whole)), strict=True):
+    for ours, due in zip(*(open_session(file).run(None, given) for file in (packed, whole)), strict=True):
         np.testing.assert_array_equal(ours, due)
 
 
@@ -196,11 +196,11 @@ def test_weights_that_need_all_of_float32_keep_it():
         np.testing.assert_array_equal(stored[name], array)
     model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=8)
     onnx.checker.check_model(model)
-    np.testing.assert_array_equal(open_session(model.SerializeToString(), threads=1).run(None, {})[0], half)
+    np.testing.assert_array_equal(open_session(model.SerializeToString()).run(None, {})[0], half)
 
 
 def assert_tells_what_it_is(folder):
-    session, header, source = open_onnx(folder / "net.onnx", threads=1)
+    session, header, source = open_onnx(folder / "net.onnx")
     config = header.config
     assert header == read_header(folder / "net.safetensors") and config.convolution and config.person
     assert source == content_digest(folder / "net.safetensors", expected="a checkpoint")
@@ -295,10 +295,10 @@ def test_a_flipped_bit_is_noticed(folder, at, bit):
 def test_a_file_without_a_digest_loads_with_a_note(folder, tmp_path):
     older = changed(folder, tmp_path / "older.onnx", lambda model: None)
     with pytest.warns(UserWarning, match="older.onnx: has no digest, so damage goes unnoticed"):
-        open_onnx(older, threads=1)
+        open_onnx(older)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        open_onnx(folder / "net.onnx", threads=1)
+        open_onnx(folder / "net.onnx")
         for name in BUNDLED:
             assert check_digest(name, bundled_path(name, ".onnx").read_bytes())
 

@@ -154,7 +154,7 @@ def test_the_file_gives_what_the_network_gives(tmp_path):
     card = {"calibration": [[-1.0, 1.0], [0.1, 0.9]], "default_score": 0.5}
     export_detector(network, path, card=card)
     assert path.stat().st_size < 1.5e6
-    session, header = open_detector(path, threads=1)
+    session, header = open_detector(path)
     assert header["default_score"] == 0.5 and header["calibration"] == card["calibration"] and header["version"]
     for candidates in (0, 1, 5):
         arrays = random_inputs(candidates, seed=candidates)
@@ -320,7 +320,7 @@ def test_people_missed_at_one_false_person_a_scan(quick_scans):
 def test_a_run_begins_with_the_bundled_detector(tmp_path):
     """Which is what the exported file of that name computes, to float16's precision."""
     begun = setup.make_setup(replace(RECIPE, init="detector")).network()
-    session, _ = open_network(detector_path(), threads=1)
+    session, _ = open_network(detector_path())
     rng = np.random.default_rng(0)
     arrays = {name: rng.normal(size=shape).astype(np.float32) for name, shape in CONFIG.shapes(5).items()}
     with torch.inference_mode():

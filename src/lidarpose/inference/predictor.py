@@ -77,8 +77,8 @@ def load(
         decode: how heatmaps are read, "window" (the mean about the mode), "argmax" or "dark" (the released DAPT
             code's); where two peaks are equally high, rounding decides.
         compile: by `torch.compile`, backend torch only.
-        threads: of ONNX Runtime, backend onnx only; None for the processors that the process may use, at most 8 and at
-            most what the environment variable OMP_NUM_THREADS says.
+        threads: over which people are spread, backend onnx only; None for the processors that the process may use, at
+            most 8 and at most what the environment variable OMP_NUM_THREADS says.
         tta: test-time augmentation, the number of transforms of each person (1 to 8), averaged with the pass that
             centers the cloud. A person costs that pass and one for each transform, so 1 takes two passes, 4 take five.
 

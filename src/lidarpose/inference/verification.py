@@ -21,8 +21,6 @@ from lidarpose.sample import MIN_POINTS, Box, Pose, facing_yaw
 # rows (m,) of a scan's points that are on nobody, and where people are (K, 2) m -> who else is beside them
 DetectBeside = Callable[[np.ndarray, np.ndarray], Detections]
 
-# detections that are verified or posed at once, of like size: a batch costs as much as if all were its largest
-_BATCH = 16
 # what is posed: a column so wide, and so far below and above the detection's box, m
 _COLUMN, _BELOW, _ABOVE = 0.6, 0.15, 0.25
 # points around a detection that its final box may hold, m to each side
@@ -154,8 +152,8 @@ def _run(
     """Batches of those among the rows that have enough points, and what a network says of them."""
     enough = (i for i in rows.tolist() if len(clouds[i]) >= MIN_POINTS)
     ordered = sorted(enough, key=lambda i: len(clouds[i]))
-    for start in range(0, len(ordered), _BATCH):
-        batch = ordered[start : start + _BATCH]
+    for start in range(0, len(ordered), backend.batch):
+        batch = ordered[start : start + backend.batch]
         yield batch, backend.run(*apply(IDENTITY, [clouds[i] for i in batch], centers[batch], origin))
 
 

@@ -71,7 +71,7 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
     metadata = {ENTRY: header.to_json(), SOURCE: content_digest(weights, expected="a checkpoint")}
     if format == "onnx":
         content = with_digest(onnx_bytes(network, metadata | {DIGEST: NO_DIGEST}))
-        session = open_session(content, threads=1)
+        session = open_session(content)
 
         def run(arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
             return session.run(
@@ -103,7 +103,7 @@ def export_detector(network: DetectorNet, out: str | os.PathLike, *, card: dict)
     example_inputs = tuple(torch.zeros(shape) for shape in shapes(2).values())
     metadata = {ENTRY: Header(config=network.config, card=card).to_json(), DIGEST: NO_DIGEST}
     content = with_digest(module_to_onnx(network, example_inputs, dynamic_axes, INPUTS, (OUTPUT,), metadata))
-    session = open_session(content, threads=1)
+    session = open_session(content)
     rng = np.random.default_rng(0)
     for candidates in (1, 7):
         arrays = {name: rng.normal(size=shape).astype(np.float32) for name, shape in shapes(candidates).items()}

@@ -7,7 +7,8 @@ checkpoint that it was made from, and a digest: the SHA-256 of the file with zer
 
 import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from importlib import import_module
 from types import ModuleType
 from typing import Any
@@ -61,6 +62,23 @@ def usable_threads() -> int:
     return min(processors, _MOST_THREADS, most or _MOST_THREADS)
 
 
+def thread_count(threads: int | None) -> int:
+    """So many threads, `usable_threads` for None. Raises InputError for a number that is none or far too large."""
+    return usable_threads() if threads is None else check_int("threads", threads, least=1, most=_THREADS_LIMIT)
+
+
+def map_in_threads(function: Callable, parts: Sequence, threads: int) -> list:
+    """What a function makes of each part, several at once on so many threads.
+
+    They last for the call: threads that stayed would not be there in a process forked later.
+    """
+    count = min(threads, len(parts))
+    if count < 2:
+        return [function(part) for part in parts]
+    with ThreadPoolExecutor(count) as pool:
+        return list(pool.map(function, parts))
+
+
 def runtime() -> ModuleType:
     """The module onnxruntime, without its telemetry. Raises InputError where it cannot be loaded, as for want of a
     system library."""
@@ -76,40 +94,36 @@ def runtime() -> ModuleType:
         raise InputError(one_line(f"ONNX Runtime cannot be loaded ({error}): {remedy}")) from None
 
 
-def open_session(content: bytes, *, threads: int | None = None):
-    """An `onnxruntime.InferenceSession` of a file's content. Raises what ONNX Runtime does."""
+def open_session(content: bytes):
+    """An `onnxruntime.InferenceSession` of a file's content, whose runs take one thread each and may be several at
+    once. Raises what ONNX Runtime does."""
     module = runtime()
     settings = module.SessionOptions()
-    # set in any case: left alone it would pin threads to processors, which a container may forbid
-    settings.intra_op_num_threads = usable_threads() if threads is None else threads
-    settings.inter_op_num_threads = 1
-    # threads that wait for the next call would take the processors from what is done between calls
-    settings.add_session_config_entry("session.force_spinning_stop", "1")
+    # networks this small gain little from several threads for one run, and much from several runs at once
+    settings.intra_op_num_threads = settings.inter_op_num_threads = 1
     # what is wrong is raised; the log would add lines of its own
     settings.log_severity_level = 4
     return module.InferenceSession(content, settings, providers=["CPUExecutionProvider"])
 
 
-def open_onnx(path: str | os.PathLike, *, threads: int | None = None) -> tuple[Any, Header, str]:
+def open_onnx(path: str | os.PathLike) -> tuple[Any, Header, str]:
     """The session of an exported network, its header, and the digest of the checkpoint that it was made from.
 
     Raises InputError as `open_network` does, and for a file that holds no network of poses.
     """
-    session, header = open_network(path, threads=threads)
+    session, header = open_network(path)
     if not isinstance(header.config, NetworkConfig):
         raise file_error(path, f"expected a network of the kind pose, got {header.network}: use its .safetensors")
     check_names(path, session, expected_inputs(header.config), output_names(header.config))
     return session, header, session.get_modelmeta().custom_metadata_map.get(SOURCE, "")
 
 
-def open_network(path: str | os.PathLike, *, threads: int | None = None) -> tuple[Any, Header]:
+def open_network(path: str | os.PathLike) -> tuple[Any, Header]:
     """The session of an exported network of any kind, and its header.
 
     Warns of a file without a digest. Raises InputError, one line, for a file that is damaged, cut off, something else,
     another program's ONNX, or one that keeps its weights elsewhere.
     """
-    if threads is not None:
-        threads = check_int("threads", threads, least=0, most=_THREADS_LIMIT)
     content = read_bytes(path, expected="an ONNX file (.onnx)")
     if _EXTERNAL in content:
         # they would be looked up in the current folder, whatever lies there
@@ -121,7 +135,7 @@ def open_network(path: str | os.PathLike, *, threads: int | None = None) -> tupl
     # what is wrong with it is not the file's fault
     runtime()
     try:
-        session = open_session(content, threads=threads)
+        session = open_session(content)
     except Exception as error:
         # its exceptions have no base of their own
         reason = " ".join(str(error).split())[:120]

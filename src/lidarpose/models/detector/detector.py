@@ -18,7 +18,7 @@ from lidarpose.models.detector.ground import Ground, estimate_ground, without_gr
 from lidarpose.models.detector.proposals import heights_above, propose
 from lidarpose.models.detector.range_image import SIDE, SLICES
 from lidarpose.models.detector.render import render
-from lidarpose.models.onnx import check_names, open_network
+from lidarpose.models.onnx import check_names, map_in_threads, open_network, thread_count
 
 # how far people are looked for by default, m; what lies farther beyond the range is left out, m: a candidate at its end
 # still has its surroundings
@@ -68,7 +68,7 @@ class Detector:
 
     Args:
         scorer: a network's ONNX file, None for the bundled one; or a function in place of the network.
-        threads: of ONNX Runtime, None for all that may be used.
+        threads: over which candidates are spread, None for all that may be used.
 
     Raises:
         InputError: one line, for a file that is damaged or something else.
@@ -76,10 +76,12 @@ class Detector:
 
     def __init__(self, scorer: str | os.PathLike | Scorer | None = None, *, threads: int | None = None):
         self.header: dict[str, Any] = {}
+        self._threads = 1
         if callable(scorer):
             self._score: Scorer = scorer
             return
-        session, self.header = open_detector(scorer, threads=threads)
+        self._threads = thread_count(threads)
+        session, self.header = open_detector(scorer)
         self._score = lambda arrays: session.run(None, arrays)[0]
 
     def detect(
@@ -154,11 +156,11 @@ class Detector:
         return self._detections(SceneIndex(points, ground, origin), places, True, None)
 
     def _detections(self, scene: SceneIndex, places: np.ndarray, has_ground: bool, limit: int | None) -> Detections:
-        # memory that each piece uses again: to get as much anew takes longer than all else
-        fine = np.empty((min(len(places), CHUNK), SLICES, SIDE, SIDE), np.float32)
-        pieces = (render(piece, fine=fine[: len(piece)]) for piece in scene.pieces(places))
-        scores = [np.asarray(self._score(inputs), float) for inputs in pieces]
-        outputs = np.concatenate([np.zeros((0, 6)), *scores])
+        outputs = np.zeros((len(places), 6))
+        shares = [slice(k, None, self._threads) for k in range(min(self._threads, len(places)))]
+        results = map_in_threads(lambda share: self._outputs(scene, places[share]), shares, self._threads)
+        for share, share_outputs in zip(shares, results, strict=True):
+            outputs[share] = share_outputs
         centers, heights = predicted_boxes(places, scene.yaws(places), outputs)
         logit = outputs[:, 0]
         indices = suppress_near(centers, logit, SAME)[:limit]
@@ -173,6 +175,13 @@ class Detector:
             ground=scene.ground,
             has_ground=has_ground,
         )
+
+    def _outputs(self, scene: SceneIndex, places: np.ndarray) -> np.ndarray:
+        """What the network says of places (K, 3) m, K at least 1: (K, 6)."""
+        # memory that each piece uses again: to get as much anew takes longer than all else
+        fine = np.empty((min(len(places), CHUNK), SLICES, SIDE, SIDE), np.float32)
+        pieces = (render(piece, fine=fine[: len(piece)]) for piece in scene.pieces(places))
+        return np.concatenate([np.asarray(self._score(inputs), float) for inputs in pieces])
 
     def probability(self, logit: np.ndarray) -> np.ndarray:
         """Of a person at a logit (D,), by the calibration in the file."""
@@ -232,14 +241,14 @@ def detector_path(suffix: str = ".onnx") -> Path:
     return weights_file(f"detector{suffix}")
 
 
-def open_detector(path: str | os.PathLike | None = None, *, threads: int | None = None) -> tuple[Any, dict]:
+def open_detector(path: str | os.PathLike | None = None) -> tuple[Any, dict]:
     """The session of a detector (None: the bundled one), and its header: "version", and the card of its training, with
     "calibration" ([logits], [probabilities]), "default_score" and "verification" once it is calibrated.
 
     Raises InputError, one line, for a file that is damaged, something else, or another network's.
     """
     path = detector_path() if path is None else path
-    session, header = open_network(path, threads=threads)
+    session, header = open_network(path)
     if not isinstance(header.config, DetectorConfig):
         raise file_error(path, f"expected a detector, got a network of the kind {header.network}: leave it away")
     check_names(path, session, INPUTS, (OUTPUT,))
