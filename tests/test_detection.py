@@ -487,7 +487,7 @@ def test_the_commands(file, capsys, fake, tmp_path):
     warning, line = capsys.readouterr().err.strip().splitlines()
     assert "learned from this scan alone?" in warning
     assert line.startswith(
-        "nobody found -> sweep.poses.json and sweep.poses.png; if somebody is there: points need meters"
+        "no people found -> sweep.poses.json and sweep.poses.png; if there should be: points need meters"
     )
     assert json.loads((tmp_path / "sweep.poses.json").read_text())["people"] == []
     for wrong, words in (

@@ -7,9 +7,9 @@ from lidarpose.errors import InputError
 from lidarpose.models import DEFAULT, NAMES
 from lidarpose.progress import Progress
 
-_WORKERS = "--workers N = 1  number of processes, at most one a shard (default 1)"
+_WORKERS = "--workers N = 1  number of processes, at most one per shard (default 1)"
 _DEMO = f"""
-show people seen by three LiDARs, true and predicted
+show people as three LiDARs see them, with true and predicted poses
 Synthesizes people, predicts their poses and writes an interactive 3D report.
 $ lidarpose demo --out demo
 --out DIR = lidarpose-demo  folder (default lidarpose-demo)
@@ -30,7 +30,7 @@ $ lidarpose synth --out streets -n 20 --scenes --sensor os1-128
 --seed N = 0  random seed (default 0)
 --hard H = 1  difficulty from 0 (easy) to 1 (default)
 {KEEP}
---set:set_set A=X,B=Y  changes of the scene: its numbers (docs/synthesis.md), recorded=1 keeps the places of --motion
+--set:set_set A=X,B=Y  overrides of the scene's fields (docs/synthesis.md); recorded=1 keeps the positions of --motion
 --clips  write clips of 16 frames at 10 Hz instead of single people
 --scenes  write whole streets with several walking people
 [poses and bodies]
@@ -51,8 +51,8 @@ $ lidarpose prepare sloper4d RAW sloper4d --smpl SMPL_NEUTRAL.pkl
 <dataset> NAME  humanm3, lidarhuman26m, sloper4d, waymo, itop, lipd, freemotion or noisemotion
 <root> RAW  folder of the dataset's raw files
 <out> DIR  a new folder, or the one of an interrupted run
---split NAME  write only the people of train, val or test
---split-by NAME  a published split (default: RAW/train.txt, val.txt and test.txt if present, else the usual one)
+--split NAME  write one split only: train, val or test
+--split-by NAME  a published split (default: RAW/train.txt, val.txt and test.txt if present, else the most used one)
 --smpl FILE|DIR  your SMPL model, for lidarhuman26m, sloper4d, freemotion, noisemotion
 --no-level  lidarhuman26m: keep the release's frame, as the LiDAR was mounted
 {_WORKERS}
@@ -63,7 +63,7 @@ Draws a contact sheet of a dataset that synth or prepare wrote; streets from abo
 $ lidarpose view people
 $ lidarpose view people --html --out people.html
 <folder> DIR  a dataset's folder
--n,--count N = 24  people, or at most 12 streets, evenly spread (default 24)
+-n,--count N = 24  number of people, or at most 12 streets, evenly spaced (default 24)
 --html  write an interactive 3D page instead of a picture
 --out FILE  default DIR.png or DIR.html, in the current folder
 """

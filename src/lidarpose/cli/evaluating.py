@@ -16,12 +16,12 @@ _OPTIONS = """
 --protocol NAME = clean  clean (default), or dapt: crops and centers from labels, as in the released code
 --split NAME  split to score, or all (default: test, else val, else all)
 --skeleton NAME  score the joints of this skeleton (default: the dataset's)
---limit N  score only N people (of detector: scans), evenly spread
+--limit N  score only N people (detector: N scans), evenly spaced
 --seed N = 0  random seed for displaced boxes and intervals (default 0)
 --device NAME = cpu  cpu (default), or cuda (backend torch)
 --backend NAME  onnx or torch, as in lidarpose predict
 --decode NAME = window  as in lidarpose predict; the released code uses dark
---tta N = 1  test-time augmentation: average N predictions of each person, 1 (default) to 8; protocol clean only
+--tta N = 1  test-time augmentation: passes per person, 1 (default) to 8; protocol clean only
 --stability  also perturb the points and draw the curves
 --legacy  also score with the released code's arithmetic
 --sensor-unknown  hide the sensor's position
@@ -33,10 +33,10 @@ DETECTOR = "detector"
 _DETECTOR = """
 --scans DIR&  a folder of SCAN.json of labeled people beside SCAN.pcd, .bin, .ply, .npy or another; may be repeated
 --method NAME  detector (default), scorer: without poses, or baselines: pose, candidates
---detector FILE  another detector's ONNX file than the bundled one
---range M  people farther from the sensor do not count (default 40)
---network NAME  compare poses in found boxes with those in labeled ones: a checkpoint (default small), or none
---pictures DIR  draw the strongest false people and those who are missed into DIR
+--detector FILE  ONNX file of a detector (default: the bundled one)
+--range M  ignore people farther from the sensor, m (default 40)
+--network NAME  compare poses in detected and in labeled boxes: a checkpoint (default small), or none
+--pictures DIR  draw the highest-scoring false positives and the missed people into DIR
 """
 _EVALUATE = f"""
 score a checkpoint on datasets
@@ -44,7 +44,7 @@ Prints metrics and writes scores.json, poses.parquet and pictures into a folder.
 $ lidarpose evaluate small bench
 $ lidarpose evaluate small prepared/waymo --out scores/waymo
 $ lidarpose evaluate detector --scans labeled --pictures look
-<weights> CHECKPOINT  {", ".join(BUNDLED)}, a checkpoint, an exported .onnx, or detector: what finds people in whole
+<weights> CHECKPOINT  {", ".join(BUNDLED)}, a checkpoint, an exported .onnx, or detector: people detection in whole
  scans
 <datasets> DATASET*  a folder written by prepare or synth, bench or bench-2; of detector heldout (default without
  --scans)
@@ -55,7 +55,7 @@ $ lidarpose evaluate detector --scans labeled --pictures look
 """
 _TABLE = """
 show scores beside the paper's Table 1
-Sets scores.json files beside the figures printed in the paper, by protocol.
+Shows scores.json files beside the figures printed in the paper, by protocol.
 $ lidarpose table evaluation/small
 <scores> FILE|DIR*  scores.json files, or folders that contain one
 --format NAME = markdown  markdown (default) or json

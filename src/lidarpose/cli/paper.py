@@ -13,32 +13,32 @@ from lidarpose.errors import InputError, check_name
 _NAMES = ("table1", "table2", "table3", "table4", "fig5", "fig6", "fig7", "fig8")
 _PAPER = """
 run a table or figure of the paper
-Runs the commands behind a table, cell by cell, and writes NAME.md and NAME.json with what each cell cost; figures as
- NAME.png. What is done is not done again, and the same command continues after an interruption. Without --data
- synthesized people stand in for the real sets.
+Runs the commands of a table, cell by cell, and writes NAME.md and NAME.json with the cost of each cell; figures as
+ NAME.png. Finished steps are not repeated, and the same command resumes after an interruption. Without --data,
+ synthesized people replace the real datasets.
 $ lidarpose paper table1 --dry-run
 $ lidarpose paper table1 --people 200000 --workers 2
 $ lidarpose paper table3 --data waymo=prepared/waymo --size paper
 <name> NAME  table1 to table4, or fig5 to fig8
 --out DIR = paper  folder of all tables (default paper)
---rows A,B  only these rows, named as --dry-run names them
+--rows A,B  only these rows, named as in --dry-run
 --dry-run  print the commands of every cell, run nothing
---table-only  write the table of what is there, run nothing
+--table-only  write the table of finished cells, run nothing
 [budget]
---people N = 200000  people that a stage of training sees: pre-training, and fine-tuning on the stand-in
+--people N = 200000  number of people per stage: pre-training, and fine-tuning on the synthesized target
  (default 200000)
---hours H  of a row's training in all: longer ones are made shorter, their schedule too
+--hours H  training time per row, all stages: longer trainings are shortened with their schedule
 --seeds K = 1  seeds 0 ... K-1 of each cell (default 1)
---workers N = 1  of each command (default 1)
---size NAME = paper-small  widths of all networks: paper-small (default) and paper-tiny: reduced ones; paper: as
+--workers N = 1  worker processes of each command (default 1)
+--size NAME = paper-small  width of all networks: paper-small (default) or paper-tiny, both reduced; paper: as
  published
 [data]
---data NAME=DIR,...  prepared real sets to learn from and to score on: waymo, humanm3, lidarhuman26m, sloper4d; to
- pre-train on: lipd, freemotion, noisemotion; raw poses: freemotion-poses, lidarhuman26m-poses;
- smpl=FILE: your SMPL file, the body of people in these poses (default: the shipped body)
---motion FILE,FILE  captured motion for synthesis; each is a row of table2, the first one is everywhere else
---subjects A,B  subjects of the first file to learn from
---held-out A,B  its subjects whom the stand-in's target shows
+--data NAME=DIR,...  prepared real datasets for fine-tuning and evaluation: waymo, humanm3, lidarhuman26m, sloper4d;
+ for pre-training: lipd, freemotion, noisemotion; raw poses: freemotion-poses, lidarhuman26m-poses;
+ smpl=FILE: your SMPL file, the body model for these poses (default: the shipped body)
+--motion FILE,FILE  captured motion for synthesis; each is a row of table2, other tables use the first
+--subjects A,B  training subjects of the first file
+--held-out A,B  held-out subjects of the first file, shown by the synthesized target
 """
 
 

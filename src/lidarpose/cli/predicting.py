@@ -17,66 +17,66 @@ from lidarpose.models import DEFAULT, NAMES
 _FILES = ".pcd .ply .las .laz .npy .npz .csv .xyz .txt .bin"
 # what to try where somebody should have been found
 _NOBODY = (
-    "if somebody is there: points need meters and z up (--up), a lower --min-score finds more, and predict --crop "
-    "takes all points for one person"
+    "if there should be: points need meters and z up (--up), a lower --min-score finds more, and predict --crop "
+    "treats all points as one person"
 )
 # characters of an id in a warning
 _LONGEST_ID = 40
 
 _FRAME = """
 --sensor-origin X,Y,Z  sensor position, or unknown (default: ORIGIN)
---up AXIS  what is up: z (default), y or x, -y where y points down (cameras), or a direction x,y,z
+--up AXIS  the file's up axis: z (default), y or x, -y where y points down (cameras), or a direction x,y,z
 --columns N  values per point in a .bin: 4 for KITTI, 5 for nuScenes
 """
 _SEARCH = """
---min-score P  least probability that it is a person, 0 to 1 (default: the detector's, about one false person a
- scan)
---range M  how far from the sensor, m (default 40)
---max-people N  only the N surest
---background FILE+  what stands still about a fixed sensor: a file of static points, several scans, or a folder of scans
+--min-score P  score threshold of detections, 0 to 1 (default: the detector's, about one false positive a scan)
+--range M  maximum distance from the sensor, m (default 40)
+--max-people N  only the N people with the highest scores
+--background FILE+  static scene of a fixed sensor, left out of the search: a file of static points, several scans, or
+ a folder of scans
 """
 _PREDICT = f"""
 estimate the poses of the people in a point file, a folder of them or a recording
-Finds the people in a scan, unless there are boxes or the file holds one person, and writes STEM.poses.json: every
- person's joints, in meters and in the file's own frame. Of a folder or a recording it writes NAME.poses.jsonl, a line
- a frame; stopped, the same command goes on. Files of the same name are replaced.
+Detects the people in a scan, unless boxes are given or the file holds one person, and writes STEM.poses.json: the
+ joints of each person, in meters and in the file's own frame. For a folder or a recording it writes NAME.poses.jsonl,
+ one line per frame; if interrupted, the same command resumes. Existing files of the same name are replaced.
 $ lidarpose predict sweep.pcd --picture
 $ lidarpose predict sweep.pcd --boxes people.json
 $ lidarpose predict person.ply --crop --out person.csv
 $ lidarpose predict drive/ --track
 $ lidarpose predict street.mcap --every 2 --format parquet
 <source> FILE+  {_FILES}; a folder, a pattern, several files, or a recording
-[what is in the file]
+[input]
 --boxes FILE  people to pose: {{"people": [{{"center": [x,y,z], "size": [l,w,h], "yaw": rad}}]}}, .npy rows, KITTI
  labels
 --calib FILE  KITTI's calibration (default: calib/N.txt beside label_2)
 --crop  the file holds one person (assumed under 4 m across)
 {_FRAME.replace("ORIGIN", "unknown for one person, else 0,0,0")}
-[who is looked for, without boxes]
---find  look for people in a file under 4 m across too
+[detection, without boxes]
+--find  detect people even in a file under 4 m across
 {_SEARCH}
 [output]
 --out PATH = .  a folder, a .json or .csv file (default: the current folder); - prints the JSON
 --picture  also draw STEM.poses.png, or FILE.png
---html  also write STEM.poses.html: everybody in 3D, the scan too; a recording is played
+--html  also write STEM.poses.html: people and scan in 3D; a recording is played
 --skeleton NAME  smpl24, human15, waymo14, itop14 or body26 (default smpl24, else the network's own)
 [network]
 --weights NAME|FILE = {DEFAULT}  {NAMES}, a checkpoint, or an exported .onnx
 --backend NAME  onnx or torch (default onnx for bundled weights and .onnx, torch for .safetensors and other devices)
 --device NAME = cpu  cpu (default), or cuda (backend torch)
 --decode NAME = window  how heatmaps are decoded: window (default), argmax or dark
---tta N = 1  test-time augmentation: average N predictions of each person and the one that finds them, 1 (default) to 8
+--tta N = 1  test-time augmentation: passes per person, averaged with the centering pass, 1 (default) to 8
 """
 _DETECT = f"""
 find the people in a point file
-Writes STEM.boxes.json: a box for each person found, surest first, with its score, the probability that it is a person.
- `lidarpose predict --boxes` takes the file.
+Writes STEM.boxes.json: a box for each detected person, highest score first; the score is the probability of a person.
+ `lidarpose predict --boxes` reads the file.
 $ lidarpose detect sweep.pcd --out people.json
 $ lidarpose detect sweep.pcd --min-score 0.6 --background recording/
 <file> FILE  {_FILES}
-[what is in the file]
+[input]
 {_FRAME.replace("ORIGIN", "0,0,0")}
-[who is looked for]
+[detection]
 {_SEARCH}
 [output]
 --out PATH = .  a folder, or a .json file (default: the current folder); - prints it
@@ -112,7 +112,7 @@ def _predict(options: argparse.Namespace) -> None:
     num_posed = sum(person.has_pose for person in poses)
     destination = f" -> {' and '.join(map(str, outputs))}" if outputs else ""
     if not poses and poses.scan is not None:
-        tell(f"nobody found{destination}; {_NOBODY}")
+        tell(f"no people found{destination}; {_NOBODY}")
         return
     search = f"searched in {poses.timing_ms['find'] / 1e3:.1f} s, " if poses.scan is not None else ""
     tell(f"{num_posed} of {len(poses)} people, {search}{poses.timing_ms['per_person']:.0f} ms each{destination}")
@@ -167,7 +167,7 @@ def _detect(options: argparse.Namespace) -> None:
         boxes.save(result)
     for line in boxes.warnings:
         tell(f"lidarpose: warning: {line}")
-    outcome = f"{counted(len(boxes), 'person', 'people')} found" if boxes else "nobody found"
+    outcome = f"{counted(len(boxes), 'person', 'people')} found" if boxes else "no people found"
     tell(outcome + (f" -> {result}" if result else "") + ("" if boxes else f"; {_NOBODY}"))
 
 

@@ -15,16 +15,16 @@ from lidarpose.errors import InputError, counted
 
 _FRAMES = """
 [folders and recordings]
---track  join people over time, and make their poses steady
---live  tracks made steady by the past alone, as they come
---world  joints in the world's frame, where it is known
---topic NAME  which points of a bag
+--track  track people over time and smooth their poses
+--live  track causally: smooth with past frames only, as frames arrive
+--world  joints in the world frame, if sensor poses are known
+--topic NAME  point cloud topic of a bag
 --meta FILE  an Ouster sensor's JSON file (default: the recording's name beside it)
---rate HZ  frames a second where times are unknown (default 10)
---start S  seconds from the first frame
---end S  seconds from the first frame
---every N  only every N-th frame
---format {jsonl,csv,parquet}  of NAME.poses.FORMAT (default jsonl)
+--rate HZ  frames per second if timestamps are missing (default 10)
+--start S  first time to process, seconds after the first frame
+--end S  last time to process, seconds after the first frame
+--every N  process every N-th frame
+--format {jsonl,csv,parquet}  format of NAME.poses.FORMAT (default jsonl)
 """
 # what a user reads of warnings that many frames have
 _MOST_WARNINGS = 8

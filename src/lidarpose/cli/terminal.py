@@ -44,7 +44,7 @@ def folder(text: str) -> str:
 _TYPES: dict[str, Callable] = {"N": int, "K": int, "DIR": folder, "RUN": folder}
 _TYPES |= dict.fromkeys(("P", "M", "S", "HZ", "H", "SHARE"), float)
 # stands for a change of the scene
-KEEP = "--keep R  laser mask: every sample keeps a share R of its patches, the paper's r_keep; as --set keep=R"
+KEEP = "--keep R  laser mask: share R of patches that each sample keeps, the paper's r_keep; same as --set keep=R"
 
 
 def add_command(commands, name: str, run: Callable[[argparse.Namespace], None], text: str) -> argparse.ArgumentParser:
@@ -58,7 +58,9 @@ def add_command(commands, name: str, run: Callable[[argparse.Namespace], None], 
     epilog = "\n  ".join([f"example{'s' * (len(examples) > 1)}:", *examples])
     description = " ".join(line for line in lines if line[0] not in "$<-[") or f"{help[0].upper()}{help[1:]}."
     parser = commands.add_parser(name, help=help, description=description, epilog=epilog, formatter_class=_Help)
-    parser.add_argument("-q", "--quiet", action="store_true", help="no notes and no progress, results and errors alone")
+    parser.add_argument(
+        "-q", "--quiet", action="store_true", help="print results and errors only, no notes or progress"
+    )
     parser.set_defaults(run=run)
     add_options(parser, "\n".join(line for line in lines if line[0] in "<-["))
     return parser

@@ -13,9 +13,9 @@ from lidarpose.errors import InputError
 from lidarpose.train.recipes import TYPES, Finetune, PoseRecipe, Pretrain, Recipe, TrainDetector, TrainVerifier
 
 _RUN = """
- The run's folder holds config.json, log.jsonl, model.safetensors, best.safetensors, pictures of people where poses are
- learned, and state.safetensors to resume from. After an interruption, --resume continues with the same losses. Several
- processes: `torchrun --nproc_per_node N -m lidarpose COMMAND ...`, with the run's folder named."""
+ The run folder holds config.json, log.jsonl, model.safetensors, best.safetensors, state.safetensors to resume from,
+ and for pose networks pictures of validation people. After an interruption, --resume continues with the same losses.
+ Several processes: `torchrun --nproc_per_node N -m lidarpose COMMAND ...`, with the run folder named."""
 _PRETRAIN = f"""
 train a network on synthesized people
 Trains on people synthesized during training, or on shards.{_RUN.replace("COMMAND", "pretrain")}
@@ -30,19 +30,19 @@ $ lidarpose finetune --out runs/finetune-001 --resume
 <data> DATASET*  folders written by lidarpose prepare; with --resume the run's own
 """
 _DETECTOR = f"""
-train the network that finds people in whole scans
+train the network that detects people in whole scans
 Trains on scans synthesized during training.{_RUN.replace("COMMAND", "train-detector")}
 $ lidarpose train-detector --scenes 20000
 $ lidarpose train-detector runs/train-detector-001 --resume
 $ lidarpose train-detector runs/train-detector-001 --calibrate 300 --scans labeled
---calibrate N  train nothing: write RUN/detector.onnx, its scores calibrated on N synthesized scans of what training
- never shows
---scans DIR  with --calibrate: labeled real scans, as evaluate detector takes them; the default score lets one false
- person a scan pass there too
+--calibrate N  no training: write RUN/detector.onnx, its scores calibrated on N synthesized scans with objects that are
+ held out of training
+--scans DIR  with --calibrate: labeled real scans, as for evaluate detector; the default threshold then gives at most
+ one false positive a scan there, too
 """
 _VERIFIER = f"""
-train the network that tells people from the detector's mistakes
-Trains on what the bundled detector finds in synthesized scans.{_RUN.replace("COMMAND", "train-verifier")}
+train the verifier, which rejects the detector's false positives
+Trains on detections of the bundled detector in synthesized scans.{_RUN.replace("COMMAND", "train-verifier")}
 $ lidarpose train-verifier --scenes 5000
 $ lidarpose train-verifier runs/train-verifier-001 --resume
 """
@@ -78,16 +78,16 @@ def _add(parser, kind: type[Recipe]) -> None:
     recipe_help = "default, paper (as with --model dapt), paper-one-stage; prn, lpformer, lidarcap, ne, as with --model"
     recipe_help += "; other options override it"
     options = f"""
-{folder_option}  a new folder for the run (default runs/{kind.kind}-001, -002, ...); with --resume that of the run
+{folder_option}  run folder, new (default runs/{kind.kind}-001, -002, ...), or with --resume an existing one
 --resume  continue an interrupted run (default: the latest)
 --recipe NAME  {"default" if kind in (TrainDetector, TrainVerifier) else recipe_help}
---device NAME  only cpu may be named (default: a GPU if there is one)
+--device NAME  cpu, to train on the CPU (default: a GPU if there is one)
 --tracker NAME  also log to tensorboard or wandb, if installed
 """
     add_options(parser, options)
     # first the settings of this kind of training, then those that all have
-    kind_group = parser.add_argument_group(f"settings of {kind.kind}")
-    common_group = parser.add_argument_group("settings of optimizer and run")
+    kind_group = parser.add_argument_group(f"{kind.kind}")
+    common_group = parser.add_argument_group("optimizer and run")
     if kind is Pretrain:
         add_options(kind_group, KEEP)
     common_names = {field.name for base in (Recipe, PoseRecipe) for field in fields(base)}

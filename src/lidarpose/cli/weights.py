@@ -16,7 +16,7 @@ from lidarpose.models import BUNDLED, DEFAULT, bundled_path
 _INFO = """
 show versions, device, bundled weights and their scores
 $ lidarpose info
--v,--verbose  also how the weights were trained, and all scores
+-v,--verbose  also show how the weights were trained, and all scores
 --json  print everything as JSON
 """
 _MODELS = """
@@ -39,7 +39,7 @@ Converts weights that DAPT's authors released, saved as safetensors, to a checkp
 $ lidarpose import dapt_waymo.safetensors waymo.safetensors --config waymo
 <file> file  the released weights, as .safetensors
 <out> OUT  the checkpoint to write (.safetensors)
---config NAME  waymo, humanm3, lidarhuman26m, sloper4d, pretrain or paper (default: as the file says)
+--config NAME  waymo, humanm3, lidarhuman26m, sloper4d, pretrain or paper (default: as stated in the file)
 """
 # of the detector's header
 _CALIBRATION = ("default_score", "calibrated_on", "labeled_scans")

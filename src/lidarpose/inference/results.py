@@ -346,7 +346,7 @@ class Poses(Sequence[PersonPose]):
 
         R_level_input = rotation_from_up(self.up)
         posed = [person for person in people if person.has_pose]
-        label = f"{counted(len(people), 'person', 'people')} found" if people else "nobody found"
+        label = f"{counted(len(people), 'person', 'people')} found" if people else "no people found"
         return ScanPanel(
             points=points @ R_level_input.T,
             boxes=[box for person in people if (box := person.box or _box_around(person))],

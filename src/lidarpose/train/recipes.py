@@ -34,7 +34,7 @@ FREE = ("workers", "validate", "pictures", "precision")
 # shares of a whole that cannot be all of it
 _BELOW_ONE = ("ema", "mix", "hold_out", "objects", "whole_scans")
 _MODEL = "ours, dapt, prn, lpformer, lidarcap or ne"
-_OPTIONS = "of a baseline's or the paper's network: grid=32, stale_convolution=true, ... (docs/train.md)"
+_OPTIONS = "options of a baseline or the paper's network: grid=32, stale_convolution=true, ... (docs/train.md)"
 _LEAST = {"batch": 1, "people": 1, "scenes": 1, "uses": 1}
 
 
@@ -90,24 +90,24 @@ class Recipe:
 
     kind: ClassVar[str]
 
-    batch: int = _setting(64, "people a step, in all processes together; each frame of a clip counts as one")
+    batch: int = _setting(64, "batch size, over all processes; each frame of a clip counts as one")
     rate: float = _setting(2e-3, "peak learning rate of AdamW", "RATE")
     decay: float = _setting(0.01, "weight decay")
     optimizer: str = _setting("adamw", "adamw or adam, where Muon is off")
-    betas: tuple[float, ...] = _setting((), "its two betas (default: those of the network)")
+    betas: tuple[float, ...] = _setting((), "betas of AdamW or Adam (default: by network)")
     schedule: str = _setting(
         "plateau",
-        "plateau (rise, stay, fall), cosine, constant, or in fine-tuning reduce-on-plateau (a tenth less where two "
-        "epochs gain less than 1 %% each)",
+        "plateau (warm-up, constant, decay), cosine, constant, or in fine-tuning reduce-on-plateau (rate x 0.9 when "
+        "two epochs improve by less than 1 %% each)",
     )
-    warmup: float = _setting(0.02, "share of the run in which the rate rises", "SHARE")
-    cool: float = _setting(0.3, "share of the run in which a plateau's rate falls to nothing", "SHARE")
-    ema: float = _setting(0.999, "how much the running mean of the weights keeps each step; 0: no mean", "SHARE")
-    clip: float = _setting(1.0, "largest norm of a step's gradient; 0: any")
+    warmup: float = _setting(0.02, "share of the run for warm-up", "SHARE")
+    cool: float = _setting(0.3, "share of the run, at its end, in which a plateau's rate decays to 0", "SHARE")
+    ema: float = _setting(0.999, "decay of the exponential moving average of the weights; 0: none", "SHARE")
+    clip: float = _setting(1.0, "gradient clipping, maximum norm; 0: none")
     precision: str = _setting("auto", "auto (bf16 on a GPU), float32 or bf16")
-    validate: int = _setting(0, "people between two validations; 0: twenty in the run")
-    seed: int = _setting(0, "of all that is random")
-    workers: int = _setting(1, "processes that make people, of each process that trains")
+    validate: int = _setting(0, "people between validations; 0: twenty validations")
+    seed: int = _setting(0, "random seed")
+    workers: int = _setting(1, "data loader processes, per training process")
 
     def __post_init__(self):
         for f in fields(self):
@@ -130,11 +130,11 @@ class PoseRecipe(Recipe):
 
     muon_rate: float = _setting(0.02, "peak learning rate of Muon for hidden matrices; 0: AdamW for all", "RATE")
     heatmap_rate: float = _setting(
-        1.0, "of the paper's network: rate of the last layer of its heatmaps, as a multiple of --rate"
+        1.0, "paper's network: learning rate of the heatmaps' last layer, as a multiple of --rate"
     )
-    bone: float = _setting(0.0, "weight of the error of bones' lengths")
-    symmetry: float = _setting(0.0, "weight of the difference of left and right bones")
-    pictures: int = _setting(6, "validation people drawn at every validation")
+    bone: float = _setting(0.0, "loss weight of bone lengths")
+    symmetry: float = _setting(0.0, "loss weight of left-right bone symmetry")
+    pictures: int = _setting(6, "people drawn at every validation")
 
 
 def _size_of(model: str, size: str) -> str:
@@ -151,45 +151,43 @@ class Pretrain(PoseRecipe):
 
     kind: ClassVar[str] = "pretrain"
 
-    model: str = _setting("", f"{_MODEL} (default: the one that --size is of)")
+    model: str = _setting("", f"{_MODEL} (default: by --size)")
     size: str = _setting(
         "",
-        "of the network: tiny (default), small, base; paper, paper-small, ...; prn, prn-small, ... (lidarpose models)",
+        "network size: tiny (default), small, base; paper, paper-small, ...; prn, prn-small, ... (lidarpose models)",
     )
     options: tuple[str, ...] = _setting((), _OPTIONS)
-    neck: str = _setting("mde", "of the paper's network: mde, finest or prn (docs/train.md)")
-    head: str = _setting(
-        "coordinates", "of the paper's network: coordinates (and parts), or heatmaps alone, in one stage"
-    )
+    neck: str = _setting("mde", "paper's network: mde, finest or prn (docs/train.md)")
+    head: str = _setting("coordinates", "paper's network: coordinates (and parts), or heatmaps alone, in one stage")
     drop_path: float | None = _setting(
-        None, "of the paper's network: how often training skips a residual branch, of the last block; earlier ones less"
+        None, "paper's network: stochastic depth, drop rate of the last block; linearly less in earlier ones"
     )
-    init: str = _setting("", "weights to begin with, of this size or smaller: bundled, or a checkpoint", "NAME|FILE")
+    init: str = _setting("", "initial weights, of this size or smaller: bundled, or a checkpoint", "NAME|FILE")
     scene: str = _setting("wild", "wild, wide, paper or reference")
     set: tuple[str, ...] = _setting(
-        (), "changes of the scene: its numbers, keep=R (laser mask), recorded=1 (places of the motion)", "A=X,B=Y"
+        (), "overrides of the scene's fields; keep=R (laser mask), recorded=1 (positions as captured)", "A=X,B=Y"
     )
-    people: int = _setting(300_000, "seen in all")
+    people: int = _setting(300_000, "number of training people")
     easy: float = _setting(
-        0.05, "share of the run in which the largest difficulty rises to full; stored people keep theirs", "SHARE"
+        0.05, "share of the run in which the maximum difficulty rises to 1; not for stored people", "SHARE"
     )
-    captured: float = _setting(0.5, "share of poses from captured motion, where clips are given", "SHARE")
-    motion: str | None = _setting(None, "captured motion to take poses from: a file or a folder")
-    subjects: tuple[str, ...] = _setting((), "those of its clips to learn from, by the first part of names")
+    captured: float = _setting(0.5, "share of poses from --motion", "SHARE")
+    motion: str | None = _setting(None, "captured motion for poses: a file or a folder")
+    subjects: tuple[str, ...] = _setting((), "clips of --motion to use, by the first part of their names")
     body: str | None = _setting(
         None, "your SMPL, SMPL+H or SMPL-X file instead of the shipped body, with the shapes of motion where it has any"
     )
-    strays: float = _setting(0.2, "how often stray points are about a person", "SHARE")
-    noise: float = _setting(0.15, "how often all points are blurred, by 0.5 to 8 cm", "SHARE")
+    strays: float = _setting(0.2, "probability of stray points around a person", "SHARE")
+    noise: float = _setting(0.15, "probability of Gaussian noise on all points, 0.5 to 8 cm", "SHARE")
     objects: float = _setting(
-        0.0, "share of crops in which nobody is; the network then says whether somebody is there", "SHARE"
+        0.0, "share of crops without a person; the network then predicts whether there is one", "SHARE"
     )
     whole_scans: float = _setting(
-        0.0, "share of people cut out of whole synthesized scans, as people are who were detected", "SHARE"
+        0.0, "share of people cropped from whole synthesized scans by detected boxes", "SHARE"
     )
     shards: tuple[str, ...] = _setting(
         (),
-        "folders that `lidarpose synth` wrote, to learn from; scene and motion then choose validation people",
+        "train on folders that `lidarpose synth` wrote; scene and motion then define validation people",
         "DIR,DIR",
     )
 
@@ -209,26 +207,26 @@ class Finetune(PoseRecipe):
 
     rate: float = _setting(5e-4, "peak learning rate of AdamW", "RATE")
     muon_rate: float = _setting(5e-3, "peak learning rate of Muon for hidden matrices; 0: AdamW for all", "RATE")
-    data: tuple[str, ...] = _setting((), "their folders")
-    model: str = _setting("", f"{_MODEL}: the network of --init (default: whichever it holds)")
+    data: tuple[str, ...] = _setting((), "folders of the datasets")
+    model: str = _setting("", f"{_MODEL}: the network of --init (default: that of the checkpoint)")
     options: tuple[str, ...] = _setting((), _OPTIONS)
-    init: str = _setting(DEFAULT, "weights to begin with: bundled, a checkpoint, or random", "NAME|FILE")
-    size: str = _setting("", "with --init random, of the network, as of pretrain")
-    neck: str = _setting("mde", "with --init random, of the paper's network, as of pretrain; else the checkpoint's")
-    epochs: float = _setting(20.0, "how often each sample is seen")
-    split: str = _setting("train", "samples to learn from; all: of every split")
-    interval: int = _setting(1, "only every so many frames, as published recipes thin out")
-    augment: str = _setting("default", "what happens to people: default, paper, lidarhmr, turn or none")
-    mix: float = _setting(0.25, "share of synthesized people, below 1", "SHARE")
-    scene: str = _setting("wild", "of the synthesized people: wild, wide, paper or reference")
+    init: str = _setting(DEFAULT, "initial weights: bundled, a checkpoint, or random", "NAME|FILE")
+    size: str = _setting("", "with --init random: network size, as for pretrain")
+    neck: str = _setting("mde", "with --init random: neck of the paper's network, as for pretrain")
+    epochs: float = _setting(20.0, "number of epochs")
+    split: str = _setting("train", "split to train on; all: every split")
+    interval: int = _setting(1, "use every N-th frame, as published recipes do")
+    augment: str = _setting("default", "data augmentation: default, paper, lidarhmr, turn or none")
+    mix: float = _setting(0.25, "share of synthesized people in training, below 1", "SHARE")
+    scene: str = _setting("wild", "scene of the synthesized people: wild, wide, paper or reference")
     hold_out: float = _setting(
-        0.1, "share of sequences kept for validation where the dataset has no split val", "SHARE"
+        0.1, "share of sequences held out for validation if the dataset has no split val", "SHARE"
     )
-    shift_windows: bool = _setting(False, "of clips: windows begin 0 to 15 frames later, drawn anew each epoch")
+    shift_windows: bool = _setting(False, "clips: shift windows by a random 0 to 15 frames each epoch")
     keep_anchors: bool = _setting(
-        True, "of the paper's network: keep pre-trained anchors and heads, joint by joint of the same name"
+        True, "paper's network: keep pre-trained anchors and heads of joints of the same name"
     )
-    head: str = _setting("heatmaps", "of the paper's network: heatmaps or coordinates")
+    head: str = _setting("heatmaps", "paper's network: heatmaps or coordinates")
 
     def __post_init__(self):
         super().__post_init__()
@@ -259,13 +257,13 @@ class TrainDetector(Recipe):
 
     kind: ClassVar[str] = "train-detector"
 
-    batch: int = _setting(4, "scans a step, in all processes together")
+    batch: int = _setting(4, "scans per batch, over all processes")
     rate: float = _setting(4e-3, "peak learning rate of AdamW", "RATE")
-    validate: int = _setting(0, "scans shown between two validations; 0: twenty in the run")
-    workers: int = _setting(1, "processes that make scans, of each process that trains")
-    scenes: int = _setting(20_000, "scans that are made")
-    uses: int = _setting(4, "how often each scan is shown, each time changed anew")
-    init: str = _setting("", "weights to begin with: detector (the bundled one), or a checkpoint", "NAME|FILE")
+    validate: int = _setting(0, "scans between validations; 0: twenty validations")
+    workers: int = _setting(1, "data loader processes, per training process")
+    scenes: int = _setting(20_000, "number of synthesized scans")
+    uses: int = _setting(4, "times each scan is used, with new augmentation")
+    init: str = _setting("", "initial weights: detector (the bundled one), or a checkpoint", "NAME|FILE")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -274,15 +272,15 @@ class TrainVerifier(Recipe):
 
     kind: ClassVar[str] = "train-verifier"
 
-    batch: int = _setting(4, "scans a step, in all processes together")
+    batch: int = _setting(4, "scans per batch, over all processes")
     rate: float = _setting(1e-3, "peak learning rate of AdamW", "RATE")
     schedule: str = _setting("cosine", "plateau (rise, stay, fall), cosine or constant")
-    warmup: float = _setting(0.1, "share of the run in which the rate rises", "SHARE")
-    validate: int = _setting(0, "scans shown between two validations; 0: twenty in the run")
-    workers: int = _setting(1, "processes that make scans, of each process that trains")
-    scenes: int = _setting(5_000, "scans that are made")
-    uses: int = _setting(3, "how often each scan is shown, each time changed anew")
-    init: str = _setting("tiny", "weights to begin with", "NAME|FILE")
+    warmup: float = _setting(0.1, "share of the run for warm-up", "SHARE")
+    validate: int = _setting(0, "scans between validations; 0: twenty validations")
+    workers: int = _setting(1, "data loader processes, per training process")
+    scenes: int = _setting(5_000, "number of synthesized scans")
+    uses: int = _setting(3, "times each scan is used, with new augmentation")
+    init: str = _setting("tiny", "initial weights", "NAME|FILE")
 
 
 # the released OneCycle schedule, AdamW on everything, neither mean of weights nor clipping
