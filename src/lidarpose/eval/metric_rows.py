@@ -20,7 +20,7 @@ from lidarpose.eval.predictions import Predictions
 from lidarpose.eval.scores import RELEASED, MetricRow, Setting, number
 from lidarpose.sample import CONFIDENCE_RADIUS, FEWEST_OF_SECOND, HIDDEN, SEEN, UNLABELED
 
-# points of people with fewer points than PLENTY often do not show the facing, with fewer than FEW hardly ever
+# with fewer points than PLENTY the facing is often ambiguous, with fewer than FEW nearly always
 PLENTY, FEW = 100, 20
 _REPEATS = 1000
 # frames count as evenly spaced if two steps differ by less than this fraction

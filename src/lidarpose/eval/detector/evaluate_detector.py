@@ -130,8 +130,8 @@ def write_detector(
     about: dict[str, Any],
     pictures: Path | None = None,
 ) -> list[Path]:
-    """Writes detector.json, and pictures of false positives and missed people into the folder `pictures`; returns all
-    paths."""
+    """Writes detector.json and, into the folder `pictures` if given, pictures of false positives and missed people;
+    returns all paths."""
     names = ("dataset", "scans", "changed", "thresholds", "reliability", "things", "rows")
     entries = [{name: getattr(result, name) for name in names} for result in results]
     text = json.dumps({"schema": SCHEMA, "version": __version__} | about | {"results": entries})
