@@ -200,8 +200,8 @@ def _value(result: Result, name: str) -> float | None:
 def mean_pose_error(target: Target, result: Result, out: Path) -> float:
     """MPJPE in mm of a baseline that predicts the mean skeleton of the training people about the protocol's center.
 
-    It is scored on the people and joints of `result`. The center comes from labels or from a person's points, depending on the
-    protocol.
+    It is scored on the people and joints of `result`. The center comes from labels or from a person's points,
+    depending on the protocol.
     """
     folders = [str(part.product(out)) if isinstance(part, Step) else part for part in (target.train, target.test)]
     # real sets may be prepared again: the digest of the card tells the versions apart

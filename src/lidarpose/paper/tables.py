@@ -342,7 +342,7 @@ def _dapt(options: Options, published: dict[str, float], name: str = "DAPT") -> 
 
 
 def _corpora(options: Options) -> list[Row]:
-    """Table 2. The stand-in has no corpora: it uses the poses of each motion file, and those of the procedural prior."""
+    """Table 2. The stand-in has no corpora: it uses poses of each motion file, and of the procedural prior."""
     finetune = _tuned(options)
     rows = [Row(name="w/o", finetune=_random(options), published=_published(59.2, None, 76.5))]
     if not options.real:
