@@ -141,7 +141,7 @@ def _person_rows(setup: EvalSetup, bench: Bench, predictions: Predictions, setti
 
 
 def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iterator[str]:
-    """Notes for the reader; setting: the setup's, with the actual sensor knowledge."""
+    """Notes for the reader; setting: the setup's, with `sensor` updated to what the dataset knows."""
     runs = runs_of(getattr(getattr(setup.model, "header", None), "card", {}))
     yield from dict.fromkeys(note for run in runs for note in _notes_of_run(run, setup.dataset))
     if setting.not_judged:

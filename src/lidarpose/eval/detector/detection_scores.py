@@ -114,7 +114,7 @@ def score_scan(
 def _conditions(scan: LabeledScan, positions: np.ndarray) -> dict[str, np.ndarray]:
     """Conditions that may make people hard to find, each (P,) bool."""
     distance = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
-    # each person is within this distance of itself
+    # a person is also within this distance of themselves
     has_company = (distance[:, scan.is_person] < _COMPANY).sum(1) > 1
     # larger to the sides, but shortened at both ends to leave out the ground and the ceiling
     margin = [2 * _TOUCHING, 2 * _TOUCHING, -2 * _TOUCHING]
@@ -175,7 +175,7 @@ def score_detector(
 
     Args:
         detect: see `Detect`; it should return boxes of all scores, low ones too.
-        max_range: people and detections farther from the sensor, m, are ignored.
+        max_range: people farther from the sensor, m, need not be found, and detections there are not false positives.
         default_score: a score threshold to report as the operating point "default".
         sensor_unknown: do not pass the sensor's position to the detector.
         predictor: predicts poses of matched people, in detected and in labeled boxes, where joints are labeled.
