@@ -1,4 +1,4 @@
-"""Charts of an evaluation: errors by group of people and joints, reliability, stability, the worst people.
+"""Charts of an evaluation: errors by group of people and by joint, reliability, stability, people with large errors.
 
 Drawn with matplotlib's Agg canvas through its object interface; every function returns the bytes of a PNG.
 """
@@ -16,16 +16,16 @@ from lidarpose.eval.scores import BASELINE, OURS, Result, Setting
 from lidarpose.sample import CONFIDENCE_RADIUS, Pose
 from lidarpose.viz.draw import Panel, draw_people, png_of
 
-# blue and orange of Okabe and Ito's color-blind-safe palette (2008), the orange darker to stand out on white
+# blue and orange of Okabe and Ito's color-blind-safe palette (2008), with a darker orange for contrast on white
 _BLUE, _ORANGE = "#0072b2", "#e07000"
-# of several networks, from the same palette
+# one color per network, from the same palette
 _PALETTE = (_BLUE, _ORANGE, "#009e73", "#cc79a7", "#56b4e9", "#7a828c", "#b59a00")
 _BAR, _GRAY, _INK, _FAINT, _HAIRLINE = "#c9deec", "#9aa3ad", "#1f2328", "#7a828c", "#e3e6ea"
 _DPI = 100
 _BINS = 10
-# edges of stated spread, m, in which it is compared with the true error
+# bin edges of the predicted spread, m, for comparing it with the true error
 _SPREADS = (0.0, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, np.inf)
-# points on a chart that stand for fewer joints say little
+# bins with fewer joints than this are not drawn
 _FEWEST = 20
 
 
@@ -60,8 +60,10 @@ def draw_errors(result: Result) -> bytes:
 
 
 def draw_reliability(predictions: Predictions, result: Result) -> bytes | None:
-    """Stated confidence against the share of joints within 10 cm, and stated spread against the true error; None where
-    the network states neither."""
+    """Predicted confidence against the share of joints within 10 cm, and predicted spread against the true error.
+
+    Returns None if no labeled joint has both a confidence and a spread.
+    """
     people = predictions.select(~predictions.moving)
     error = people.errors()
     is_stated = ~np.isnan(error) & ~np.isnan(people.confidence) & ~np.isnan(people.spread)
@@ -81,7 +83,7 @@ def draw_reliability(predictions: Predictions, result: Result) -> bytes | None:
 
 
 def draw_stability(study: Stability) -> bytes:
-    """The curves of a study, the other sensors, and the errors of end joints over the worst people."""
+    """The curves of a study, the other sensors, and the end-joint errors of the people with the largest errors."""
     columns, count = 4, len(study.curves) + bool(study.ends)
     rows = -(-count // columns)
     title = f"{study.setting.method}, points perturbed: MPJPE of {study.who}, mm"
@@ -104,28 +106,35 @@ def draw_stability(study: Stability) -> bytes:
 
 
 def compare_stability(studies: dict[str, dict[str, Any]]) -> bytes:
-    """Curves of several networks in one chart. Paper: Figure 7. studies: name of a network -> a study of
-    stability.json."""
+    """Curves of several networks in one chart. Paper: Figure 7.
+
+    Args:
+        studies: name of a network -> a study of stability.json.
+    """
     names, first_study = ("jitter", "clusters"), next(iter(studies.values()))
     figure = _figure(5.2 * len(names), 4.2, "points perturbed: MPJPE in mm", _scored(first_study["who"], first_study))
     for axes, name in zip(np.ravel(figure.subplots(1, len(names))), names, strict=True):
         for (network, study), color in zip(studies.items(), cycle(_PALETTE), strict=False):
             curve = next(curve for curve in study["curves"] if curve["name"] == name)
-            # a gap where nobody has a pose: amounts keep their places
+            # an amount at which no person has a pose leaves a gap; the others keep their positions
             values = [np.nan if point["mpjpe"] is None else point["mpjpe"] for point in curve["points"]]
             axes.plot(values, "o-", color=color, ms=4, lw=1.5, label=network)
             axes.set_xticks(range(len(values)), [point["label"] for point in curve["points"]], fontsize=8)
             title = curve["title"]
         axes.set_ylim(0, None)
         _styled(axes, title)
-    # below, where no curve runs
+    # below the axes, where it cannot cover a curve
     figure.legend(*axes.get_legend_handles_labels(), fontsize=8, frameon=False, ncols=3, loc="outside lower center")
     return png_of(figure, None)
 
 
 def compare_ends(studies: dict[str, dict[str, Any]]) -> bytes:
-    """Errors of end joints over the worst people, of several networks: means, and quartiles as lines. Paper: Figure 8.
-    studies: as of `compare_stability`."""
+    """End-joint errors over the people with the largest errors, for several networks: means, and quartiles as lines.
+    Paper: Figure 8.
+
+    Args:
+        studies: as in `compare_stability`.
+    """
     first_study = next(iter(studies.values()))
     subtitle = _scored(first_study["setting"]["dataset"], first_study)
     figure = _figure(9.6, 4.4, "end joints of each network's worst people: error in mm", subtitle)
@@ -143,12 +152,16 @@ def compare_ends(studies: dict[str, dict[str, Any]]) -> bytes:
 
 
 def _scored(people: str, study: dict[str, Any]) -> str:
-    """Who was scored, and how: the protocol is that of all studies in a chart."""
+    """The subtitle: which people were scored, and the protocol, which all studies in a chart share."""
     return f"{people} · protocol {study['setting']['protocol']}"
 
 
 def draw_worst(p: Predictions, setting: Setting, worst: Sequence[tuple[EvalSample, int]]) -> bytes:
-    """The people with the largest mean errors and their rows in the predictions: points, pose and truth."""
+    """The people with the largest mean errors: points, predicted pose and true pose.
+
+    Args:
+        worst: people and their rows in the predictions.
+    """
     errors = p.errors()
     panels = []
     for person, k in worst:
@@ -168,7 +181,7 @@ def draw_worst(p: Predictions, setting: Setting, worst: Sequence[tuple[EvalSampl
 
 
 def _bars(axes, values: np.ndarray, low, high, names: list[str], texts: list[str], *, horizontal: bool = False) -> None:
-    """A bar a value with its interval and a text at its end, upright or `horizontal`."""
+    """Draws one bar per value with its interval and a text at its end, vertical or `horizontal`."""
     positions = np.arange(len(values))
     (axes.barh if horizontal else axes.bar)(positions, values, 0.7, color=_BAR, zorder=1)
     (axes.hlines if horizontal else axes.vlines)(positions, low, high, color=_BLUE, lw=1.6, zorder=4)
@@ -180,7 +193,7 @@ def _bars(axes, values: np.ndarray, low, high, names: list[str], texts: list[str
         annotation.set_bbox({"fc": "white", "ec": "none", "alpha": 0.75, "pad": 0.6})
     (axes.set_yticks if horizontal else axes.set_xticks)(positions, names, fontsize=7.5)
     (axes.set_xlim if horizontal else axes.set_ylim)(0, 1.18 * ends.max())
-    # a single bar is no wider than one of four
+    # fewer than four bars are as wide as four would be
     margin = max(4 - len(positions), 0) / 2
     (axes.set_ylim if horizontal else axes.set_xlim)(-0.6 - margin, len(positions) - 0.4 + margin)
     _styled(axes, grid="x" if horizontal else "y")
@@ -220,7 +233,7 @@ def _spread(axes, spread: np.ndarray, error: np.ndarray) -> None:
 
 
 def _curve(axes, curve: Curve, top: float) -> None:
-    # amounts are not evenly apart, but each is one step of the study
+    # the amounts are not evenly spaced, but each is one step on the axis
     positions = np.array([k for k, point in enumerate(curve.points) if point.mpjpe is not None])
     points = [curve.points[k] for k in positions]
     values, low, high = _intervals(points, "mpjpe")
@@ -251,7 +264,7 @@ def _end_joints(axes, ends: Sequence[End]) -> None:
     _styled(axes, f"end joints of the worst {ends[0].worst:,}: mean, quartiles")
 
 
-# ---- the sheet
+# ---- layout and styles
 
 
 def _figure(width: float, height: float, title: str, subtitle: str):
@@ -264,7 +277,7 @@ def _figure(width: float, height: float, title: str, subtitle: str):
 
 
 def _intervals(rows: Sequence, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Values of this name and the ends of their intervals; the values themselves where there is none."""
+    """The attribute `name` of each row and the ends of its interval; without an interval, the value itself."""
     values, low, high = (np.array([getattr(row, key) for row in rows], float) for key in (name, "low", "high"))
     return values, np.where(np.isnan(low), values, low), np.where(np.isnan(high), values, high)
 
@@ -292,7 +305,7 @@ def _text(axes, text: str, position: tuple[Any, Any], offset: tuple[float, float
 
 
 def _level(axes, y: float, text: str, color: str) -> None:
-    """A level line with words above its right end."""
+    """A horizontal line with a text above its right end."""
     dashes = (4, 3) if color == _INK else (1, 2)
     axes.axhline(y, color=color, lw=0.8, ls=(0, dashes), zorder=3)
     options = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "ha": "right"}

@@ -1,20 +1,22 @@
-"""Datasets to evaluate on: folders that `lidarpose prepare` or `synth` wrote, and lidarpose-bench.
+"""Datasets to evaluate on: folders written by `lidarpose prepare` or `synth`, and lidarpose-bench.
 
-lidarpose-bench 1 and 2 are frozen sets of synthetic people on which weights are scored, 1 with clips of them: one
-Parquet file each that ships with the package and that no later version of the generator touches (`tools/make_bench.py`
-made them once). A row is one person in one frame:
+lidarpose-bench 1 and 2 are frozen sets of synthetic people for scoring weights; set 1 also has clips of them. Each is
+one Parquet file that ships with the package. `tools/make_bench.py` made them once, and later versions of the generator
+do not change them. A row is one person in one frame:
 
-    clip, frame         number of the clip and frame of it; clip -1: a person alone
-    person              of 2: False of 500 crops without a person: joints NaN, condition object, family the thing
-    others              of 2: how many points are a second person's
-    condition           clean, occluded, cluttered, crop (a poor detector's box) or company (a second person); of 2 also
-                        the `conditions` of a sample
-    poses               prior (procedural) or captured (subjects kept out of all training); of 2 prior, cmu, hdm05, idle
-    family              of 2: what is done, in one word for all sources
+    clip, frame         number of the clip and frame in it; clip -1: a single frame
+    person              set 2: False for 500 crops without a person: joints NaN, condition object, family the object
+    others              set 2: number of points on a second person
+    condition           clean, occluded, cluttered, crop (a poor detector's box) or company (a second person); in set 2
+                        also the `conditions` of a sample
+    poses               prior (procedural) or captured (subjects excluded from all training); in set 2 prior, cmu,
+                        hdm05 or idle
+    family              set 2: the activity, one word that is the same across all sources
     sensor, kind, distance, visible, clutter, upright      as in `sample.PersonInfo`
-    origin              (3,) m in the level frame at the sensor; points_mm: x, y, z of all points from it, millimeters
-    part                one a point: 0 = background, 1 + j = the bone of SMPL-24's joint j
-    joints              x, y, z of body26's joints, m, in the level frame at the sensor, which stands at its origin
+    origin              (3,) m in the level frame at the sensor
+    points_mm           x, y, z of all points relative to origin, millimeters
+    part                one per point: 0 = background, 1 + j = the bone of SMPL-24's joint j
+    joints              x, y, z of body26's joints, m, in the level frame with the sensor at its origin
     box                 center (3), size (3), yaw of the detector's box: m, rad
 """
 
@@ -38,28 +40,28 @@ from lidarpose.skeleton import BODY26, HUMAN15, Skeleton, skeleton
 
 
 class BenchFile(NamedTuple):
-    """A set that ships with the package: its name, and the hash of its file."""
+    """A set that ships with the package: its name, and the SHA-256 hash of its file."""
 
     name: str
     sha256: str
 
 
-# by the word for it; the first one's is also the kind of both
+# keys are the names that users give; the first one is also the `kind` of both sets
 BENCH = "bench"
 BENCHES = {
     BENCH: BenchFile("lidarpose-bench-1", "8abcafc6628c7580b8bdf91f9c05992c7c6e4098d6922973c7cfc39d8fe0e0d2"),
     "bench-2": BenchFile("lidarpose-bench-2", "872355263c4fc6de96e158c177ebb8694753ab5de5110013eb029a6152caf69d"),
 }
-# the word for everybody, whatever split
+# the split name that selects all people
 EVERYBODY = "all"
-# splits that are scored where none is named, the first that there is. Waymo's papers report on its validation folder
+# splits scored by default: the first of these that the dataset has. Waymo's papers report on its validation folder
 _DEFAULT_SPLITS = ("test", "val")
-# joints by which synthetic people are scored, where nobody asks for others
+# joints scored by default on synthetic people
 _SYNTHETIC = HUMAN15
-# plain people have so many points and more
+# plain people have at least this many points
 PLAIN_POINTS = 100
 
-# reason -> how many were left out for it, and the first
+# reason -> how many people or shards were skipped for it, and the first of them
 Skipped = dict[str, dict[str, Any]]
 
 
@@ -67,10 +69,10 @@ Skipped = dict[str, dict[str, Any]]
 class EvalSample:
     """A sample and its place in the dataset.
 
-    points: (n, 3) m, what the network is shown, at first all that the dataset holds, as precise as it holds them;
-    crop_box: the box that cut these out, None where nothing is cut and the dataset has none; shard, row: where in the
-    dataset; condition, poses, family: as in lidarpose-bench, "" elsewhere; moving: a frame of a clip that is scored for
-    motion alone.
+    points: (n, 3) m, the network's input; when read, all points that the dataset holds, at their stored precision;
+    crop_box: the box that `points` were cropped with, or the dataset's own box if nothing was cropped, None if there is
+    neither; shard, row: position in the dataset; condition, poses, family: as in lidarpose-bench, "" elsewhere; moving:
+    a frame of a clip that is scored for acceleration only.
     """
 
     sample: LabeledSample
@@ -85,12 +87,12 @@ class EvalSample:
 
     @property
     def info(self) -> PersonInfo:
-        """What is known of a synthetic person, of others nothing."""
+        """Attributes of a synthetic person; empty for real people."""
         return self.sample.info or PersonInfo()
 
     @property
     def plain(self) -> bool:
-        """Upright, whole and uncluttered, of 100 points and more."""
+        """Upright, whole and uncluttered, with at least 100 points."""
         info = self.info
         has_enough_points = len(self.sample.points) >= PLAIN_POINTS
         return has_enough_points and bool(is_plain(bool(info.upright), info.visible, info.clutter))
@@ -98,12 +100,13 @@ class EvalSample:
 
 @dataclass(frozen=True, kw_only=True)
 class EvalDataset:
-    """A dataset, opened.
+    """An open dataset.
 
     name; kind: the raw dataset's name, "synth" or "bench"; skeleton of the joints; scored: the joints that are scored
-    by default; split: name or "none"; split_source: of the split, "" where there is none; leaks, in words; settings: of
-    the dataset's card; count: people to score, of `total`; limit as asked for, None where it takes nobody away;
-    clusters: people of one `sequence` are not independent; skipped: of the last iteration.
+    by default; split: name or "none"; split_source: origin of the split, "" without one; leaks: how the split leaks, in
+    words; settings: of the dataset's card; count: number of people to score, out of `total`; limit: as given, None if
+    it excludes no person; clusters: people of one `sequence` are not independent; skipped: people and shards skipped in
+    the last iteration.
     """
 
     name: str
@@ -128,11 +131,15 @@ class EvalDataset:
 
 
 def open_eval_dataset(dataset: str | PathLike, *, split: str | None = None, limit: int | None = None) -> EvalDataset:
-    """A dataset's people: those of `split`, "all" for everybody; None: test, else val, else everybody where there is no
-    split. limit: only so many, evenly spread.
+    """Opens a dataset's people for evaluation.
+
+    Args:
+        dataset: "bench", "bench-2" or the path of a folder.
+        split: the split to score, "all" for all people. None: test, else val, else all people if there are no splits.
+        limit: score only this many people, evenly spread.
 
     Raises:
-        InputError: for what is no dataset, a split that nobody is in, missing shards, and where all are damaged.
+        InputError: not a dataset, a split without people, a missing shard, or all shards damaged.
         MissingExtra: without pyarrow.
     """
     if limit is not None:
@@ -145,13 +152,15 @@ def open_eval_dataset(dataset: str | PathLike, *, split: str | None = None, limi
 
 
 def count_skipped(skipped: Skipped, reason: str, where: object, count: int = 1) -> None:
-    """Counts somebody or something left out."""
+    """Counts `count` skipped people or shards under a reason; `where` is stored for the first one."""
     skipped.setdefault(reason, {"count": 0, "first": str(where)})["count"] += count
 
 
 def evenly_drawn(total: int, limit: int | None) -> np.ndarray:
-    """Indices of `limit` of `total` people, one of each equal share; of everybody without a limit. Drawn, always alike:
-    equal steps would fall in step with the order of a dataset, as with the sensors of a bench."""
+    """Indices of `limit` of `total` people, one drawn from each of `limit` equal parts; all indices without a limit.
+
+    The seed is fixed. Equal steps could match a period in the order of a dataset, such as the sensors of a bench.
+    """
     count = total if limit is None else min(limit, total)
     edges = np.arange(count + 1) * total // max(count, 1)
     return np.random.default_rng(0).integers(edges[:-1], edges[1:])
@@ -202,8 +211,10 @@ def _open_folder(folder: Path, split: str | None, limit: int | None) -> EvalData
 
 
 def _stored_rows(dataset: DatasetReader, damaged_shards: Skipped) -> pd.DataFrame:
-    """(shard, row, split) of everybody stored. Damaged shards are left out and counted; raises InputError for a missing
-    one, and where all are damaged."""
+    """(shard, row, split) of every stored person. Damaged shards are skipped and counted.
+
+    Raises InputError if a shard is missing or all are damaged.
+    """
     card, rows = dataset.card, []
     for shard in range(card.shards):
         path = dataset.path(shard)
@@ -233,7 +244,7 @@ def _read_folder(
     for shard, rows in people.groupby("shard")["row"]:
         path = dataset.path(shard)
         try:
-            # a shard that turns out to be damaged half way is left out as a whole
+            # read the whole shard first: if it turns out to be damaged half way, none of it is used
             stored_rows = list(read_rows(path, dataset.card.people))
         except InputError as error:
             count_skipped(skipped, "damaged shards", error)
@@ -248,12 +259,12 @@ def _read_folder(
                 yield EvalSample(sample=sample, points=sample.points, shard=int(shard), row=int(row))
 
 
-# ---- the set that ships
+# ---- the sets that ship with the package
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """lidarpose-bench in memory. points: one (n, 3) float64 m a row, in the level frame at the sensor; joints
+    """lidarpose-bench in memory. points: one (n, 3) float64 m per row, in the level frame at the sensor; joints
     (N, 26, 3) m; columns: the others by name, (N,) or (N, k)."""
 
     points: tuple[np.ndarray, ...]
@@ -262,7 +273,7 @@ class Bench:
 
     @property
     def people(self) -> np.ndarray:
-        """Rows of people alone."""
+        """Rows of people that are not frames of a clip."""
         return np.flatnonzero(self.columns["person"] & (self.columns["clip"] < 0))
 
     @property
@@ -272,18 +283,18 @@ class Bench:
 
     @property
     def clips(self) -> list[np.ndarray]:
-        """Rows of each clip, in order of time."""
+        """Rows of each clip, in time order."""
         clip = self.columns["clip"]
         return [np.flatnonzero(clip == k) for k in range(int(clip.max(initial=-1)) + 1)]
 
 
 def bench_path(which: str = BENCH) -> Path:
-    """Where the package keeps the file of a name of `BENCHES`."""
+    """Path of the packaged file of a key of `BENCHES`."""
     return Path(str(resources.files("lidarpose.eval") / "assets" / f"{BENCHES[which].name}.parquet"))
 
 
 def load_bench(which: str = BENCH) -> Bench:
-    """The set of a name of `BENCHES`. Raises InputError where the file is not the one that was frozen, MissingExtra
+    """Loads a set by its key in `BENCHES`. Raises InputError if the file differs from the frozen one, MissingExtra
     without pyarrow."""
     pa, parquet = pyarrow()
     path, (name, sha256) = bench_path(which), BENCHES[which]
@@ -296,7 +307,7 @@ def load_bench(which: str = BENCH) -> Bench:
     pairs = zip(columns["origin"], columns.pop("points_mm"), strict=True)
     points = tuple(origin + millimeters.reshape(-1, 3) / 1e3 for origin, millimeters in pairs)
     columns["num_points"] = np.array([len(cloud) for cloud in points])
-    # of bench 1 all are people, of no family
+    # bench 1 holds only people, and has no families
     defaults = {
         "person": np.ones(len(points), bool),
         "others": np.zeros(len(points), int),
@@ -308,7 +319,7 @@ def load_bench(which: str = BENCH) -> Bench:
 
 
 def _open_bench(key: str, split: str | None, limit: int | None) -> EvalDataset:
-    """lidarpose-bench: its people alone, and without a limit the frames of its clips for motion."""
+    """lidarpose-bench: its single people and, without a limit, the frames of its clips for the acceleration error."""
     name = BENCHES[key].name
     if split not in (None, EVERYBODY):
         raise InputError(f"{name} is one test set without splits, got {split!r}: leave split out")
@@ -352,7 +363,7 @@ def _bench_sample(bench: Bench, row: int) -> EvalSample:
 
 
 def facing(joints: np.ndarray, skeleton: Skeleton = BODY26) -> np.ndarray:
-    """joints (N, J, 3) m -> (N,) rad: the direction that hips and shoulders face, from above."""
+    """joints (N, J, 3) m -> (N,) rad: the yaw of the direction that hips and shoulders face, seen from above."""
     joint_index = skeleton.index
     left = joints[:, joint_index("left_hip")] - joints[:, joint_index("right_hip")]
     left = left + joints[:, joint_index("left_shoulder")] - joints[:, joint_index("right_shoulder")]
@@ -360,8 +371,11 @@ def facing(joints: np.ndarray, skeleton: Skeleton = BODY26) -> np.ndarray:
 
 
 def mean_poses(bench: Bench) -> dict[str, np.ndarray]:
-    """Baselines that know no points: joints (N, 26, 3) m of the mean skeleton about the points' center, turned to the
-    true facing ("mean pose, true facing") and not turned at all ("mean pose"). The means are over this set's people."""
+    """Baselines that use only the center of the points: joints (N, 26, 3) m of the mean skeleton about that center.
+
+    "mean pose, true facing" is rotated to the true facing, "mean pose" is not rotated. The means are over this set's
+    people.
+    """
     clouds = zip(bench.points, bench.columns["origin"], strict=True)
     center = np.stack([center_of(points) if len(points) else origin for points, origin in clouds])
     offset = bench.joints - center[:, None]

@@ -1,7 +1,7 @@
-"""Predictions -> rows of metrics: for each metric and each group of people or joints its mean and interval.
+"""Predictions -> rows of metrics: the mean and interval of each metric for each group of people or joints.
 
-Everything that scores.json says can be computed again from poses.parquet. A row's interval is drawn with a generator of
-its own name, so that no row depends on what else is reported. How to add a metric: CONTRIBUTING.md.
+Everything in scores.json can be recomputed from poses.parquet. The random generator of a row's interval is seeded with
+the row's name, so no row depends on which other rows are reported. How to add a metric: CONTRIBUTING.md.
 """
 
 import zlib
@@ -20,24 +20,24 @@ from lidarpose.eval.predictions import Predictions
 from lidarpose.eval.scores import RELEASED, MetricRow, Setting, number
 from lidarpose.sample import CONFIDENCE_RADIUS, FEWEST_OF_SECOND, HIDDEN, SEEN, UNLABELED
 
-# people of fewer points often do not tell where they face, those of fewer than `FEW` hardly ever
+# with fewer points than PLENTY the facing is often ambiguous, with fewer than FEW nearly always
 PLENTY, FEW = 100, 20
 _REPEATS = 1000
-# frames count as evenly apart where two steps differ by less than this share
+# frames count as evenly spaced if two steps differ by less than this fraction
 _EVEN = 0.2
-# joints of each half of the body, without their sides. Source: Haque et al. 2016, whose torso is in neither
+# joints of each half of the body, without sides. Source: Haque et al. 2016, where the torso is in neither
 ITOP_HALVES = {
     "upper": ("head_center", "neck", "shoulder", "elbow", "hand"),
     "lower": ("hip", "knee", "foot"),
 }
 
 
-# ---- what is computed
+# ---- metrics
 
 
 def facing_flipped(predictions: Predictions) -> np.ndarray:
-    """(N,) percent: 100 where the predicted person faces over 90 degrees away from the true one, by hips and shoulders
-    seen from above, else 0; NaN where these are not labeled or there is no pose."""
+    """(N,) percent: 100 if the predicted facing, by hips and shoulders seen from above, is more than 90 degrees off the
+    true one, else 0; NaN if these joints are not labeled or there is no pose."""
     skeleton = predictions.skeleton
     names = [(f"left_{joint}", f"right_{joint}") for joint in ("hip", "shoulder")]
     pairs = np.array(
@@ -74,8 +74,8 @@ def _box_size(p: Predictions) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric that is a mean over people or joints. values: Predictions -> (N, J) or (N,), NaN: nothing to score;
-    sections: where it is reported, see `_groups`."""
+    """A metric that is a mean over people or joints. values: Predictions -> (N, J) or (N,), NaN where there is nothing
+    to score; sections: where it is reported, see `_groups`; average: see `mean`."""
 
     values: Callable[[Predictions], np.ndarray]
     unit: str
@@ -100,8 +100,8 @@ METRICS = {
 
 
 def _pem(p: Predictions, setting: Setting) -> Score | None:
-    """People are predicted in their own labeled boxes, so nobody is made up; who has no pose is missed. Labels that
-    are hidden do not count, as in Waymo's rules."""
+    """Waymo's PEM. People are predicted in their own labeled boxes, so there are no false positives; people without a
+    pose are missed. Hidden labels do not count, as in Waymo's rules."""
     if not _has_waymo_boxes(p, setting):
         return None
     frames: dict[tuple, list[int]] = {}
@@ -116,7 +116,7 @@ def _pem(p: Predictions, setting: Setting) -> Score | None:
 
 
 def _of_confidence(p: Predictions, setting: Setting, metric: Callable) -> Score | None:
-    """Confidence against hits, over all labeled joints at once; None where it cannot be ranked or is not stated."""
+    """Confidence against hits, pooled over all labeled joints; None if there is none or it cannot be ranked."""
     error = p.errors()
     is_stated = ~np.isnan(error) & ~np.isnan(p.confidence)
     is_hit = error[is_stated] < 1e3 * CONFIDENCE_RADIUS
@@ -128,7 +128,7 @@ def _of_confidence(p: Predictions, setting: Setting, metric: Callable) -> Score 
 
 
 def _p95(p: Predictions, setting: Setting) -> Score | None:
-    """The 95th percentile of people's mean errors."""
+    """The 95th percentile of the people's mean errors."""
     error = p.errors()
     is_labeled = ~np.isnan(error)
     has_label = is_labeled.any(1)
@@ -138,7 +138,7 @@ def _p95(p: Predictions, setting: Setting) -> Score | None:
     return Score(value, people=has_label.sum(), joints=is_labeled.sum(), skipped=(p.posed & ~has_label).sum())
 
 
-# metrics of everybody at once, without an interval: (Predictions, Setting) -> Score or None, unit
+# metrics that pool all people, without an interval: (Predictions, Setting) -> Score or None, unit
 SUMMARIES: dict[str, tuple[Callable[[Predictions, Setting], Score | None], str]] = {
     "pem": (_pem, "mm"),
     "mpjpe_p95": (_p95, "mm"),
@@ -147,11 +147,11 @@ SUMMARIES: dict[str, tuple[Callable[[Predictions, Setting], Score | None], str]]
 }
 
 
-# ---- of whom
+# ---- groups of people and joints
 
 
 def _groups(section: str, p: Predictions, setting: Setting) -> Iterator[tuple[str, str, np.ndarray, np.ndarray | None]]:
-    """(group, of, rows (N,) bool, joint indices or None for all) of a section of the report."""
+    """Yields (group, of, rows (N,) bool, joint indices or None for all) of a section of the report."""
     all_rows = np.ones(len(p), bool)
     if section == "all":
         yield "all", "all", all_rows, None
@@ -190,7 +190,7 @@ def _groups(section: str, p: Predictions, setting: Setting) -> Iterator[tuple[st
 
 
 def _has_waymo_boxes(p: Predictions, setting: Setting) -> bool:
-    """Whether Waymo's own metrics apply: somebody has a labeled box, and each joint has a sigma."""
+    """Whether Waymo's own metrics apply: there are labeled boxes, and each joint has a sigma."""
     try:
         keypoints.oks_sigmas(p.skeleton)
     except InputError:
@@ -199,8 +199,8 @@ def _has_waymo_boxes(p: Predictions, setting: Setting) -> bool:
 
 
 def hidden_share(labels: np.ndarray) -> np.ndarray:
-    """labels (n, J) -> (n,): the share of each person's labeled joints that are hidden; NaN where nobody's joint is
-    labeled so, since then nothing was said about it."""
+    """labels (n, J) -> (n,): the share of each person's labeled joints that are hidden; all NaN if no joint at all is
+    labeled as hidden, since such labels do not record occlusion."""
     if not (labels == HIDDEN).any():
         return np.full(len(labels), np.nan)
     count = (labels != UNLABELED).sum(1)
@@ -211,7 +211,7 @@ def hidden_share(labels: np.ndarray) -> np.ndarray:
 
 
 def metric_rows(predictions: Predictions, setting: Setting, *, dapt_compat: bool = False) -> tuple[MetricRow, ...]:
-    """The rows of a dataset's people; dapt_compat: also with the released code's arithmetic."""
+    """The rows of a dataset's people; dapt_compat: also rows with the released code's arithmetic."""
     people = predictions.select(~predictions.moving)
     rows = [*_mean_rows(people, setting, ("all", "dense", "joints", "conditions", "spans", "boxes", "itop"))]
     for name, (summary, unit) in SUMMARIES.items():
@@ -222,7 +222,7 @@ def metric_rows(predictions: Predictions, setting: Setting, *, dapt_compat: bool
 
 
 def baseline_rows(predictions: Predictions, setting: Setting) -> tuple[MetricRow, ...]:
-    """What is reported of a baseline: over everybody, and MPJPE by condition."""
+    """The rows of a baseline: over all people, and MPJPE by condition."""
     people = predictions.select(~predictions.moving)
     by_condition = _mean_rows(people, setting, ("conditions",), metrics=("mpjpe",))
     return (*_mean_rows(people, setting, ("all", "dense")), *by_condition)
@@ -247,7 +247,7 @@ def _mean_rows(
 def _mean_row(
     table: np.ndarray, setting: Setting, figure: str, metric: Metric, group: str, of: str, *, clusters=None, no_pose=0
 ) -> MetricRow:
-    """The mean of a table (n, J) or (n,) as a row, with its interval: see `Interval.stated`."""
+    """The mean of a table (n, J) or (n,) as a row, with its interval, see `Interval.stated`."""
     name = f"{setting.method}/{figure}/{group}/{of}"
     rng = np.random.default_rng([setting.seed, zlib.crc32(name.encode())])
     low, high = aggregate.interval(table, rng, metric.average, clusters=clusters, repeats=_REPEATS).stated
@@ -259,19 +259,19 @@ def _mean_row(
 def _row(
     score: Score, setting: Setting, figure: str, *, group: str = "all", of: str = "all", **other_fields: Any
 ) -> MetricRow:
-    """A row of a score; other_fields: of `MetricRow`."""
+    """A score as a row; other_fields: of `MetricRow`."""
     counts: dict[str, Any] = {name: int(getattr(score, name)) for name in ("people", "joints", "skipped")}
     setting_values = {name: getattr(setting, name) for name in ("method", "protocol", "centring", "split", "limit")}
     return MetricRow(figure=figure, group=group, of=of, value=number(score), **counts | setting_values | other_fields)
 
 
 def _dapt_compat_rows(p: Predictions, setting: Setting) -> Iterator[MetricRow]:
-    """The released code's arithmetic on people with a pose; see docs/evaluate.md for what differs."""
+    """The released code's arithmetic on people with a pose; docs/evaluate.md lists the differences."""
     posed_people = p.select(p.posed)
     if not len(posed_people):
         return
     tables = {name: METRICS[name].values(posed_people) for name in ("mpjpe", "pck3", "pck5")}
-    # its alignment takes every joint, so it has none where a joint is not labeled
+    # its alignment uses all joints, so it is undefined if a joint is not labeled
     if not np.isnan(posed_people.true).any():
         tables["pa_mpjpe"] = aligned_errors(posed_people.pred, posed_people.true, dapt_compat=True)
     for metric, table in tables.items():
@@ -285,20 +285,20 @@ def _dapt_compat_rows(p: Predictions, setting: Setting) -> Iterator[MetricRow]:
                 yield _row(score, setting, metric, group=group, of=name, **options)
 
 
-# ---- persons
+# ---- person probabilities
 
 
 def person_rows(p: Predictions, objects: np.ndarray, others: np.ndarray, setting: Setting) -> Iterator[MetricRow]:
-    """How well a network that says so tells crops of people from those of objects, and of two people from those of one.
+    """AUROC of a network's person probabilities: crops of people against objects, and of two people against one.
 
     Args:
         p: people.
-        objects: (K,) what it says of the objects, the probability of a person.
-        others: (N,) how many points are a second person's; with a few it is neither there nor not.
+        objects: (K,) the predicted probability of a person for each object.
+        others: (N,) number of points on a second person; crops with only a few such points are left out.
     """
     is_clear = (others == 0) | (others >= FEWEST_OF_SECOND)
     rankings = {
-        # who has no pose is not taken for a person
+        # a crop without a pose counts as a prediction of no person
         "person_auroc": (
             np.append(np.where(p.posed, p.person, 0), objects).astype(np.float32),
             np.arange(len(p) + len(objects)) < len(p),
@@ -316,7 +316,7 @@ def person_rows(p: Predictions, objects: np.ndarray, others: np.ndarray, setting
 
 
 def triples(p: Predictions) -> np.ndarray:
-    """(T, 3) rows: frames of one person in one sequence, each with a pose, that follow each other evenly."""
+    """(T, 3) rows: three successive, evenly spaced frames of one person in one sequence, each with a pose."""
     tracks = [f"{sequence}\0{track}" for sequence, track in zip(p.sequence, p.track, strict=True)]
     _, owner = np.unique(tracks, return_inverse=True)
     order = np.lexsort((p.frame, owner))
@@ -325,13 +325,13 @@ def triples(p: Predictions) -> np.ndarray:
     rows = np.stack([order[:-2], order[1:-1], order[2:]], 1)
     first_step, second_step = np.diff(p.time[rows], axis=1).T
     with np.errstate(invalid="ignore"):
-        # of one person: a step from one track's end to the next one's beginning is nobody's
+        # a step from the end of one track to the beginning of the next is excluded
         is_even = (
             (owner[rows] == owner[rows[:, :1]]).all(1)
             & (first_step > 0)
             & (np.abs(second_step - first_step) < _EVEN * first_step)
         )
-        # the sequence's own step: not one that skips frames
+        # the step must be the shortest one of the track, so that no frame is skipped
         step = np.full(int(owner.max()) + 1, np.inf)
         np.minimum.at(step, owner[rows[is_even, 0]], first_step[is_even])
         is_even &= first_step < (1 + _EVEN) * step[owner[rows[:, 0]]]
@@ -339,8 +339,8 @@ def triples(p: Predictions) -> np.ndarray:
 
 
 def _acceleration(p: Predictions, setting: Setting) -> Iterator[MetricRow]:
-    """Acceleration error over all triples of frames that follow each other, in mm a frame squared."""
-    # people evenly picked out of sequences do not follow each other
+    """Acceleration error over all triples of successive frames, in mm per frame squared."""
+    # people drawn by a limit are not successive frames
     rows = triples(p) if setting.limit is None else np.empty((0, 3), int)
     if len(rows):
         table = acceleration_errors(p.filled[rows], p.true[rows], 1.0, p.labeled[rows])

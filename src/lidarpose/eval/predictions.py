@@ -1,23 +1,24 @@
-"""What was predicted of a dataset's people, beside the truth, as arrays; and as poses.parquet, from which every metric
-can be computed again.
+"""Predictions for a dataset's people beside the ground truth, as arrays and as poses.parquet, from which every metric
+can be recomputed.
 
 A row is one person in one frame; columns:
 
     dataset             name, as in scores.json
-    shard, row          where in the dataset
+    shard, row          position in the dataset
     sequence, frame, track, time        s, NaN where unknown
-    sensor, condition, poses, family, plain     what synthetic sets tell; "" where nothing is known
-    moving              a frame of a clip that counts for acceleration alone
-    points              how many points the network was given
+    sensor, condition, poses, family, plain     known for synthetic sets; "" where unknown
+    moving              a frame of a clip that counts for the acceleration error only
+    points              number of points that the network was given
     distance            m from the sensor, NaN where unknown
-    hidden              share of the body that is hidden, of synthetic people; else NaN, labels may tell
-    box                 center (3), size (3), yaw of the box before any jitter: m, rad; null where there is none
-    pred, true          x, y, z of the joints that the file's metadata names, m, in the dataset's frame; pred null
+    hidden              share of the body that is hidden, for synthetic people; else NaN, but labels may record it
+    box                 center (3), size (3), yaw of the box before any jitter: m, rad; null without a box
+    pred, true          x, y, z of the joints that the file's metadata names, m, in the dataset's frame; pred is null
                         without a pose, true NaN without a label
-    labels              one a joint: 0 not labeled, 1 hidden or uncertain, 2 seen
-    confidence, spread, visible         one a joint, null where the network does not tell; spread in m
-    person, second_person               probabilities that the cloud shows one, NaN where the network does not tell
-    error_mm            one a joint, NaN where there is nothing to score
+    labels              one per joint: 0 not labeled, 1 hidden or uncertain, 2 seen
+    confidence, spread, visible         one per joint, null if the network does not predict it; spread in m
+    person, second_person               probability that the cloud shows a person, and a second person; NaN if the
+                        network does not predict it
+    error_mm            one per joint, NaN where there is nothing to score
 """
 
 import json
@@ -40,15 +41,15 @@ METADATA = "lidarpose.poses"
 
 
 def _column(kind: type, *shape: int, null: bool = False) -> Any:
-    """A column: type; shape of one person's values, -1 for J; whether NaN all over is null in the file."""
+    """A column: type; shape of one person's values, -1 for J; whether a value that is all NaN is null in the file."""
     return field(metadata={"kind": kind, "shape": shape, "null": null})
 
 
 @dataclass(frozen=True, kw_only=True)
 class Predictions:
-    """N people in J joints, of `skeleton`. Columns as in poses.parquet: pred, true (N, J, 3) float32 m, pred NaN
-    without a pose; labels (N, J) uint8; confidence, spread, visible (N, J) float32, NaN where not stated; box (N, 7),
-    NaN where there is none; the others (N,)."""
+    """N people with the J joints of `skeleton`. Columns as in poses.parquet: pred, true (N, J, 3) float32 m, pred NaN
+    without a pose; labels (N, J) uint8; confidence, spread, visible (N, J) float32, NaN if not predicted; box (N, 7),
+    NaN without a box; the others (N,)."""
 
     skeleton: Skeleton
     shard: np.ndarray = _column(np.int32)
@@ -81,17 +82,17 @@ class Predictions:
 
     @property
     def posed(self) -> np.ndarray:
-        """(N,) bool: has a pose."""
+        """(N,) bool: people with a pose."""
         return np.isfinite(self.pred).all((1, 2))
 
     @property
     def boxed(self) -> np.ndarray:
-        """(N,) bool: has a box."""
+        """(N,) bool: people with a box."""
         return np.isfinite(self.box).all(1)
 
     @property
     def labeled(self) -> np.ndarray:
-        """(N, J) bool: a joint that counts, hidden or seen, of a person with a pose."""
+        """(N, J) bool: joints to score, labeled as hidden or seen, of people with a pose."""
         return (self.labels != UNLABELED) & self.posed[:, None]
 
     # the name until 0.2
@@ -99,7 +100,7 @@ class Predictions:
 
     @property
     def filled(self) -> np.ndarray:
-        """(N, J, 3): pred, 0 without a pose; such people have no labeled joints."""
+        """(N, J, 3): pred, with 0 for people without a pose, none of whose joints count as labeled."""
         return np.where(self.posed[:, None, None], self.pred, 0)
 
     def errors(self) -> np.ndarray:
@@ -107,7 +108,7 @@ class Predictions:
         return joint_errors(self.filled, self.true, self.labeled)
 
     def select(self, rows: np.ndarray) -> "Predictions":
-        """Some of the people."""
+        """The people in `rows`."""
         return replace(self, **{column.name: getattr(self, column.name)[rows] for column in _COLUMNS})
 
     # the name until 0.2
@@ -118,8 +119,8 @@ _COLUMNS = [column for column in fields(Predictions) if column.metadata]
 
 
 def stack(skeleton: Skeleton, rows: Sequence[dict[str, Any]]) -> Predictions:
-    """Predictions from a dict a person, whose keys are the columns' names; None or nothing where the file
-    would have null; numbers become as wide as in the file."""
+    """Predictions from one dict per person, with the columns' names as keys. A value that is None or missing is null;
+    numbers get the precision of the file."""
     columns: dict[str, np.ndarray] = {}
     for column in _COLUMNS:
         name, kind = column.name, column.metadata["kind"]
@@ -127,14 +128,14 @@ def stack(skeleton: Skeleton, rows: Sequence[dict[str, Any]]) -> Predictions:
         if column.metadata["null"]:
             values = [np.full(shape, np.nan) if row.get(name) is None else np.reshape(row[name], shape) for row in rows]
         else:
-            # files of before 0.3 have no families
+            # files written before 0.3 have no families
             values = [row.get(name, "") if name == "family" else row[name] for row in rows]
         columns[name] = np.array(values, kind).reshape(len(rows), *shape)
     return Predictions(skeleton=skeleton, **columns)
 
 
 def concatenate(parts: Sequence[Predictions]) -> Predictions:
-    """One or more predictions of the same joints as one."""
+    """Joins one or more predictions of the same joints."""
     columns: dict[str, Any] = {
         column.name: np.concatenate([getattr(part, column.name) for part in parts]) for column in _COLUMNS
     }
@@ -145,7 +146,7 @@ def concatenate(parts: Sequence[Predictions]) -> Predictions:
 
 
 def poses_parquet(predictions: dict[str, Predictions]) -> bytes:
-    """poses.parquet: people of all datasets by their names."""
+    """The bytes of poses.parquet. predictions: name of a dataset -> its people."""
     pa, parquet = pyarrow()
     types = [("dataset", pa.string())]
     for column in _COLUMNS:
@@ -180,7 +181,7 @@ def poses_parquet(predictions: dict[str, Predictions]) -> bytes:
 
 
 def read_poses(path: str | Path) -> dict[str, Predictions]:
-    """The people of poses.parquet by dataset. Raises InputError where it is none, MissingExtra without pyarrow."""
+    """The people of poses.parquet by dataset. Raises InputError for another file, MissingExtra without pyarrow."""
     pa, parquet = pyarrow()
     data = read_bytes(path, expected="poses.parquet of an evaluation")
     try:

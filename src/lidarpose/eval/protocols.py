@@ -1,9 +1,9 @@
-"""A network before a dataset, under one of two protocols, whose scores are not comparable: how a person is cut out and
-centered before the network sees them.
+"""Runs a network on a dataset under one of two protocols, whose scores are not comparable. A protocol defines how a
+person is cropped and centered before the network sees the points.
 
-clean   what a user has: the crop is a detector's box (the labeled one, displaced, see `jittered`), the center comes
-        from the points alone, and no sequence is in both training and test
-dapt    what the paper's released code does: crop and center from the labels, one pass, its splits
+clean   what a user has: the crop is a detector's box (the labeled box, displaced, see `jittered`), the center is
+        computed from the points alone, and no sequence is in both training and test
+dapt    what the paper's released code does: crop and center from the labels, a single pass, its splits
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -25,17 +25,17 @@ from lidarpose.skeleton import skeleton as skeleton_of
 
 PROTOCOLS = ("clean", "dapt")
 
-# standard deviations of a detector's errors, each cut at twice itself: of the center along x and y, and along z, m; of
-# the logarithm of each edge; of the yaw, rad
+# standard deviations of a detector's errors, each clipped at twice its value: of the center along x and y, and along z,
+# m; of the logarithm of each edge; of the yaw, rad
 CENTER_SIGMA, HEIGHT_SIGMA, SIZE_SIGMA, YAW_SIGMA = 0.1, 0.05, 0.05, 0.1
 _CUT = 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class DaptProtocol:
-    """What the released code does with a dataset: center, the name in `LabeledSample.centers`; centring, the same in
-    words; crop in words; split: the name that prepare must have split by; least: points of people whom it scores;
-    without: joints that it leaves out of its means."""
+    """What the released code does with a dataset: center, the key in `LabeledSample.centers`; centring, the same in
+    words; crop in words; split: the name that `prepare` must have split by; least: minimum number of points of a person
+    that it scores; without: joints that it leaves out of its means."""
 
     center: str
     centring: str
@@ -65,18 +65,18 @@ _CLEAN_CROPS = {
     "synth": "the set's own detector's box",
 }
 _UNBOXED = f"{_SEGMENTED}: there is no box, so none could be displaced"
-# sets whose crops are a detector's already
+# sets whose crops are already a detector's
 _OWN_CROP = ("bench", "synth")
 
 
-# how much larger than the labeled joints the released box of HumanM3 is
+# size of the released code's box for HumanM3, as a multiple of the extent of the labeled joints
 _ROOM = 1.25
-# of a box, m
+# minimum edge of that box, m
 _LEAST_EDGE = 1e-6
 
 
 def check_protocol(protocol: str, dataset: EvalDataset) -> None:
-    """Raises InputError, one line, where the dataset cannot be scored by the protocol."""
+    """Raises InputError, one line, if the dataset cannot be scored under the protocol."""
     check_name("protocol", protocol, PROTOCOLS)
     name, kind, split_by = dataset.name, dataset.kind, dataset.settings.get("split_by")
     if protocol == "clean":
@@ -100,8 +100,8 @@ def check_protocol(protocol: str, dataset: EvalDataset) -> None:
 
 
 def jittered(box: Box, rng: np.random.Generator) -> Box:
-    """The box as a detector might have drawn it: its center off by 10 cm (5 cm in height), its edges by 5 %, its yaw by
-    0.1 rad, standard deviations of normal errors cut at twice that."""
+    """The box with a detector's errors: its center off by 10 cm (5 cm in height), its edges by 5 %, its yaw by 0.1 rad.
+    These are standard deviations of normal errors, clipped at twice that."""
     step = np.clip(rng.standard_normal(7), -_CUT, _CUT)
     shift = step[:3] * [CENTER_SIGMA, CENTER_SIGMA, HEIGHT_SIGMA]
     return replace(
@@ -115,10 +115,12 @@ def jittered(box: Box, rng: np.random.Generator) -> Box:
 def released_view(
     points: np.ndarray, joints: np.ndarray, centers: dict[str, np.ndarray], box: Box | None
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """points (n, 3) m, joints (J, 3) m, NaN without a label -> (n,) bool of what is inside, and the center (3,) m.
+    """points (n, 3) m, joints (J, 3) m, NaN without a label -> (n,) bool of the points in the crop, and the center
+    (3,) m.
 
-    "trans" (LiDARHuman26M, SLOPER4D): all points, about SMPL's translation; "joints_box" (HumanM3): an upright box of
-    1.25 times the joints' extent; "box" (Waymo): the labeled box. All true and None for a dataset with none of these.
+    "trans" (LiDARHuman26M, SLOPER4D): all points, centered on SMPL's translation; "joints_box" (HumanM3): an
+    axis-aligned box of 1.25 times the joints' extent; "box" (Waymo): the labeled box. For a dataset with none of these
+    all points, and None.
     """
     center = next((centers[name] for name in ("trans", "joints_box", "box") if name in centers), None)
     crop = None if center is None or "trans" in centers else released_box(joints, centers, box)
@@ -126,19 +128,19 @@ def released_view(
 
 
 def released_box(joints: np.ndarray, centers: dict[str, np.ndarray], box: Box | None) -> Box | None:
-    """The box that `released_view` crops by; where it crops nothing, the dataset's own, if any."""
+    """The box that `released_view` crops with; if it does not crop, the dataset's own box, if any."""
     if "trans" in centers or "joints_box" not in centers:
         return box
     low, high = np.nanmin(joints, 0), np.nanmax(joints, 0)
-    # of a single labeled joint too
+    # the minimum is for a single labeled joint
     return Box(center=(low + high) / 2, size=np.maximum(_ROOM * (high - low), _LEAST_EDGE))
 
 
 class Model(Protocol):
-    """What is evaluated: `lidarpose.Predictor`, or anything with joints `skeleton` and with `predict`, whose answers
-    have a `pose` each, None or a `Pose` of that skeleton. model: what scores.json says of it, by default its class's
-    name. The protocol dapt also needs `outputs` and `backend`. A network of clips, whose backend has `frames`, also
-    takes `predict(clips=)` and `outputs(clip=)`."""
+    """The model to evaluate: `lidarpose.Predictor`, or any object with the joints `skeleton` and with `predict`, whose
+    results have a `pose` each, None or a `Pose` of that skeleton. model: its description in scores.json, by default its
+    class's name. The protocol dapt also needs `outputs` and `backend`. A network of clips, whose backend has `frames`,
+    also takes `predict(clips=)` and `outputs(clip=)`."""
 
     skeleton: Skeleton
     model: dict[str, Any]
@@ -151,7 +153,7 @@ class Model(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class EvalSetup:
-    """A network before a dataset, checked: see `eval_setup`. joints: those that are scored."""
+    """A network and a dataset, checked: see `eval_setup`. joints: those that are scored."""
 
     model: Model
     dataset: EvalDataset
@@ -159,9 +161,11 @@ class EvalSetup:
     joints: Skeleton
 
     def crop(self, person: EvalSample) -> tuple[np.ndarray, Box | None]:
-        """The points that the protocol lets the network see, and the box they are cut out by: of the released code in
-        dapt, else a detector's, which depends on the seed and the person's place in the dataset alone; where nothing is
-        cut, the dataset's own, if any."""
+        """The points that the network gets under the protocol, and the box that they are cropped with.
+
+        Protocol dapt uses the released code's box, clean a detector's box, which depends only on the seed and the
+        person's position in the dataset. If nothing is cropped, the box is the dataset's own, if any.
+        """
         sample, setting = person.sample, self.setting
         if setting.protocol == "dapt":
             is_inside, _ = released_view(person.points, sample.joints, sample.centers, sample.box)
@@ -172,7 +176,7 @@ class EvalSetup:
         return person.points[box.contains(person.points)], box
 
     def crop_sample(self, person: EvalSample) -> tuple[EvalSample | None, str]:
-        """The person as the protocol shows them; or None, and why it leaves them out."""
+        """The person as cropped by the protocol; or None, and the reason for which the person is skipped."""
         kind, min_points = self.setting.kind, 0
         if self.setting.protocol == "dapt":
             center, min_points = DAPT[kind].center, DAPT[kind].least
@@ -186,7 +190,7 @@ class EvalSetup:
         return replace(person, points=points, crop_box=box), ""
 
     def predict(self, samples: Sequence[EvalSample]) -> Predictions:
-        """What is known of people as the protocol shows them, see `crop_sample`, and what the network answers."""
+        """Labels and predictions of people that were cropped by `crop_sample`."""
         answers: list[dict] = [{} for _ in samples]
         answer = self._predict_clean if self.setting.protocol == "clean" else self._predict_dapt
         is_single = self._frames == 1
@@ -204,7 +208,7 @@ class EvalSetup:
         clouds = [person.points for person in samples]
         model: Any = self.model
         name, clips = model.skeleton.name, self._clips(samples)
-        # all of them have one, or none; of the boxes that cut, not those that labels made
+        # in a call either all people have a box or none; these are the boxes that cropped, not boxes made from labels
         centers = [person.crop_box.center for person in samples if person.crop_box is not None]
         if hasattr(model, "predict_in") and not clips:
             box_centers = np.stack(centers) if centers else None
@@ -224,7 +228,7 @@ class EvalSetup:
             yield {} if person.pose is None else self._prediction_columns(person.pose, ())
 
     def _predict_dapt(self, samples: list[EvalSample], origin: np.ndarray | None) -> Iterator[dict]:
-        """One pass about the released code's center."""
+        """Predicts in one pass, centered as in the released code."""
         model: Any = self.model
         batch = model.backend.batch
         answers: dict[int, dict] = {}
@@ -246,22 +250,24 @@ class EvalSetup:
 
     @property
     def _frames(self) -> int:
-        """Of a clip of the network, 1 for a network of single frames."""
+        """Number of frames in a clip of the network, 1 for a network of single frames."""
         return getattr(getattr(self.model, "backend", None), "frames", 1)
 
     def can_split(self, samples: Sequence[EvalSample], person: EvalSample) -> bool:
-        """Whether the clips of these samples are the same without and with the person who comes next."""
+        """Whether `person`, who comes next, can start a new chunk without changing the clips of these samples."""
         sequence = person.sample.sequence
         if self._frames == 1 or self.dataset.limit is not None or samples[-1].sample.sequence != sequence:
             return True
         sequence_samples = [eval_sample.sample for eval_sample in samples if eval_sample.sample.sequence == sequence]
-        # a track's last run may go on
+        # the last run of a track may continue
         last_lengths = {sequence_samples[run[0]].track: len(run) for run in _runs(sequence_samples)}
         return all(length % self._frames == 0 for length in last_lengths.values())
 
     def _clips(self, samples: Sequence[EvalSample]) -> dict[str, Clips]:
-        """What a network of clips reads besides clouds: which people are frames that follow each other; of people who
-        are drawn from a dataset none, however few frames lie between them."""
+        """Additional input of a network of clips: which people are successive frames, and their surroundings.
+
+        With a limit, each person is a clip of their own, even if the frames drawn happen to be close to each other.
+        """
         if self._frames == 1:
             return {}
         labeled_samples = [person.sample for person in samples]
@@ -276,7 +282,7 @@ class EvalSetup:
         return {"clips": Clips(windows=np.concatenate([clip_windows(run) for run in runs]), **surroundings)}
 
     def _prediction_columns(self, estimates, index) -> dict:
-        """Of a pose, or of person `index` of many: the scored joints."""
+        """Columns of the scored joints of a pose, or of person `index` of many."""
         joint_indices = self.model.skeleton.map_to(self.joints)
         joint_values = {name: getattr(estimates, name) for name in ("confidence", "spread", "visible")}
         joint_values = {
@@ -312,8 +318,11 @@ def eval_setup(
     skeleton: str | None = None,
     sensor_unknown: bool = False,
 ) -> EvalSetup:
-    """Puts a network before a dataset. Raises InputError, one line, where the protocol does not fit the dataset, the
-    dataset lacks joints of the `skeleton` asked for, or it and the network have no joint in common."""
+    """Checks a network and a dataset for evaluation under a protocol.
+
+    Raises InputError, one line, if the protocol does not fit the dataset, the dataset lacks joints of the requested
+    `skeleton`, or it and the network have no joint in common.
+    """
     seed = check_int("seed", seed, least=0)
     check_protocol(protocol, dataset)
     if protocol == "dapt" and not (hasattr(model, "outputs") and hasattr(model, "backend")):
@@ -362,8 +371,8 @@ def eval_setup(
 
 
 def _subset(skeleton: Skeleton, joints: Sequence[str]) -> Skeleton:
-    """A skeleton of some joints of another, in its order; each hangs on the nearest of its ancestors that is left, or
-    on the first."""
+    """A skeleton of some joints of another, in its order. The parent of each is its nearest remaining ancestor, or else
+    the first joint."""
     if tuple(joints) == skeleton.joints:
         return skeleton
     parents: list[int] = []
@@ -376,5 +385,5 @@ def _subset(skeleton: Skeleton, joints: Sequence[str]) -> Skeleton:
 
 
 def _runs(samples: Sequence[LabeledSample]) -> list[np.ndarray]:
-    """Rows of each run of one person's frames that follow each other."""
+    """Rows of each run of one person's successive frames."""
     return consecutive([(sample.sequence, sample.track) for sample in samples], [sample.frame for sample in samples])

@@ -1,7 +1,7 @@
-"""The paper's stability study as curves, and what it left out: error against how much the points were perturbed.
+"""The paper's stability study as curves, extended: error against the amount by which the points are perturbed.
 
-Each amount is tried on the same people with the same random numbers, so a curve's points differ in the amount alone. To
-add a perturbation: write a pure function of (points, box, amount, rng) and add it to `PERTURBATIONS`.
+Each amount is applied to the same people with the same random numbers, so the points of a curve differ only in the
+amount. To add a perturbation: write a pure function of (points, box, amount, rng) and add it to `PERTURBATIONS`.
 """
 
 import json
@@ -24,26 +24,26 @@ from lidarpose.skeleton import BODY26
 from lidarpose.synth.noise import jitter, noise_cluster, random_keep
 
 SCHEMA = "lidarpose.stability/1"
-# people of a dataset that are perturbed, evenly spread, and people simulated anew for each sensor
+# number of people of a dataset that are perturbed, evenly spread, and of people simulated for each sensor
 PEOPLE, CAST = 1000, 200
-# the paper's statistics of end joints are of so many instances; of fewer people the worst share
+# the paper's statistics of end joints use this many instances; smaller sets use this share of their people
 WORST, WORST_SHARE = 600, 0.3
 ENDS = ("head", "wrists", "hands", "ankles", "feet")
-# of the bench these alone are perturbed: the others have something wrong already
+# condition of the only people of the bench that are perturbed: the others are already degraded
 _CLEAN = "clean"
 _REPEATS = 1000
-# sensors that people are simulated for, with few beams first; of a seed that no training uses, bench-2 does
+# sensors that people are simulated for, those with few beams first; the seed is used by no training, but by bench-2
 SENSORS = (
     *("vlp-16", "hdl-32e", "vlp-32c", "os1-64", "hdl-64e", "os1-128", "pandar64", "waymo-top", "av2"),
     *("livox-mid360", "livox-avia"),
 )
 _SEED = 720_000
 _DISTANCE = (4.0, 20.0)
-# of the paper's perturbations: two clusters, as in its released code
+# number of clusters in the paper's perturbation, as in its released code
 _CLUSTERS = 2
-# standard deviation of the jitter in units of its clip: of normal steps 4.6 % are cut
+# standard deviation of the jitter as a multiple of its clip: 4.6 % of normal steps are clipped
 _SIGMA = 0.5
-# what the points' own box has around them where a dataset has no box, m
+# margin of the box about the points for datasets without boxes, m
 _MARGIN = 0.05
 
 
@@ -51,18 +51,18 @@ _MARGIN = 0.05
 
 
 def with_clusters(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
-    """Two clusters of `amount` clutter points each about the person."""
+    """Adds two clusters of `amount` clutter points each around the person."""
     center = center_of(points)
-    # the places stay where they are while the clusters grow
+    # one generator per cluster: the positions of the clusters do not depend on the amount
     return np.concatenate([points, *(noise_cluster(center, count=int(amount), rng=r) for r in rng.spawn(_CLUSTERS))])
 
 
 def behind_an_edge(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
-    """All but what lies behind one straight edge of something opaque, which hides a share `amount` of the points: the
-    end of a wall, a parapet, a car. The edge is straight as seen from the origin and has any direction."""
+    """Removes a share `amount` of the points, those behind an opaque object with one straight edge: the end of a wall,
+    a parapet, a car. The edge is straight as seen from the origin and has a random direction."""
     angle = rng.uniform(0, 2 * np.pi)
     center = points.mean(0)
-    # seen from the sensor: to the left and up, as tangents of angles from the middle of the points
+    # coordinates as seen from the sensor: left and up, as tangents of the angles from the direction of the points' mean
     forward = np.array([center[0], center[1], 0]) / max(np.hypot(center[0], center[1]), 1e-6)
     depth = np.maximum(points @ forward, 1e-3)
     left = points @ np.array([-forward[1], forward[0], 0]) / depth
@@ -73,8 +73,8 @@ def behind_an_edge(points: np.ndarray, box: Box | None, amount: float, rng: np.r
 
 
 def moved_box(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> Box:
-    """The person's box moved by `amount` m in a level direction; without a box, that of the points with 5 cm of
-    room."""
+    """The person's box moved by `amount` m in a random horizontal direction; without a box, the points' bounding box
+    with a margin of 5 cm."""
     if box is None:
         low, high = points.min(0) - _MARGIN, points.max(0) + _MARGIN
         box = Box(center=(low + high) / 2, size=high - low)
@@ -83,8 +83,8 @@ def moved_box(points: np.ndarray, box: Box | None, amount: float, rng: np.random
 
 
 def out_of_level(points: np.ndarray, box: Box | None, amount: float, rng: np.random.Generator) -> np.ndarray:
-    """Everything turned by `amount` rad about a random level axis through the sensor, as if that were mounted askew and
-    took its own axis for up."""
+    """Rotates everything by `amount` rad about a random horizontal axis through the sensor, as if the sensor were
+    mounted at a tilt and its own axis were taken as up."""
     angle = rng.uniform(0, 2 * np.pi)
     R_tilted_level = axis_angle_to_matrix(amount * np.array([np.cos(angle), np.sin(angle), 0.0]))
     return points @ R_tilted_level.T
@@ -92,8 +92,8 @@ def out_of_level(points: np.ndarray, box: Box | None, amount: float, rng: np.ran
 
 @dataclass(frozen=True)
 class Perturbation:
-    """apply(points, box, amount, rng) -> points; title, with the unit of the amounts; amounts that a study tries;
-    says: what is done, in words; scale: amounts times this are printed; rigid: the whole frame is moved, labels too."""
+    """apply(points, box, amount, rng) -> points; title, with the unit of the amounts; amounts that a study applies;
+    says: a description in words; scale: amounts are printed times this; rigid: the whole frame moves, labels too."""
 
     apply: Callable[[np.ndarray, Box | None, float, np.random.Generator], np.ndarray]
     title: str
@@ -118,7 +118,7 @@ PERTURBATIONS = {
         scale=1,
     ),
     "dropped": Perturbation(
-        # what is dropped at one share is dropped at each larger one
+        # points dropped at one amount are also dropped at each larger one
         lambda points, box, amount, rng: points[random_keep(len(points), share=amount, rng=rng)],
         "points dropped, %",
         (0.25, 0.5, 0.75, 0.9, 0.95),
@@ -148,13 +148,14 @@ PERTURBATIONS = {
 }
 
 
-# ---- what a study says; the fields are the keys of stability.json
+# ---- results of a study; the fields are the keys of stability.json
 
 
 @dataclass(frozen=True, kw_only=True)
 class Point:
-    """One amount. mpjpe mm with its 95 % interval; increase over the unperturbed, mm, of those who have a pose in both,
-    with its paired interval; people, of whom no_pose have no answer; points: the median number of a person's points."""
+    """One amount. mpjpe mm with its 95 % interval; increase over the unperturbed points, mm, of people with a pose in
+    both cases, with its paired interval; people, of which no_pose have no pose; points: the median number of points per
+    person."""
 
     amount: float
     label: str
@@ -171,7 +172,7 @@ class Point:
 
 @dataclass(frozen=True, kw_only=True)
 class Curve:
-    """A perturbation's points, the first being the unperturbed (of sensors there is none: labels are their names)."""
+    """A perturbation's points, the first one unperturbed (none for sensors, whose labels are their names)."""
 
     name: str
     title: str
@@ -181,8 +182,8 @@ class Curve:
 
 @dataclass(frozen=True, kw_only=True)
 class End:
-    """Errors of an end joint's group in mm over the worst people: mean, standard deviation, quartiles; people; worst:
-    how many of all scored."""
+    """Errors of a group of end joints in mm over the people with the largest errors: mean, standard deviation,
+    quartiles; people; worst: number of people selected from all scored."""
 
     group: str
     mean: float
@@ -194,7 +195,7 @@ class End:
 
 @dataclass(frozen=True, kw_only=True)
 class Stability:
-    """A study. who: the people perturbed, in words; notes: what could not be done."""
+    """A study. who: the perturbed people, in words; notes: what could not be evaluated."""
 
     setting: Setting
     who: str
@@ -213,21 +214,21 @@ def to_json(studies: Sequence[Stability], *, head: dict[str, Any]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class CroppedPerson:
-    """Somebody as the protocol shows them; whole: with all points that the dataset holds."""
+    """A person as cropped by the protocol (`shown`); whole: with all points that the dataset holds."""
 
     shown: EvalSample
     whole: EvalSample
 
 
 def people_to_perturb(setup: EvalSetup) -> list[CroppedPerson]:
-    """Of lidarpose-bench its clean people, of other datasets at most `PEOPLE`, evenly spread. Raises InputError where
-    nobody has a point."""
+    """The clean people of lidarpose-bench, or at most `PEOPLE` people of another dataset, evenly spread. Raises
+    InputError if none of them has a point."""
     if setup.setting.kind == BENCH:
         samples = [person for person in setup.dataset if person.condition == _CLEAN and not person.moving]
     else:
         rows = set(evenly_drawn(setup.dataset.count, PEOPLE).tolist())
         samples = [person for k, person in enumerate(setup.dataset) if k in rows]
-    # who is not scored is not perturbed either
+    # people that are not scored are not perturbed either
     pairs = [(setup.crop_sample(person)[0], person) for person in samples]
     people = [
         CroppedPerson(shown=crop, whole=person) for crop, person in pairs if crop is not None and len(crop.points)
@@ -246,15 +247,16 @@ def study(
     people: list[CroppedPerson] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Stability:
-    """The study of a dataset's people, whom `predictions` holds unperturbed.
+    """The study of a dataset's people.
 
     Args:
-        people: whom to perturb, by default `people_to_perturb`.
+        predictions: of the unperturbed dataset.
+        people: people to perturb, by default `people_to_perturb`.
         progress: progress(done, 0) is called as people are predicted.
     """
     people = people_to_perturb(setup) if people is None else people
     if setup.dataset.count > PEOPLE:
-        # a draw of it, as by a limit
+        # a draw from the dataset, as with a limit
         setup = replace(setup, dataset=replace(setup.dataset, limit=PEOPLE))
     num_predicted = 0
 
@@ -288,8 +290,8 @@ def study(
 
 
 def end_errors(predictions: Predictions) -> tuple[End, ...]:
-    """The errors of the end joints over the 600 people whose mean errors are largest, of fewer than 2,000 people the
-    worst 30 %."""
+    """The errors of the end joints over the 600 people with the largest mean errors; with fewer than 2,000 people, over
+    the worst 30 %."""
     table = predictions.select(~predictions.moving & predictions.posed).errors()
     table = table[~np.isnan(table).all(1)]
     num_worst = min(WORST, int(np.ceil(WORST_SHARE * len(table))))
@@ -315,7 +317,7 @@ def _people_text(setup: EvalSetup) -> str:
 def _perturbed(setup: EvalSetup, person: CroppedPerson, name: str, amount: float) -> EvalSample:
     eval_sample, sample, box = person.shown, person.shown.sample, person.shown.crop_box
     seed = [setup.setting.seed, zlib.crc32(name.encode()), eval_sample.shard, eval_sample.row]
-    # a displaced box may let in what the dataset holds around the person
+    # a displaced box may include other points that the dataset holds around the person
     points = (person.whole if name == "crop" else eval_sample).points.astype(float)
 
     def apply(positions: np.ndarray) -> np.ndarray:
@@ -335,7 +337,7 @@ def _perturbed(setup: EvalSetup, person: CroppedPerson, name: str, amount: float
 
 
 def _point(predictions: Predictions, base_errors: np.ndarray, amount: float, label: str, setting: Setting) -> Point:
-    """One amount's point; base_errors (n, J) mm: the errors of the same people unperturbed."""
+    """The point of one amount; base_errors (n, J) mm: errors of the same people without perturbation."""
     rng = np.random.default_rng([zlib.crc32(label.encode()), setting.seed])
     clusters = predictions.sequence if setting.clusters else None
     # NaN without a label, a row of NaN without a pose
@@ -362,21 +364,21 @@ def _point(predictions: Predictions, base_errors: np.ndarray, amount: float, lab
 
 
 def _sensor_curve(setup: EvalSetup, advance: Callable[[int], None]) -> Curve:
-    """The same bodies in the same poses at the same distances from each sensor, however little it sees of them, nothing
-    around them. Sensors are of other heights, and people in other directions."""
+    """The same bodies in the same poses at the same distances for each sensor, with nothing around them, even if a
+    sensor sees little of them. Heights of sensors and directions to people differ."""
     from lidarpose.synth.generator import Generator
     from lidarpose.synth.scene import scene_config
 
     scene, points = scene_config("wild"), []
     noise, crop = replace(scene.noise, mask=0.0, clutter=0.0, missing_part=0.0), replace(scene.crop, loose=0.0, cut=0.0)
-    # uniform: the law of counts would bring people nearer to coarser sensors
+    # uniform distances: `median_points` would place people nearer to coarser sensors
     scene = replace(scene, distance=_DISTANCE, median_points=0, clutter=0.0, occluder=0.0, company=0.0)
     scene = replace(scene, noise=noise, crop=replace(crop, jitter=0.03))
     for k, name in enumerate(SENSORS):
         generator = Generator(scene=replace(scene, sensors=(name,)), measure=False, redraw=False)
         samples = [generator.person(_SEED, index).sample for index in range(CAST)]
         predictions = setup.predict([_simulated(sample, setup, k, row) for row, sample in enumerate(samples)])
-        # everybody is a sequence of their own
+        # each person is a sequence of their own
         setting = replace(setup.setting, clusters=False)
         point = _point(predictions, predictions.errors(), float(k), name, setting)
         points.append(replace(point, increase=None, increase_low=None, increase_high=None))
@@ -387,7 +389,7 @@ def _sensor_curve(setup: EvalSetup, advance: Callable[[int], None]) -> Curve:
 
 
 def _simulated(sample, setup: EvalSetup, shard: int, row: int) -> EvalSample:
-    """A simulated sample with the joints of the evaluated dataset, all of them seen."""
+    """A simulated sample with the joints of the evaluated dataset, all labeled as seen."""
     skeleton = setup.dataset.skeleton
     labeled_sample = LabeledSample(
         points=sample.points,

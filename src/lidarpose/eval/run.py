@@ -1,6 +1,6 @@
-"""Evaluation: a network and a dataset's samples -> predictions -> metric rows -> a folder of results.
+"""Evaluation: a network and a dataset's samples -> predictions -> rows of metrics -> a folder of results.
 
-`lidarpose.evaluation` offers what is public here; docs/evaluate.md describes the protocols and the files.
+The public part is in `lidarpose.evaluation`; docs/evaluate.md describes the protocols and the files.
 """
 
 import os
@@ -30,9 +30,9 @@ from lidarpose.models.checkpoint import runs_of
 from lidarpose.sample import UNLABELED
 from lidarpose.skeleton import BODY26, Skeleton, as_skeleton
 
-# people predicted at once, or more up to the end of a clip: so many clouds are in memory
+# people per chunk, whose clouds are in memory together; a chunk may be longer, up to the end of a clip
 _CHUNK = 512
-# the worst people whose points are kept for pictures
+# number of people with the largest errors whose points are kept for pictures
 WORST = 24
 # where results go unless a folder is named
 FOLDER = "evaluation"
@@ -43,7 +43,8 @@ FOLDER = "evaluation"
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """A dataset's result, what it was computed from, and the worst people, as the network saw them, with their rows."""
+    """A dataset's result, its predictions, and the people with the largest errors, as cropped for the network, with
+    their rows in the predictions."""
 
     result: Result
     predictions: Predictions
@@ -53,8 +54,8 @@ class Evaluation:
 def evaluate_dataset(
     setup: EvalSetup, *, dapt_compat: bool = False, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> Evaluation:
-    """Predicts everybody and scores it; progress(done, total) is called as people are predicted. Raises InputError
-    where nobody could be read."""
+    """Predicts and scores all people of a dataset; progress(done, total) is called as people are predicted. Raises
+    InputError if no person could be read."""
     dataset, setting = setup.dataset, setup.setting
     parts: list[Predictions] = []
     worst: list[tuple[float, int, EvalSample]] = []
@@ -65,7 +66,7 @@ def evaluate_dataset(
         errors = chunk_predictions.errors()
         for k in np.flatnonzero(~np.isnan(errors).all(1) & ~chunk_predictions.moving).tolist():
             worst.append((float(np.nanmean(errors[k])), num_people + k, chunk[k]))
-        # the points of the worst people alone are kept
+        # keep the points of only the people with the largest errors
         worst = sorted(worst, key=lambda entry: (-entry[0], entry[1]))[:WORST]
         parts.append(chunk_predictions)
         num_people += len(chunk)
@@ -91,7 +92,7 @@ def evaluate_dataset(
 
 
 def _chunks(setup: EvalSetup) -> Iterator[list[EvalSample]]:
-    """The people as the protocol shows them, some at a time, whole clips for networks of clips."""
+    """The people as cropped by the protocol, in chunks; networks of clips get whole clips."""
     chunk: list[EvalSample] = []
     for person in _shown(setup):
         if len(chunk) >= _CHUNK and setup.can_split(chunk, person):
@@ -103,7 +104,7 @@ def _chunks(setup: EvalSetup) -> Iterator[list[EvalSample]]:
 
 
 def _shown(setup: EvalSetup) -> Iterator[EvalSample]:
-    """The people as the protocol shows them; who has nothing to show is counted."""
+    """The people as cropped by the protocol; people that it skips are counted."""
     for person in setup.dataset:
         cropped_person, reason = setup.crop_sample(person)
         if cropped_person is None:
@@ -114,7 +115,7 @@ def _shown(setup: EvalSetup) -> Iterator[EvalSample]:
 
 
 def _baselines(bench: Bench, predictions: Predictions, setting: Setting) -> tuple[MetricRow, ...]:
-    """What knows no points, scored on the same people."""
+    """Rows of the baselines that use no points, scored on the same people."""
     joint_indices = BODY26.map_to(predictions.skeleton)
     nan_values = np.full_like(predictions.confidence, np.nan)
     rows: tuple[MetricRow, ...] = ()
@@ -126,21 +127,21 @@ def _baselines(bench: Bench, predictions: Predictions, setting: Setting) -> tupl
 
 
 def _person_rows(setup: EvalSetup, bench: Bench, predictions: Predictions, setting: Setting) -> tuple[MetricRow, ...]:
-    """Of a network that says whether a crop shows a person, where the set has objects too."""
+    """Rows for a network that predicts whether a crop shows a person, if the set has crops of objects."""
     people = predictions.select(~predictions.moving)
     if not len(bench.objects) or np.isnan(people.person).all():
         return ()
     model, origin = setup.model, np.zeros(3) if setting.sensor == "known" else None
     clouds = [bench.points[row] for row in bench.objects]
     answers = model.predict(clouds, sensor_origin=origin, skeleton=model.skeleton.name)
-    # what no pose is found in is no person
+    # an object without a pose counts as a prediction of no person
     probabilities = [None if answer.pose is None else answer.pose.person for answer in answers]
     objects = np.array([0.0 if probability is None else float(probability) for probability in probabilities])
     return tuple(person_rows(people, objects, bench.columns["others"][people.row], setting))
 
 
 def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iterator[str]:
-    """What the reader must know; setting: the setup's, as it turned out."""
+    """Notes for the reader; setting: the setup's, with `sensor` updated to what the dataset knows."""
     runs = runs_of(getattr(getattr(setup.model, "header", None), "card", {}))
     yield from dict.fromkeys(note for run in runs for note in _notes_of_run(run, setup.dataset))
     if setting.not_judged:
@@ -165,11 +166,11 @@ def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iter
 
 
 def _notes_of_run(run: dict, dataset: EvalDataset) -> Iterator[str]:
-    """Whether the network was trained on these people, by what its checkpoint tells of a run that made it."""
+    """Whether the network was trained on these people, according to a run in its checkpoint."""
     recipe = run.get("recipe")
     if not isinstance(recipe, dict):
         return
-    # pre-training on shards takes everybody
+    # pre-training on shards uses all people
     data, split = run.get("data") or recipe.get("shards"), recipe.get("split", "all")
     if isinstance(data, list) and dataset.name in data:
         if split == dataset.split or "all" in (split, dataset.split):
@@ -186,12 +187,12 @@ def _notes_of_run(run: dict, dataset: EvalDataset) -> Iterator[str]:
         yield f"the network was trained on {people}; make others by lidarpose synth --seed"
 
 
-# ---- all of one call
+# ---- one call
 
 
 @dataclass(frozen=True, kw_only=True)
 class Run:
-    """All of one call: scores, what is in scores.json; evaluations, one a dataset; studies of their stability."""
+    """Results of one call: scores, the content of scores.json; evaluations, one per dataset; studies of stability."""
 
     scores: Scores
     evaluations: tuple[Evaluation, ...]
@@ -199,7 +200,7 @@ class Run:
 
 
 def evaluate(model: Model | str | os.PathLike, dataset: str | os.PathLike, **options: Any) -> Result:
-    """One dataset's result, in millimeters and percent; `options` and errors as of `run`."""
+    """One dataset's result, in millimeters and percent; `options` and errors as in `run`."""
     return run(model, [dataset], **options).scores.results[0]
 
 
@@ -223,29 +224,30 @@ def run(
     progress: Callable[[str, int, int], None] | None = None,
     legacy: bool = False,
 ) -> Run:
-    """Scores a network on datasets. Everything is checked before anybody is predicted.
+    """Scores a network on datasets. All arguments are checked before the first prediction.
 
     Args:
-        model: a `Predictor`, what `load` takes, or an object with the joints `skeleton` and `predict(clouds,
-            sensor_origin=, skeleton=)`, which gives for each cloud an object whose `pose` is a `Pose` or None.
-        datasets: folders that `lidarpose prepare` or `synth` wrote, or "bench" or "bench-2".
+        model: a `Predictor`, anything that `load` takes, or an object with the joints `skeleton` and `predict(clouds,
+            sensor_origin=, skeleton=)`, which returns for each cloud an object whose `pose` is a `Pose` or None.
+        datasets: folders written by `lidarpose prepare` or `synth`, or "bench" or "bench-2".
         protocol: "clean" or "dapt".
-        split: by default test, else val, else "all", which is everybody.
-        skeleton: score its joints, by default the dataset's (of synthetic people human15's).
-        limit: so many people, evenly spread.
-        stability: perturb the points, too.
-        dapt_compat: also the released code's arithmetic; `legacy` is its old name.
-        sensor_unknown: do not tell where the sensor stood.
+        split: by default test, else val, else "all", which is all people.
+        skeleton: score its joints, by default the dataset's (human15's for synthetic people).
+        limit: score only this many people, evenly spread.
+        stability: also evaluate with perturbed points.
+        dapt_compat: also use the released code's arithmetic; `legacy` is its old name.
+        sensor_unknown: do not pass the sensor's position to the network.
         seed: of displaced boxes and intervals.
-        device: as of `load`, for weights by name or path.
-        backend: the same.
-        decode: the same.
-        tta: the same.
-        command: what scores.json says was run.
+        device: as in `load`, for weights by name or path.
+        backend: as `device`.
+        decode: as `device`.
+        tta: as `device`.
+        command: the command line to record in scores.json.
         progress: progress(dataset, done, total) is called as people are predicted.
 
     Raises:
-        InputError: one line, for what does not fit. MissingExtra: without pyarrow.
+        InputError: one line, for invalid arguments.
+        MissingExtra: without pyarrow.
     """
     eval_datasets = _opened(datasets, split, limit)
     predictor, weights = _loaded(model, device=device, backend=backend, decode=decode, tta=tta)
@@ -278,11 +280,11 @@ def _opened(datasets: str | os.PathLike | Sequence[str | os.PathLike], split, li
 
 
 def _loaded(model: Model | str | os.PathLike, **options: Any) -> tuple[Model, dict[str, Any]]:
-    """The network, and what scores.json says of its weights."""
+    """The network, and the description of its weights for scores.json."""
     weights: dict[str, Any] = {}
     if isinstance(model, str | os.PathLike):
         path = weights_path(model)
-        # a missing file is for `load` to report
+        # `load` reports a missing file
         if path.is_file():
             weights = {"file": path.name, "digest": content_digest(path, expected="a checkpoint")}
         model = load(model, **options)
@@ -292,13 +294,13 @@ def _loaded(model: Model | str | os.PathLike, **options: Any) -> tuple[Model, di
         raise InputError("device, backend, decode and tta are of weights by name or path: give them to load instead")
     elif not isinstance(model, Predictor):
         model = _described(model)
-    # whether a dataset's own sequences were trained on shows only in the checkpoint
+    # only the checkpoint shows whether it was trained on the dataset's own sequences
     card = getattr(getattr(model, "header", None), "card", {})
     return model, dict(model.model) | weights | {"skeleton": model.skeleton.name, "trained by": card.get("command")}
 
 
 def _described(model: Any) -> Model:
-    """A user's own model with what it may lack. Raises InputError for one of unknown joints."""
+    """A user's own model with missing attributes added. Raises InputError if its skeleton is unknown."""
     kind, skeleton, known = type(model).__name__, getattr(model, "skeleton", None), getattr(model, "model", None)
     if not isinstance(skeleton, str | Skeleton):
         raise InputError(f"{kind}.skeleton: expected a Skeleton or its name, got {skeleton!r}: say whose joints it has")
@@ -312,7 +314,7 @@ def _described(model: Any) -> Model:
 
 
 def new_folder(checkpoint: str | os.PathLike, folder: str | os.PathLike = FOLDER) -> Path:
-    """FOLDER/NAME of the checkpoint, or FOLDER/NAME-2, ..., the first that is not there."""
+    """FOLDER/NAME of the checkpoint, or the first of FOLDER/NAME-2, FOLDER/NAME-3, ... that does not exist."""
     name = weights_path(checkpoint).stem
     path, number = Path(folder) / name, 2
     while path.exists():
@@ -321,7 +323,7 @@ def new_folder(checkpoint: str | os.PathLike, folder: str | os.PathLike = FOLDER
 
 
 def check_folder(folder: str | os.PathLike) -> Path:
-    """The folder to write to. Raises InputError unless it is new or empty, and can be written."""
+    """The folder to write to. Raises InputError unless it is new or empty, and writable."""
     path = Path(folder)
     remedy = "give a new or empty folder for the results (--out DIR)"
     if path.exists() and not path.is_dir():
@@ -333,13 +335,13 @@ def check_folder(folder: str | os.PathLike) -> Path:
 
 
 def write(run: Run, folder: str | os.PathLike) -> list[Path]:
-    """Writes scores.json, poses.parquet, pictures and, where there are studies, stability.json; returns their paths.
+    """Writes scores.json, poses.parquet, pictures and, if there are studies, stability.json; returns their paths.
 
     Args:
-        folder: a new or empty one, in which all of them are written or none.
+        folder: a new or empty folder. Either all files are written or none.
 
     Raises:
-        InputError: the folder holds something.
+        InputError: the folder is not empty.
     """
     from lidarpose.eval import charts
 

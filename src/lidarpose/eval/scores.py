@@ -1,5 +1,5 @@
-"""What an evaluation says: rows, each one metric of one group with the protocol it was found by; scores.json; and the
-paper's Table 1 with the results of such files beside it.
+"""Results of an evaluation: rows, each one metric of one group with its protocol; scores.json; and the paper's Table 1
+together with the results of such files.
 """
 
 import json
@@ -16,12 +16,12 @@ from lidarpose.errors import InputError
 from lidarpose.io.files import file_error, lined_json, listed, read_bytes
 
 SCHEMA = "lidarpose.scores/1"
-# keys of scores.json beside its results, and their types
+# top-level keys of scores.json besides its results, and their types
 _HEAD: dict[str, Any] = {"version": str, "command": str, "seed": int, "weights": dict}
 FILE = "scores.json"
-# whose arithmetic: this package's, or the paper's released code's, see docs/evaluate.md
+# arithmetic: of this package, or of the paper's released code, see docs/evaluate.md
 OURS, RELEASED = "lidarpose", "released"
-# in front of the name of a method that knows no points; what is shown calls it a baseline
+# prefix of the name of a method that uses no points; displayed as "baseline"
 BASELINE = "floor: "
 
 
@@ -29,11 +29,11 @@ BASELINE = "floor: "
 class Setting:
     """How a dataset was scored, under the keys of scores.json.
 
-    dataset: its name; kind: the raw dataset's name, "synth" or "bench"; method: what predicted; protocol, centring (how
-    people are centered), crop, split in words; split_source and leaks of the split, "" where there is nothing to say;
-    joints that were scored; not_judged: joints of the dataset, or asked for, that were not scored, and why; sensor:
-    "known", "unknown" or "of some people"; total: people of whom `limit` were scored, None for all; clusters: intervals
-    draw whole sequences; seed of boxes and intervals.
+    dataset: its name; kind: the raw dataset's name, "synth" or "bench"; method: the network or baseline; protocol,
+    centring (how people are centered), crop, split in words; split_source and leaks of the split, "" if there are none;
+    joints that were scored; not_judged: joints of the dataset, or requested ones, that were not scored, and why;
+    sensor: "known", "unknown" or "of some people"; total: people of which `limit` were scored, None for all; clusters:
+    intervals resample whole sequences; seed of boxes and intervals.
     """
 
     dataset: str
@@ -70,11 +70,11 @@ class Setting:
 class MetricRow:
     """One metric of one group, under the keys of scores.json.
 
-    method; figure: the metric's name, "mpjpe"; group, of: of which people or joints, ("all", "all"), ("joints",
-    "wrists"), ("distance, m", "0 to 10"); value in `unit`, None of nobody; low, high: ends of the 95 % interval, None
-    where there is none; people, joints that it is of (of oks_ap and turned_round, one a person); skipped: people
-    without a labeled joint; no_pose: people for whom the network had no answer; arithmetic; protocol, centring, split,
-    limit: as in `Setting`.
+    method; figure: the metric's name, "mpjpe"; group, of: the group of people or joints, ("all", "all"), ("joints",
+    "wrists"), ("distance, m", "0 to 10"); value in `unit`, None if there is nothing to score; low, high: ends of the
+    95 % interval, None without one; people, joints behind the value (for oks_ap and turned_round, joints counts one per
+    person); skipped: people without a labeled joint; no_pose: people for whom the network gave no pose; arithmetic;
+    protocol, centring, split, limit: as in `Setting`.
     """
 
     method: str
@@ -99,7 +99,7 @@ class MetricRow:
 @dataclass(frozen=True, kw_only=True)
 class Result:
     """One dataset's rows (`lines`, as in scores.json). counts: people scored, frames of clips, people without a pose;
-    skipped: reason -> count and the first one; notes: what the reader must know."""
+    skipped: reason -> count and the first one; notes: remarks that the reader needs to interpret the scores."""
 
     setting: Setting
     counts: dict[str, int]
@@ -108,8 +108,8 @@ class Result:
     lines: tuple[MetricRow, ...]
 
     def line(self, figure: str, group: str = "all", of: str = "all", **more: str) -> MetricRow:
-        """The row of a metric, of the network itself unless `method` or `arithmetic` say otherwise. Raises InputError
-        where there is none."""
+        """The row of a metric, of the network itself unless `method` or `arithmetic` is given. Raises InputError if
+        there is none."""
         keys = {"method": self.setting.method, "arithmetic": OURS} | more
         keys |= {"figure": figure, "group": group, "of": of}
         for row in self.lines:
@@ -120,8 +120,8 @@ class Result:
 
 @dataclass(frozen=True, kw_only=True)
 class Scores:
-    """The content of scores.json. weights: name, digest (SHA-256) and what else the checkpoint tells; command: what was
-    run; seed; results, one a dataset; version of the package."""
+    """The content of scores.json. weights: name, digest (SHA-256) and other metadata of the checkpoint; command: the
+    command line; seed; results, one per dataset; version of the package."""
 
     weights: dict[str, Any]
     command: str
@@ -130,7 +130,7 @@ class Scores:
     version: str = __version__
 
     def to_json(self) -> str:
-        """One line of text a row."""
+        """The text of scores.json, with one line per row."""
         content: dict[str, Any] = {"schema": SCHEMA, "unit": {"mm": "millimeters", "%": "percent"}}
         content |= {name: getattr(self, name) for name in _HEAD}
         content["results"] = [asdict(result) for result in self.results]
@@ -138,13 +138,13 @@ class Scores:
 
 
 def scores_path(path: str | PathLike) -> Path:
-    """scores.json itself, of a file or of a folder that holds one."""
+    """The path of scores.json, given the file or its folder."""
     path = Path(path)
     return path / FILE if path.is_dir() else path
 
 
 def read_scores(path: str | PathLike) -> Scores:
-    """scores.json, or that of a folder. Raises InputError for a file that is none."""
+    """Reads scores.json, given the file or its folder. Raises InputError for any other file."""
     path = scores_path(path)
     data = read_bytes(path, expected=f"{FILE} of lidarpose evaluate")
     try:
@@ -181,11 +181,11 @@ def _result(content: dict[str, Any]) -> Result:
 
 
 def number(value: float) -> float | None:
-    """A value as JSON has it: NaN is None."""
+    """A value for JSON: NaN becomes None."""
     return None if math.isnan(value) else float(value)
 
 
-# ---- the paper's Table 1 with what was evaluated here beside it
+# ---- the paper's Table 1 together with results of this package
 
 TABLE_SCHEMA = "lidarpose.table/1"
 FORMATS = ("markdown", "json")
@@ -203,19 +203,19 @@ _OTHERS = "Evaluated here on sets that the paper does not have"
 
 
 def published() -> dict[str, Any]:
-    """The paper's results: source, note, datasets with their protocols, methods with theirs and their figures."""
+    """The paper's results: source, note, datasets with their protocols, methods with their protocols and scores."""
     return json.loads((resources.files("lidarpose.eval") / "assets" / "published.json").read_text("utf-8"))
 
 
 def table(paths: str | PathLike | Sequence[str | PathLike], *, format: str = "markdown") -> str:
-    """The paper's Table 1 and the results of scores.json files; results of different protocols in different blocks.
+    """The paper's Table 1 and the results of scores.json files; results of different protocols are in separate blocks.
 
     Args:
-        paths: the files, or folders that hold one; our figures come from these alone.
+        paths: the files, or folders that hold one; our scores come only from these.
         format: "markdown" or "json".
 
     Raises:
-        InputError: an unknown format, or a file that is none.
+        InputError: an unknown format, or a file that is not scores.json.
     """
     if format not in FORMATS:
         raise InputError(f"expected a table's format, {' or '.join(FORMATS)}, got {format!r}")
@@ -228,8 +228,8 @@ def table(paths: str | PathLike | Sequence[str | PathLike], *, format: str = "ma
 
 
 def _entries(path: str, scores: Scores) -> Iterator[dict[str, Any]]:
-    """A method's result on a dataset, one by one. row: the method's name in the table; figures: metric -> value or
-    None; note: what the reader must know; path of the scores.json; weights: their digest, None of baselines."""
+    """Yields the results of each method on each dataset. row: the method's name in the table; figures: metric -> value
+    or None; note: remarks on the setting; path of the scores.json; weights: their digest, None for baselines."""
     digest = scores.weights.get("digest") or None
     for result in scores.results:
         setting = result.setting
@@ -305,8 +305,11 @@ def _markdown(entries: list[dict[str, Any]]) -> str:
 
 
 def _rows(entries: list[dict[str, Any]], by: str, mark: Callable[[str], str]) -> list[tuple[str, dict]]:
-    """Rows of (name, cells): one a method and its weights, another one where a column comes twice. by: what a column
-    is of, "kind" or "dataset"."""
+    """Rows of (name, cells): one per method and weights, and another one for a second result in the same column.
+
+    Args:
+        by: what a column stands for, "kind" or "dataset".
+    """
     rows: list[tuple[tuple[str, str | None], dict]] = []
     for entry in entries:
         key, column = (entry["row"].replace(BASELINE, "baseline: "), entry["weights"]), entry[by]

@@ -1,1 +1,1 @@
-"""The paper's tables and figures as lists of commands, run one after the other and taken up where they stopped."""
+"""The paper's tables and figures as lists of commands, which are run one after the other and can be resumed."""

@@ -1,4 +1,4 @@
-"""The paper's figures 5 to 8, from what the cells of their tables left."""
+"""The paper's figures 5 to 8, drawn from the results of their tables' cells."""
 
 import json
 from collections.abc import Sequence
@@ -21,17 +21,16 @@ from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.viz.draw import Panel, draw_people
 
-# people side by side: those of the largest errors, averaged over the methods
+# number of people drawn side by side: those with the largest errors, averaged over the methods
 HARDEST = 6
-# distances m and shares kept of one body's pictures
+# Figure 6: distances, m, and shares of points kept
 _DISTANCES, _KEPT = (5.0, 8.0, 12.0, 16.0, 20.0), (1.0, 0.8, 0.6, 0.4)
-# who is so tall from the lowest to the highest joint stands, m; people looked at, of this seed
+# a person stands if lowest and highest joint are at least this far apart, m; number of people tried, and their seed
 _STANDS, _TRIED, _SEED = 1.5, 100, 0
 
 
 def draw(name: str, cells: Sequence[Cell], out: Path) -> list[Path]:
-    """Draws fig5, fig7 or fig8 of the cells that are done, of the first seed, a picture a column; returns their
-    paths."""
+    """Draws fig5, fig7 or fig8 from the finished cells of the first seed, one picture per column; returns the paths."""
     columns = list(dict.fromkeys(cell.column for cell in cells))
     paths = []
     for column in columns:
@@ -44,7 +43,7 @@ def draw(name: str, cells: Sequence[Cell], out: Path) -> list[Path]:
 
 
 def _picture(name: str, cells: dict[str, Cell], out: Path) -> bytes:
-    """A figure of one column, of its cells that are done."""
+    """A figure of one column, from its finished cells."""
     if name == "fig5":
         return _side_by_side(cells, out)
     paths = {row: cell.evaluation.product(out) / "stability.json" for row, cell in cells.items() if cell.evaluation}
@@ -55,13 +54,13 @@ def _picture(name: str, cells: dict[str, Cell], out: Path) -> bytes:
 
 
 def _titled(study: dict[str, Any], title: str) -> dict[str, Any]:
-    """A study of stability.json with a title in place of the name of its dataset's folder."""
+    """A study of stability.json with a title in place of the dataset's folder name."""
     dataset = study["setting"]["dataset"]
     return study | {"who": study["who"].replace(dataset, title), "setting": study["setting"] | {"dataset": title}}
 
 
 def _side_by_side(cells: dict[str, Cell], out: Path) -> bytes:
-    """The hardest people, a row a person, a column a method."""
+    """The people with the largest errors, one row per person and one column per method."""
     paths = {row: cell.evaluation.product(out) / POSES for row, cell in cells.items() if cell.evaluation}
     predictions = {row: next(iter(read_poses(path).values())) for row, path in paths.items()}
     index_by_key = [
@@ -70,7 +69,7 @@ def _side_by_side(cells: dict[str, Cell], out: Path) -> bytes:
     common_keys = sorted(set.intersection(*map(set, index_by_key)))
     tables = zip((p.errors() for p in predictions.values()), index_by_key, strict=True)
     errors = np.array([[table[index[key]] for key in common_keys] for table, index in tables])
-    # without labels there is no error
+    # a person without labels has the error 0
     mean = np.nansum(errors, -1) / np.maximum((~np.isnan(errors)).sum(-1), 1)
     hardest_keys = [common_keys[k] for k in np.argsort(-mean.mean(0), kind="stable")[:HARDEST]]
     target = next(iter(cells.values())).target
@@ -83,7 +82,7 @@ def _side_by_side(cells: dict[str, Cell], out: Path) -> bytes:
             pose, truth = (
                 Pose(joints=joints[row_index].astype(float), skeleton=p.skeleton) for joints in (p.pred, p.true)
             )
-            # from the same side in every column, whichever way a method turned the person
+            # viewed along the true facing, so that all columns show the same side whatever the predicted facing
             panel = Panel(points=clouds[key], pose=pose, truth=truth, forward=facing(truth))
             label = f"{row}: {mean[k, common_keys.index(key)]:.0f} mm"
             panels.append(replace(panel, label=label, distance=float(p.distance[row_index])))
@@ -98,7 +97,7 @@ def draw_one_body(out: Path, *, motion: str | None = None) -> Path:
         for keep in _KEPT:
             scene = replace(scene_config("paper").changed((f"keep={keep}",)), distance=(distance, distance))
             generator = Generator(scene=scene, bank=bank, captured=float(bank is not None), redraw=False, measure=False)
-            # of one seed and index the body is the same in every scene
+            # with the same seed and index, the body is the same in every scene
             index = index if index >= 0 else _standing(generator)
             sample = generator.person(_SEED, index).sample
             joints = sample.pose.to(SMPL24).joints if sample.pose else None
@@ -110,7 +109,7 @@ def draw_one_body(out: Path, *, motion: str | None = None) -> Path:
 
 
 def _standing(generator: Generator) -> int:
-    """The first person who stands, else the first."""
+    """The index of the first standing person, or 0 if none is found."""
     for index in range(_TRIED):
         pose = generator.person(_SEED, index).sample.pose
         if pose is not None and np.ptp(pose.joints[:, 2]) > _STANDS:

@@ -1,4 +1,4 @@
-"""What a table says: of each cell its result, what it cost, and the mean pose's error beside it; Markdown and JSON."""
+"""Reports of a table as Markdown and JSON: each cell's result, its cost, and the mean pose's error for comparison."""
 
 import json
 from collections.abc import Sequence
@@ -33,27 +33,30 @@ from lidarpose.paper.tables import PROTOCOL, Cell, Options, Table, Target, cells
 from lidarpose.sample import MIN_POINTS, center_of
 
 SCHEMA = "lidarpose.paper/1"
-# a network that is not so much better than the mean pose, as a share of its error, has not learned enough to compare
+# a network whose error is not lower than the mean pose's by this share has not been trained enough to compare
 _UNDERTRAINED = 0.2
 _LEGEND = (
     "MPJPE in mm, the mean over seeds; in brackets the 95 % interval over people, of several seeds the least and the "
     "greatest. *undertrained*: not 20 % better than the mean pose about the protocol's center; nothing can be "
     "concluded from it. *Against* a row: the mean difference over the same people, where both rows' poses are there."
 )
-# beside figures as printed in the paper
+# appended if the paper's printed values are shown
 _PRINTED = (
     " In parentheses what the paper prints, not run here: LiDARCap's and NE's figures are of poses about the root "
     "without shapes, LPFormer's of detected boxes."
 )
-# people of whom the mean pose is taken at most
+# maximum number of people that the mean pose is computed from
 _MEAN_POSE = 5_000
 
 
 def run_table(
     table: Table, options: Options, out: Path, chosen: Sequence[str], execute: Execute, tell: Any
 ) -> dict[str, Any]:
-    """Runs what is not done of a table, cell by cell, and writes it anew after each; returns it. A cell that fails is
-    reported and written as failed, and the others go on. A cell whose figures are there is done, wherever it was."""
+    """Runs the unfinished cells of a table, rewrites it after each, and returns it.
+
+    A failed cell is reported and recorded, and the other cells are still run. A cell whose results exist is done, even
+    if it was run elsewhere.
+    """
     begin_out(out)
     selected_cells = cells(table, options, chosen)
     check_targets(selected_cells)
@@ -70,21 +73,22 @@ def run_table(
 
 
 def check_targets(selected: Sequence[Cell]) -> None:
-    """Raises InputError, one line, where a real set cannot be scored by the protocol: before hours of training."""
+    """Raises InputError, one line, if a real set cannot be scored under the protocol: before hours of training."""
     for test in {cell.target.test for cell in selected if cell.evaluation is not None}:
         if isinstance(test, str):
             check_protocol(PROTOCOL, open_eval_dataset(test))
 
 
 def _is_there(table: Table, evaluation: Step, out: Path) -> bool:
-    """Whether a cell's figures are there, and what a picture is drawn of, which is not copied with them."""
+    """Whether a cell's results exist. A figure also needs the files that it is drawn from, which are not copied along
+    with the results."""
     return _path(evaluation, out).is_file() and (not table.name.startswith("fig") or is_done(evaluation, out))
 
 
 def write_table(
     table: Table, selected: Sequence[Cell], options: Options, out: Path, failed: dict[int, str] | None = None
 ) -> dict[str, Any]:
-    """Writes OUT/TABLE.json and OUT/TABLE.md of what is there, and each done cell's own JSON."""
+    """Writes OUT/TABLE.json and OUT/TABLE.md from the existing results, and the JSON of each finished cell."""
     failed = failed or {}
     entries = [_entry(table, cell, out, failed.get(k, "")) for k, cell in enumerate(selected)]
     for cell, entry in zip(selected, entries, strict=True):
@@ -106,7 +110,7 @@ def write_table(
 
 
 def _entry(table: Table, cell: Cell, out: Path, failure: str) -> dict[str, Any]:
-    """A cell as JSON. state: done, failed, not run, not possible; the figures of cells that are done."""
+    """A cell as JSON. state: done, failed, not run or not possible; finished cells also have their results."""
     steps = list(cell.evaluation.all()) if cell.evaluation else []
     entry: dict[str, Any] = {"row": cell.row, "column": cell.column, "seed": cell.seed, "published": cell.published}
     entry["commands"] = [step.line(out) for step in steps]
@@ -125,14 +129,14 @@ def _entry(table: Table, cell: Cell, out: Path, failure: str) -> dict[str, Any]:
 
 
 def _reference(table: Table, cell: Cell, selected: Sequence[Cell]) -> Cell | None:
-    """The cell of the table's reference row in the same column and with the same seed."""
+    """The cell in the table's reference row with the same column and seed."""
     wanted = (table.reference, cell.column, cell.seed)
     return next((other for other in selected if (other.row, other.column, other.seed) == wanted), None)
 
 
 def _difference(cell: Cell, reference: Cell | None, out: Path) -> dict[str, float]:
-    """A cell's MPJPE less that of the reference on the same people, mm, and its 95 % interval over people; nothing of
-    the reference itself, of other people, or where the poses of either are gone."""
+    """A cell's MPJPE minus the reference's on the same people, mm, and its 95 % interval over people; empty for the
+    reference itself, for different people, or if the poses of either are missing."""
     steps = [other.evaluation for other in (cell, reference) if other is not None and other.evaluation is not None]
     paths = [step.product(out) / POSES for step in steps]
     if len(set(paths)) < 2 or not all(path.is_file() for path in paths):
@@ -140,7 +144,7 @@ def _difference(cell: Cell, reference: Cell | None, out: Path) -> dict[str, floa
     (first,), (second,) = (read_poses(path).values() for path in paths)
     if first.skeleton.joints != second.skeleton.joints or not np.array_equal(first.true, second.true, equal_nan=True):
         return {}
-    # whom only one of both has a pose of tells nothing of the difference
+    # only people with a pose from both networks can be compared
     both = first.posed & second.posed
     errors, reference_errors = (people.select(both).errors() for people in (first, second))
     clustered = read_scores(paths[0].with_name(FILE)).results[0].setting.clusters
@@ -151,15 +155,15 @@ def _difference(cell: Cell, reference: Cell | None, out: Path) -> dict[str, floa
 
 
 def _path(evaluation: Step, out: Path) -> Path:
-    """Where a cell's figures are, once it is done."""
+    """The file of a cell's results, which exists once the cell is finished."""
     return out / CELLS / f"{evaluation.name}.json"
 
 
 def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
-    """An evaluation's figures, what the training cost, and the mean pose's error on the same people."""
+    """An evaluation's results, the cost of the training, and the mean pose's error on the same people."""
     result = read_scores(evaluation.product(out) / FILE).results[0]
     lengths = {step.line(out): length_of(step, out) for step in evaluation.all()}
-    # of shortened trainings those that ran
+    # for shortened trainings, the commands that were actually run
     commands = [" ".join([line, *length]) for line, length in lengths.items()]
     network, header = load_checkpoint(cell.training[-1].product(out))
     runs, entry = runs_of(header.card), last_entry(cell.training[-1].folder(out))
@@ -194,14 +198,17 @@ def _value(result: Result, name: str) -> float | None:
 
 
 def mean_pose_error(target: Target, result: Result, out: Path) -> float:
-    """MPJPE in mm, over the scored joints of the people scored, of the mean skeleton of those learned from, about the
-    center that the protocol gives: of labels, or of a person's points."""
+    """MPJPE in mm of a baseline that predicts the mean skeleton of the training people about the protocol's center.
+
+    It is scored on the people and joints of `result`. The center comes from labels or from a person's points,
+    depending on the protocol.
+    """
     folders = [str(part.product(out)) if isinstance(part, Step) else part for part in (target.train, target.test)]
-    # real sets may have been prepared anew
+    # real sets may be prepared again: the digest of the card tells the versions apart
     card_digest = (
         None if isinstance(target.test, Step) else content_digest(Path(folders[1]) / CARD, expected="a dataset")[:8]
     )
-    # trainings of several budgets are scored on the same people
+    # different budgets have different training people, but are scored on the same people
     learned = target.train.name if isinstance(target.train, Step) else None
     name = filter(None, (result.setting.dataset, str(len(result.setting.joints)), card_digest, learned))
     path = out / CELLS / f"mean-pose-{'-'.join(name)}.json"
@@ -221,7 +228,7 @@ def mean_pose_error(target: Target, result: Result, out: Path) -> float:
 
 
 def _offset(person: EvalSample, result: Result) -> np.ndarray:
-    """(J, 3) m: the scored joints from the protocol's center, NaN without a label or points."""
+    """(J, 3) m: the scored joints relative to the protocol's center, NaN without a label or points."""
     sample, setting = person.sample, result.setting
     columns = [sample.skeleton.index(joint) for joint in setting.joints]
     is_labeled = (sample.joint_labels[columns] > 0)[:, None]
@@ -235,7 +242,7 @@ def _offset(person: EvalSample, result: Result) -> np.ndarray:
 
 
 def markdown(content: dict[str, Any]) -> str:
-    """A table as a page: the figures, what each cell cost, and the commands."""
+    """A table as a page: the results, the cost of each cell, and the commands."""
     entries = content["cells"]
     budget = f"Budget: {content['people']:,} people a stage of training"
     budget += f", {content['hours']:g} hours a row" if content["hours"] else ""
@@ -247,7 +254,7 @@ def markdown(content: dict[str, Any]) -> str:
 
 
 def result_lines(content: dict[str, Any]) -> list[str]:
-    """A table's rows and columns, as the paper has them."""
+    """A table's rows and columns, laid out as in the paper."""
     entries = content["cells"]
     columns, rows = (list(dict.fromkeys(entry[name] for entry in entries)) for name in ("column", "row"))
     lines = _grid(["", *columns])
@@ -258,7 +265,7 @@ def result_lines(content: dict[str, Any]) -> list[str]:
 
 
 def _note_lines(entries: list[dict[str, Any]]) -> list[str]:
-    """What the evaluations say that a reader must know, each once with the columns that it is of."""
+    """The notes of the evaluations, each once with the columns that it applies to."""
     columns: dict[str, list[str]] = {}
     for entry in entries:
         for note in entry.get("notes", ()):
@@ -267,7 +274,8 @@ def _note_lines(entries: list[dict[str, Any]]) -> list[str]:
 
 
 def cost_lines(content: dict[str, Any], *, finished: bool = False) -> list[str]:
-    """What each cell reached and cost, or each that is done; its difference to the reference row where any has one."""
+    """Result and cost of each cell, or of each finished one; with a column for the difference to the reference row if
+    any cell has one."""
     entries = [entry for entry in content["cells"] if not finished or entry["state"] == "done"]
     heads = "row, column, seed, MPJPE, PA, PCK-3, PCK-5, mean pose, people seen, hours, people/s in training, size"
     columns, lines = [*heads.split(", "), "parameters", "state"], [_cost(entry) for entry in entries]
@@ -286,8 +294,11 @@ def _difference_text(entry: dict[str, Any]) -> str:
 
 
 def plan(table: Table, selected: Sequence[Cell], out: Path, problem: Any) -> str:
-    """The commands of each cell as a page, each in full where it comes first. problem(words): what the parser says
-    against a command, "" for nothing."""
+    """The commands of each cell as a page, each command in full at its first occurrence.
+
+    Args:
+        problem: function of a command's words that returns the parser's complaint, "" for none.
+    """
     entries, printed_names = [], set[str]()
     for cell in selected:
         steps = list(cell.evaluation.all()) if cell.evaluation else []
@@ -336,7 +347,7 @@ def _cost(entry: dict[str, Any]) -> list[str]:
         return [*cell_words, *["-"] * 10, entry["state"]]
     figures = ["-" if entry[name] is None else f"{entry[name]:.1f}" for name in (*COLUMNS, "mean_pose")]
     speed = "-" if entry["people_per_second"] is None else f"{entry['people_per_second']:.1f}"
-    # tables of before have no sizes
+    # tables written by older versions have no sizes
     cost = [f"{entry['people_seen']:,}", f"{entry['hours']:.2f}", speed, entry.get("size", "-")]
     cost.append(f"{entry['parameters']:,}")
     return [*cell_words, *figures, *cost, "undertrained" if entry["undertrained"] else "done"]

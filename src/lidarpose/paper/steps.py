@@ -1,8 +1,8 @@
-"""Steps: lidarpose commands that make one folder each, from what other steps make.
+"""Steps: lidarpose commands that make one folder each, from the folders of other steps.
 
-A step's folder is OUT/runs/NAME, and NAME follows from the command alone: tables share what they have in common, and
-what is done is never done again. OUT/runs/NAME.json says that a step is done; without it the step goes on, a training
-by --resume.
+A step's folder is OUT/runs/NAME. NAME follows from the command alone, so tables share the steps that they have in
+common, and no step is run twice. OUT/runs/NAME.json records that a step is done; an unfinished step is run again, a
+training with --resume.
 """
 
 import hashlib
@@ -26,29 +26,29 @@ from lidarpose.io.files import exclusive_lock, write_atomic
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.run_dir import CONFIG, LENGTHS, MODEL, read_config, read_log
 
-# folders of a table's own folder: of the steps, and of the figures of cells that are done
+# subfolders of the output folder: the steps, and the results of finished cells
 RUNS, CELLS = "runs", "cells"
-# of an evaluation's files the one that is put in place last
+# the file of an evaluation that is put in place last
 POSES = "poses.parquet"
-# the kinds of training, by command
+# recipe classes of the training commands
 KINDS: dict[str, type[Pretrain] | type[Finetune]] = {"pretrain": Pretrain, "finetune": Finetune}
-# how long a training is watched before its speed is known: at most so many seconds, or this share of its hours
+# a training's speed is measured over this many seconds, or over this share of its hours if that is less
 _WATCH, _WATCH_SHARE = 120.0, 0.05
 _POLL = 0.5
-# times what was seen: a run that is made shorter still sees this many people
+# a shortened run sees at least this many times as many people as it has seen so far
 _MORE = 1.1
-# options whose values are part of a folder's name
+# options whose values appear in a folder's name
 _TELLING: dict[Any, str] = {"--keep": "keep"} | dict.fromkeys(
     ("--model", "--size", "--neck", "--head", "--set", "-n"), ""
 )
-# runs a command, as `lidarpose.cli.main`: its exit status
+# runs a command, as `lidarpose.cli.main` does, and returns its exit status
 Execute = Callable[[list[str]], int]
 
 
 @dataclass(frozen=True)
 class Step:
-    """A command. words: the command and its options, in which a step stands for what it makes; hours: a training that
-    would take longer is made shorter, schedule and all; None: no limit."""
+    """A command. words: the command and its options, where a step stands for its product; hours: a training that would
+    take longer is shortened, including its schedule; None: no limit."""
 
     words: tuple["str | Step", ...]
     hours: float | None = None
@@ -60,10 +60,10 @@ class Step:
 
     @cached_property
     def name(self) -> str:
-        """The folder's, which tells commands apart: the command, what it is of, and a digest of all its words."""
+        """The folder's name: the command, its most distinctive options, and a digest of all its words."""
         words = [word.name if isinstance(word, Step) else word for word in self.words]
         if "--workers" in words:
-            # changes nothing that is made
+            # does not affect the result
             index = words.index("--workers")
             words[index : index + 2] = []
         digest = hashlib.sha256(json.dumps([words, self.hours]).encode()).hexdigest()[:8]
@@ -72,7 +72,7 @@ class Step:
 
     @property
     def _about(self) -> str:
-        """Values of the options that tell most, of this step or of those that it needs."""
+        """Values of the most distinctive options of this step, or else of a training that it needs."""
         pairs = zip(self.words, self.words[1:], strict=False)
         option_values = [f"{_TELLING[option]}{value}" for option, value in pairs if option in _TELLING]
         return "-".join(option_values) or next((need._about for need in self.needs if need.kind in KINDS), "")
@@ -83,7 +83,7 @@ class Step:
         return tuple(word for word in self.words if isinstance(word, Step))
 
     def all(self) -> Iterator["Step"]:
-        """This step and all before it, in the order in which they run."""
+        """This step and all steps that it needs, in the order in which they run."""
         for step in self.needs:
             yield from step.all()
         yield self
@@ -92,7 +92,7 @@ class Step:
         return out / RUNS / self.name
 
     def product(self, out: Path) -> Path:
-        """What other steps read: weights, or the folder."""
+        """What other steps read: the weights of a training, else the folder."""
         return self.folder(out) / MODEL if self.kind in KINDS else self.folder(out)
 
     def command(self, out: Path) -> list[str]:
@@ -102,22 +102,26 @@ class Step:
         return [words[0], folder, *words[1:]] if self.kind == "pretrain" else [*words, "--out", folder]
 
     def line(self, out: Path) -> str:
-        """The command as it would be typed."""
+        """The command as typed in a shell."""
         return shlex.join(["lidarpose", *self.command(out)])
 
 
 class StepFailed(LidarPoseError):
-    """A command that ended with an error, which is the message."""
+    """A command that ended with an error; its message is the command's error message."""
 
 
 def is_done(step: Step, out: Path) -> bool:
-    """Whether its command has ended well."""
+    """Whether the step's command has finished successfully."""
     return _state(step, out).get("done", False)
 
 
 def run_steps(step: Step, out: Path, execute: Execute, tell: Callable[[str], None]) -> None:
-    """Runs what is not done of a step and those before it, and waits for what another process is at. Raises StepFailed
-    with the command's own message, KeyboardInterrupt where it was stopped."""
+    """Runs the unfinished steps among a step and those that it needs; waits for steps that another process is running.
+
+    Raises:
+        StepFailed: a command failed; has its error message.
+        KeyboardInterrupt: a command was interrupted.
+    """
     for part in step.all():
         if is_done(part, out):
             continue
@@ -144,9 +148,9 @@ def _run(step: Step, out: Path, execute: Execute) -> None:
     folder = step.folder(out)
     if step.kind == "evaluate":
         if (folder / POSES).is_file():
-            # put in place last: the process ended before it could be noted
+            # put in place last: the process ended before it could record that the step is done
             return
-        # what a killed process had not put in place: the command takes an empty folder only
+        # remove what a killed process left behind: the command needs an empty folder
         shutil.rmtree(folder, ignore_errors=True)
     words = step.command(out)
     if step.kind in KINDS and (folder / CONFIG).is_file():
@@ -172,7 +176,7 @@ def _execute(words: list[str], execute: Execute) -> None:
         try:
             status = execute(words)
         except SystemExit as exit_error:
-            # a command line that the parser refuses
+            # raised by the parser for an invalid command line
             status = exit_error.code if isinstance(exit_error.code, int) else 2
     if status >= 128:
         raise KeyboardInterrupt(last_line.line)
@@ -181,7 +185,7 @@ def _execute(words: list[str], execute: Execute) -> None:
 
 
 class _LastLine(io.TextIOBase):
-    """Passes text on and keeps its last line."""
+    """Passes text on and remembers its last line that is not blank."""
 
     def __init__(self, to: Any):
         self._to, self.line = to, ""
@@ -198,8 +202,10 @@ class _LastLine(io.TextIOBase):
 
 
 class _Watch:
-    """Stops the training of this process, by SIGINT, once its log shows that it will take longer than its hours.
-    fit: how many people fit into them; None while nothing was stopped."""
+    """Stops the training in this process, by SIGINT, once its log shows that it will take longer than its hours.
+
+    fit: how many people can be seen in these hours; None as long as it has not stopped the training.
+    """
 
     def __init__(self, folder: Path, hours: float):
         self.fit: float | None = None
@@ -227,13 +233,13 @@ class _Watch:
 
 
 def last_entry(folder: Path) -> dict[str, Any] | None:
-    """The last whole line of a run's log; None before the first."""
+    """The last complete line of a run's log; None before the first."""
     lines = read_log(folder)
     return lines[-1] if lines else None
 
 
 def _people(folder: Path) -> int:
-    """How many samples the run sees in all."""
+    """The number of samples that the whole run sees."""
     from lidarpose.train.setup import make_setup
 
     kind = KINDS[json.loads((folder / CONFIG).read_text())["kind"]]
@@ -241,8 +247,8 @@ def _people(folder: Path) -> int:
 
 
 def _shortened(step: Step, folder: Path, fit: float) -> list[str]:
-    """The options that make a run as long as `fit` people, or a little longer than it has become meanwhile."""
-    # what was seen cannot be taken back
+    """The options that shorten a run to `fit` people, or to slightly more than it has seen already."""
+    # a run cannot be made shorter than what it has seen
     people_seen = (last_entry(folder) or {}).get("people", 0)
     share = min(max(fit, _MORE * people_seen) / _people(folder), 1.0)
     recipe = read_config(folder, KINDS[step.kind])[0].to_dict()
@@ -252,18 +258,18 @@ def _shortened(step: Step, folder: Path, fit: float) -> list[str]:
 
 
 def length_of(step: Step, out: Path) -> tuple[str, ...]:
-    """The options that made a training as long as its hours allowed; none of one that was not shortened."""
+    """The options that shortened a training to its hours; empty if it was not shortened."""
     return tuple(_state(step, out).get("length", ()))
 
 
 def begin_out(out: Path) -> None:
-    """Makes the folder at once: another process may begin another table in it. Raises as `check_out`."""
+    """Creates the folder at once, since another process may start another table in it. Raises as `check_out`."""
     check_out(out)
     (out / RUNS).mkdir(parents=True, exist_ok=True)
 
 
 def check_out(out: Path) -> None:
-    """Raises InputError for a folder that holds something else."""
+    """Raises InputError if the folder holds other files than those of lidarpose paper."""
     is_paper_folder = any((out / name).is_dir() for name in (RUNS, CELLS))
     if out.is_file() or out.is_dir() and any(out.iterdir()) and not is_paper_folder:
         raise InputError(f"{out}: expected a new or empty folder, or one of lidarpose paper: name another by --out")

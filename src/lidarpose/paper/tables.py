@@ -1,8 +1,8 @@
 """The paper's tables 1 to 4 and figures 5, 7, 8 as data: rows, columns, and for each cell the steps that fill it.
 
-With prepared real sets the commands are the paper's protocol. Without, synthesized people stand in: pre-training on the
-scene `paper` (one simulated LiDAR), a target of the scene `wild` of another seed and other sensors, of which every
-method learns the same people and is scored on the same others.
+With prepared real sets the commands follow the paper's protocol. Without, synthesized people stand in: pre-training
+uses the scene `paper` (one simulated LiDAR), and the target is the scene `wild` with another seed and other sensors.
+All methods are trained on the same people of it and scored on the same other people.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,41 +17,41 @@ from lidarpose.errors import InputError, check_name
 from lidarpose.paper.steps import Step
 from lidarpose.train.recipes import MODELS, PAPER, SMALL_PAPER, TINY_PAPER
 
-# of the paper's figures
+# protocol of the paper's scores
 PROTOCOL = "dapt"
-# real sets of a table's columns, and what else a row may read
+# real sets that are columns of a table, and other data that a row may read
 REAL = ("waymo", "humanm3", "lidarhuman26m", "sloper4d")
 CORPORA = ("lipd", "freemotion", "noisemotion")
 POSES = ("freemotion-poses", "lidarhuman26m-poses")
-# the user's SMPL file, the body of people synthesized of those poses
+# the user's SMPL file, the body of people that are synthesized from those poses
 SMPL = "smpl"
-# on real sets everybody learns from the crops and about the centers that the protocol scores by
+# on real sets all methods are trained on the crops, and about the centers, that the protocol scores with
 _RELEASED, _RELEASED_CLIPS = ("--augment", "paper"), ("--options", "trans_center=true")
-# clips of the stand-in are few, and other rows' people are turned there
+# the stand-in has few clips, so they are rotated, as the people of other rows are there
 _TURNED = ("--augment", "turn")
-# people of the stand-in: to learn from at most, to be scored on at most, and their seeds, which nothing else has
+# the stand-in's people: maximum numbers for training and for scoring, and their seeds, which are used nowhere else
 _TRAIN, _TEST = 10_000, 2_000
 _SEEDS = {"train": 1_000_003, "test": 1_000_033}
-# sensors of the stand-in's target, none of them the pre-training's
+# sensors of the stand-in's target, none of them used in pre-training
 _SENSORS = "waymo-top,os1-128,hdl-64e,vlp-32c"
 _CLIP = 16
-# published rates and schedules are those of the full sizes and of many more steps
+# the published rates and schedules are meant for the full sizes and for many more steps
 _FASTER = ("--rate", "2e-3")
 _ONE_CYCLE = (*_FASTER, "--schedule", "cosine", "--warmup", "0.04")
-# Adam moves a weight by the rate a step, and logits of narrow heatmaps are large (docs/log.md)
+# an Adam step moves a weight by about the learning rate, and logits of narrow heatmaps are large (docs/log.md)
 _HEATMAP_RATE = ("--heatmap-rate", "10")
-# necks and heads of the paper's network that have none
+# necks and heads that make the paper's network one without heatmaps
 _NO_HEATMAPS = {"prn", "coordinates"}
 _KEPT = ("0.5", "0.6", "0.7", "0.8", "0.9")
-# r_keep of the recipe, which needs no option
+# r_keep of the recipe, for which no option is given
 _RECIPE_KEEP = "0.6"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """What was asked for. people: budget of a stage of training; hours: of a row's training in all; size: of the
-    paper's network, and by it the baselines' widths, published or reduced; seeds; data: name -> folder, see `REAL`,
-    `CORPORA`, `POSES` and `SMPL`; motion: files of captured motion, subjects of the first one to learn from and
+    """The options of a run. people: budget of one training stage; hours: limit for all training of a row; size: of the
+    paper's network, which also determines the baselines' widths, published or reduced; seeds; data: name -> folder, see
+    `REAL`, `CORPORA`, `POSES` and `SMPL`; motion: files of captured motion; subjects of the first one for training, and
     held_out ones for the target; workers: of each command."""
 
     people: int = 200_000
@@ -79,14 +79,14 @@ class Options:
 
     @property
     def real(self) -> tuple[str, ...]:
-        """The real sets that are there."""
+        """The real sets that are available."""
         return tuple(name for name in REAL if name in self.data)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Target:
-    """A column: what is learned from and what is scored, a step or a folder; learn, score: options of finetune and
-    evaluate; thinned: of finetune, where a network reads single frames; clips: of consecutive frames with rotations."""
+    """A column: training and test data, each a step or a folder; learn, score: options of finetune and evaluate; clips:
+    whether it has consecutive frames with rotations; thinned: options of finetune for networks of single frames."""
 
     name: str
     title: str
@@ -100,7 +100,7 @@ class Target:
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """A row's place in a column. evaluation: its last step, None where there is none, and why; published: MPJPE mm of
+    """A row in a column. evaluation: its last step, None if it cannot be run; why: the reason; published: MPJPE mm in
     the paper."""
 
     row: str
@@ -113,7 +113,7 @@ class Cell:
 
     @property
     def training(self) -> tuple[Step, ...]:
-        """Its training steps, the last one last."""
+        """Its training steps, in order."""
         steps = self.evaluation.all() if self.evaluation else ()
         return tuple(step for step in steps if step.kind in ("pretrain", "finetune"))
 
@@ -126,8 +126,8 @@ class Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """name; title; columns: real sets that it is of; rows: (options) -> each row; reference: the row that the others
-    are compared with; score: options of evaluate; single: the stand-in has no clips."""
+    """name; title; columns: its real sets; rows: (options) -> rows; reference: the row that the others are compared
+    with; score: options of evaluate; single: the stand-in has no clips."""
 
     name: str
     title: str
@@ -140,8 +140,8 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """A method. pretrain: options of its pre-training, None for none; finetune: its options besides --init; why: it
-    cannot be run, "" where it can; clips: it needs clips; published: MPJPE mm by real set."""
+    """A method. pretrain: options of its pre-training, None for none; finetune: its options besides --init; why: the
+    reason why it cannot be run, "" if it can; clips: it needs clips; published: MPJPE mm by real set."""
 
     name: str
     finetune: tuple[str, ...]
@@ -157,7 +157,7 @@ class Row:
 
 
 def _check_prepared(name: str, folder: str) -> None:
-    """Raises InputError unless a folder holds this dataset as prepared."""
+    """Raises InputError unless the folder holds this dataset in prepared form."""
     if not (Path(folder) / CARD).is_file():
         raise InputError(f"{name}={folder} is no prepared dataset: run lidarpose prepare first")
     content = read_card(folder).settings.get("dataset", "synthetic people")
@@ -166,13 +166,13 @@ def _check_prepared(name: str, folder: str) -> None:
 
 
 def row_key(name: str) -> str:
-    """A row's name as --rows has it; of a corpus synthesized of poses alone (a dagger) it ends in -poses."""
+    """A row's name as given to --rows; for a corpus synthesized from poses alone (with a dagger) it ends in -poses."""
     name = name.lower().replace("†", " poses")
     return "-".join("".join(c if c.isalnum() or c == "." else " " for c in name).split())
 
 
 def cells(table: Table, options: Options, chosen: Sequence[str] = ()) -> list[Cell]:
-    """The cells of a table, those of the rows chosen, by default of all. Raises InputError for an unknown row."""
+    """The cells of a table in the chosen rows, by default in all. Raises InputError for an unknown row."""
     rows = table.rows(options)
     for key in chosen:
         check_name(f"row of {table.name}", key, [row_key(row.name) for row in rows])
@@ -197,7 +197,7 @@ def _cell(row: Row, target: Target, seed: int, score: tuple[str, ...], options: 
         init = ("--init", pretraining)
     learn = target.learn if row.clips else (*target.learn, *target.thinned)
     finetuning = Step(("finetune", target.train, *row.finetune, *init, *learn, *run_words), hours)
-    # as the released code decodes heatmaps
+    # the released code decodes heatmaps in this way
     decoding = ("--decode", "dark") if options.real and row.heatmaps else ()
     words = ("evaluate", finetuning, target.test, *target.score, *decoding, *score)
     return replace(cell, evaluation=Step(words))
@@ -219,7 +219,7 @@ def _targets(table: Table, options: Options) -> list[Target]:
 
 
 def _real(name: str, folder: str) -> Target:
-    """Paper: implementation details. HumanM3 and LiDARHuman26M are thinned out by 5."""
+    """Paper: implementation details. HumanM3 and LiDARHuman26M are thinned out to every fifth frame."""
     thinned = ("--interval", "5") if name in ("humanm3", "lidarhuman26m") else ()
     clips = name in ("lidarhuman26m", "sloper4d")
     score = ("--protocol", PROTOCOL)
@@ -248,8 +248,8 @@ def _stand_in(name: str, title: str, options: Options) -> Target:
 
 
 def _paper(options: Options, *words: str) -> tuple[str, ...]:
-    """Options of a training of the paper's network; fine-tuning on synthesized people is centered on the points, as
-    everybody's there, where the paper's own is centered on labels."""
+    """Options of a training of the paper's network. On synthesized people, fine-tuning centers on the points, as all
+    methods do there; the paper's own fine-tuning centers on labels."""
     return ("--recipe", "paper", *(() if options.size == PAPER else _FASTER), *words)
 
 
@@ -260,26 +260,26 @@ def _pretrained(options: Options, *words: str, motion: tuple[str, ...] | None = 
 
 
 def _motion(options: Options) -> tuple[str, ...]:
-    """Where poses of pre-training come from: LiDARHuman26M's where they are, else the first file of motion."""
+    """Options for the poses of pre-training: LiDARHuman26M's if available, else those of the first motion file."""
     if "lidarhuman26m-poses" in options.data:
         return _corpus(options, "lidarhuman26m-poses")
     return _captured(options.motion[0], options.subjects) if options.motion else ()
 
 
 def _corpus(options: Options, name: str) -> tuple[str, ...]:
-    """The poses of a corpus alone, on the user's SMPL body where there is one."""
+    """Options for the poses of one corpus alone, on the user's SMPL body if available."""
     source = options.data.get(name, "")
     body = ("--body", options.data[SMPL]) if SMPL in options.data else ()
     return (*_captured(source, _learned(source) if name == "lidarhuman26m-poses" else ""), *body)
 
 
 def _captured(source: str, subjects: str) -> tuple[str, ...]:
-    """Captured motion of these subjects alone, "" for all."""
+    """Options for captured motion alone, of the given subjects; "" for all."""
     return ("--motion", source, *(("--subjects", subjects) if subjects else ()), "--captured", "1")
 
 
 def _learned(raw: str) -> str:
-    """The subjects of LiDARHuman26M's raw folder that are not of the split test; "" where none is."""
+    """The subjects of LiDARHuman26M's raw folder that are not in the test split; "" if none is in it."""
     sequences = sorted(path.name for path in (Path(raw) / POSE_FOLDER).glob("*") if path.is_dir())
     rule = split_rule("lidarhuman26m", Path(raw)) if sequences else None
     subjects = [f"{POSE_FOLDER}/{name}" for name in sequences if rule is not None and rule.of_part(name) != "test"]
@@ -287,7 +287,7 @@ def _learned(raw: str) -> str:
 
 
 def _tuned(options: Options, *words: str) -> tuple[str, ...]:
-    """Options of the paper's fine-tuning, by heatmaps unless `words` names what has none."""
+    """Options of the paper's fine-tuning, with heatmaps unless `words` names a neck or head without them."""
     heatmap_rate = () if options.size == PAPER or _NO_HEATMAPS & set(words) else _HEATMAP_RATE
     return _paper(options, *heatmap_rate, *(() if options.real else ("--augment", "default")), *words)
 
@@ -304,7 +304,7 @@ def _methods(options: Options) -> list[Row]:
     """Table 1."""
     prn, size = ("--neck", "prn"), "tiny" if options.size == TINY_PAPER else "small"
     released_options = _RELEASED if options.real else ()
-    # the other recipes mix in nobody and hold nobody out
+    # the other recipes neither mix in synthesized people nor hold people out
     equal_people = ("--mix", "0", "--hold-out", "0") if options.real else ()
     lpformer = _baseline(options, "lpformer", *released_options)
     return [
@@ -323,8 +323,8 @@ def _methods(options: Options) -> list[Row]:
 
 
 def _baseline(options: Options, model: str, *words: str) -> tuple[str, ...]:
-    """Options of a baseline's training, at the width that goes with the size of the paper's network; the reduced ones
-    by the cycle of rates that the paper's network has."""
+    """Options of a baseline's training, at the width that matches the size of the paper's network. Reduced sizes use
+    the same learning-rate cycle as the paper's network."""
     cycle = () if options.size == PAPER else _ONE_CYCLE
     return ("--model", model, "--size", model + options.size.removeprefix(PAPER), *cycle, *words)
 
@@ -342,7 +342,7 @@ def _dapt(options: Options, published: dict[str, float], name: str = "DAPT") -> 
 
 
 def _corpora(options: Options) -> list[Row]:
-    """Table 2. The stand-in has no corpora: poses of each file of motion, and those of the procedural prior."""
+    """Table 2. The stand-in has no corpora: it uses poses of each motion file, and of the procedural prior."""
     finetune = _tuned(options)
     rows = [Row(name="w/o", finetune=_random(options), published=_published(59.2, None, 76.5))]
     if not options.real:
@@ -383,7 +383,7 @@ def _components(options: Options) -> list[Row]:
 
 
 def _augmentations(options: Options) -> list[Row]:
-    """Table 4a, and Table 4b, whose r_keep of 0.6 is the last row of 4a."""
+    """Table 4a, and Table 4b, where r_keep 0.6 equals the last row of 4a."""
     finetune, motion = _tuned(options), _motion(options)
     pretrain_recorded, pretrain_sampled = (
         _pretrained(options, *words) for words in (("--set", "recorded=1,keep=1"), ("--keep", "1"))
@@ -403,7 +403,7 @@ def _augmentations(options: Options) -> list[Row]:
 
 
 def _compared(options: Options) -> list[Row]:
-    """Figures 7 and 8: the methods, and the paper's network without its parts."""
+    """Figures 7 and 8: the methods, and the paper's network with parts removed."""
     rows = {row.name: row for row in (*_components(options), *_augmentations(options), *_methods(options))}
     names = {"PRN": "PRN", "LPFormer": "LPFormer", "DAPT": "DAPT", "anchors + heatmaps": "DAPT without MDE"}
     names |= {"scratch": "DAPT without pre-training", "ours": "ours"}

@@ -1,4 +1,4 @@
-"""The assignment of rows to columns that costs least in all."""
+"""Assignment of rows to columns with the least total cost."""
 
 from collections.abc import Callable
 from functools import cache
@@ -7,9 +7,9 @@ import numpy as np
 
 
 def assign(costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of the least sum of costs, of as many rows and columns as pay: who has no pair costs 0.
+    """The pairs with the least total cost, where a row or column without a pair costs 0: only negative costs pair.
 
-    costs (N, B): inf for what cannot be a pair. Returns rows (k,) ascending and their columns (k,).
+    costs (N, B): inf for pairs that are not allowed. Returns rows (k,) ascending and their columns (k,).
     """
     clipped_costs = np.minimum(np.asarray(costs, float), 0.0)
     rows, columns = _solver()(clipped_costs)
@@ -29,7 +29,7 @@ def _solver() -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
 def assign_plain(costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """As scipy's `linear_sum_assignment`, for finite costs (N, B): min(N, B) pairs, rows ascending.
 
-    Source: Jonker and Volgenant 1987: each row in turn takes its place by the shortest augmenting path.
+    Source: Jonker and Volgenant 1987: each row in turn is assigned along the shortest augmenting path.
     """
     costs = np.asarray(costs, float)
     if costs.shape[0] > costs.shape[1]:
@@ -40,7 +40,7 @@ def assign_plain(costs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     row_price, column_price = np.zeros(count), np.zeros(width)
     row_of = np.full(width, -1)
     for start in range(count):
-        # Dijkstra over columns: distance so far, the column before, and whether it is settled
+        # Dijkstra over columns: distance so far, the previous column, and whether it is settled
         distance, predecessor, is_settled = np.full(width, np.inf), np.full(width, -1), np.zeros(width, bool)
         row, column, min_distance = start, -1, 0.0
         while row >= 0:

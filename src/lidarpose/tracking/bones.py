@@ -1,4 +1,4 @@
-"""Bones that keep their length: estimated over a track, then kept in each frame.
+"""Bones of constant length: estimated over a track, then enforced in each frame.
 
 Legend: T frames, J joints, E bones.
 """
@@ -7,18 +7,18 @@ import numpy as np
 
 from lidarpose.skeleton import BODY26, Skeleton
 
-# rounds over all bones, of a track and of a single frame
+# passes over all bones, for a track and for a single frame
 _ROUNDS, _LIVE_ROUNDS = 15, 3
-# a joint's expected place is pulled towards where it may be elsewhere, which shortens bones: a squared length lacks so
-# much of the ends' variance
+# predicted joints are pulled towards their other possible positions, which shortens bones: a squared length is too
+# small by this multiple of the variance of its ends
 _SHORT = 0.1
-# frames count by the inverse variance to this power
+# frames are weighted by the inverse variance to this power
 _POWER = 2.0
 
 
 def rigid_bones(skeleton: Skeleton) -> np.ndarray:
-    """(E, 2) pairs of joints whose distance does not change when a person moves: bones that are bones of SMPL's tree
-    too, and the hips; of skeletons with joints of other names the limbs that they share with it."""
+    """(E, 2) pairs of joints with a constant distance when a person moves: the bones of body26's tree, the hips, and
+    the nose with the center of the head; those whose joints the skeleton has, by name."""
     pairs = [(BODY26.joints[parent], child) for child, parent in zip(BODY26.joints, BODY26.parents, strict=True)]
     pairs = [*pairs[1:], ("left_hip", "right_hip"), ("nose", "head_center")]
     joint_index = {name: i for i, name in enumerate(skeleton.joints)}
@@ -28,8 +28,8 @@ def rigid_bones(skeleton: Skeleton) -> np.ndarray:
 
 
 def length_statistics(joints: np.ndarray, variance: np.ndarray, bones: np.ndarray) -> np.ndarray:
-    """(..., E, 2) of joints (..., J, 3) m with variance (..., J) m^2: what a frame says of the squared length of each
-    bone (E, 2), times its weight, and the weight. Sums over frames are what `lengths_of` takes."""
+    """(..., E, 2) from joints (..., J, 3) m with variance (..., J) m^2: for each bone (E, 2) of a frame, the weighted
+    squared length and the weight. `lengths_of` takes their sums over frames."""
     squared = ((joints[..., bones[:, 0], :] - joints[..., bones[:, 1], :]) ** 2).sum(-1)
     end_variance = variance[..., bones[:, 0]] + variance[..., bones[:, 1]]
     weight = end_variance**-_POWER
@@ -37,7 +37,7 @@ def length_statistics(joints: np.ndarray, variance: np.ndarray, bones: np.ndarra
 
 
 def lengths_of(total: np.ndarray, bones: np.ndarray, flip: tuple[int, ...]) -> np.ndarray:
-    """(E,) m: lengths of bones (E, 2), the same left and right, from a sum (E, 2) of `length_statistics`. flip: as in
+    """(E,) m: lengths of bones (E, 2), equal for left and right, from a sum (E, 2) of `length_statistics`. flip: as in
     `Skeleton`."""
     bone_index = {frozenset(bone): i for i, bone in enumerate(bones.tolist())}
     mirror_index = [bone_index[frozenset((flip[a], flip[b]))] for a, b in bones.tolist()]
@@ -46,7 +46,7 @@ def lengths_of(total: np.ndarray, bones: np.ndarray, flip: tuple[int, ...]) -> n
 
 
 def keep_lengths(joints: np.ndarray, variance: np.ndarray, bones: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Joints (..., J, 3) m moved so that bones (E, 2) have lengths (E,) m; those of large variance (..., J) move most
+    """Moves joints (..., J, 3) m so that bones (E, 2) have lengths (E,) m; joints of large variance (..., J) move most
     (position-based dynamics: Mueller et al. 2007)."""
     joints = joints.copy()
     for _ in range(_ROUNDS if joints.ndim > 2 else _LIVE_ROUNDS):

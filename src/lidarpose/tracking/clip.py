@@ -1,4 +1,4 @@
-"""One person's poses over time, as smoothing takes and gives them."""
+"""One person's poses over time: the input and output of smoothing."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,13 +9,13 @@ from lidarpose.errors import InputError
 from lidarpose.sample import Pose
 from lidarpose.skeleton import Skeleton
 
-# what a track may hold of each joint besides its place
+# optional values per joint of a track
 _PER_JOINT = ("spread", "visible", "confidence")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackPoses:
-    """One person through T frames, in a frame of coordinates that stays where it is (z up).
+    """One person over T frames, in a fixed coordinate frame (z up).
 
     times (T,) s, increasing; joints (T, J, 3) m, NaN where the person was not seen; spread (T, J) m, the expected
     distance between joint and truth, or None; visible, confidence (T, J) in [0, 1] or None; filled (T,) bool: frames
@@ -53,7 +53,7 @@ class TrackPoses:
 
     @classmethod
     def of_poses(cls, times: np.ndarray, poses: list[Pose | None], skeleton: Skeleton) -> "TrackPoses":
-        """From a pose a frame, None where the person was not seen."""
+        """From one pose per frame, None where the person was not seen."""
         seen_poses = [pose for pose in poses if pose is not None]
         values: dict[str, Any] = {}
         for name in ("joints", *_PER_JOINT):
@@ -66,7 +66,7 @@ class TrackPoses:
         return cls(times=np.asarray(times, float), skeleton=skeleton, **values)
 
     def pose(self, row: int) -> Pose | None:
-        """The pose of a frame, None where there is none."""
+        """The pose of a frame, None without joints."""
         if not np.isfinite(self.joints[row]).all():
             return None
         values = {name: getattr(self, name) for name in _PER_JOINT}

@@ -1,7 +1,7 @@
-"""Which way a person faces, settled over a whole track.
+"""The direction that a person faces, corrected over a whole track.
 
-From points alone front and back look alike: now and then a network turns a person round, and what it calls left is
-right. A frame has two hypotheses, as predicted and with left and right exchanged; the best path through them is found.
+Front and back look alike in a point cloud: sometimes a network flips a person, so that left and right are exchanged.
+Each frame has two hypotheses, as predicted and with left and right exchanged; the best path through them is found.
 
 Legend: T frames, J joints.
 """
@@ -10,35 +10,35 @@ import numpy as np
 
 from lidarpose.skeleton import Skeleton
 
-# log odds that a frame is the right way round, times the mean confidence of its joints
+# log odds that a frame is not flipped, per unit of the mean confidence of its joints
 _SURE = 6.0
-# what confidence is taken for where the network does not say
+# confidence if the network does not predict it
 _CONFIDENCE = 0.6
-# cost of a frame flipped against the one before: nobody turns about in a tenth of a second, and it falls by e with each
-# further half second, s
+# cost of flipping a frame relative to the one before: a person cannot turn around within a tenth of a second, and the
+# cost falls by a factor of e with each further half second; times in s
 _TURN, _TURN_STEP, _TURN_TIME = 40.0, 0.1, 0.5
-# what is across the body
+# joints whose left-right pairs define the axis across the body
 _ACROSS = ("hip", "shoulder")
-# log odds for walking forwards rather than backwards, at most, and the speed of half as much, m/s
+# maximum log odds for walking forwards rather than backwards; at this speed, m/s, they are 71 % (1 / sqrt 2) of it
 _FORWARD, _WALK = 0.3, 0.7
 
 
 def swapped_frames(
     times: np.ndarray, joints: np.ndarray, variance: np.ndarray, confidence: np.ndarray | None, skeleton: Skeleton
 ) -> np.ndarray:
-    """(T,) bool: the frames in which left and right are to be exchanged.
+    """(T,) bool: the frames in which left and right must be exchanged.
 
     times (T,) s; joints (T, J, 3) m, all seen; variance (T, J) m^2; confidence (T, J) or None.
     """
     flip = np.array(skeleton.flip)
     frame_confidence = np.full(len(times), _CONFIDENCE) if confidence is None else confidence.mean(1)
     log_odds = _SURE * frame_confidence + _forward_log_odds(times, joints, skeleton)
-    # joints in the middle are their own mirror: nothing is across
+    # joints on the midline are their own mirror image: their difference is 0
     similarity = _cosine_similarity(joints - joints[:, flip], variance + variance[:, flip])
     turn_cost = _TURN * np.minimum(1.0, np.exp((_TURN_STEP - np.diff(times)) / _TURN_TIME)) * similarity
     costs, backpointers = np.array([0.0, log_odds[0]]), np.zeros((len(times), 2), int)
     for row in range(1, len(times)):
-        # [before, now]
+        # [state before, state now]
         total = costs[:, None] + turn_cost[row - 1] * (1 - np.eye(2))
         backpointers[row] = total.argmin(0)
         costs = total.min(0) + [0, log_odds[row]]
@@ -51,7 +51,7 @@ def swapped_frames(
 
 
 def _cosine_similarity(offsets: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """(T - 1,) in [-1, 1]: how far the ways from right to left joints (T, J, 3) m are those of the frame before."""
+    """(T - 1,) in [-1, 1]: similarity of a frame's right-to-left vectors (T, J, 3) m to those of the one before."""
     weight = 1 / np.sqrt(variance[1:] * variance[:-1])
     product = (weight * (offsets[1:] * offsets[:-1]).sum(-1)).sum(-1)
     previous_square, current_square = ((weight * (part**2).sum(-1)).sum(-1) for part in (offsets[:-1], offsets[1:]))
@@ -59,7 +59,7 @@ def _cosine_similarity(offsets: np.ndarray, variance: np.ndarray) -> np.ndarray:
 
 
 def _forward_log_odds(times: np.ndarray, joints: np.ndarray, skeleton: Skeleton) -> np.ndarray:
-    """(T,) log odds that a frame is the right way round, from where the person goes."""
+    """(T,) log odds that a frame is not flipped, from the direction in which the person moves."""
     pairs = [(name, f"right_{part}") for name in skeleton.joints if (part := name.removeprefix("left_")) in _ACROSS]
     if not pairs or len(times) < 2:
         return np.zeros(len(times))

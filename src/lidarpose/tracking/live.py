@@ -1,4 +1,4 @@
-"""A person's poses made steady as frames come: `LiveFilter` knows the past only."""
+"""Online smoothing of a person's poses: `LiveFilter` uses the past only."""
 
 from dataclasses import replace
 from typing import Any
@@ -21,17 +21,17 @@ from lidarpose.tracking.smoothing import (
     steady_spread,
 )
 
-# how fast joints are expected to move at first, standard deviation m/s, which steadies the first frames
+# standard deviation of the joints' initial velocities, m/s; a small one steadies the first frames
 _SPEED = 1.0
-# degrees of freedom by which frames are trusted: what is new may be true
+# degrees of freedom of the t-distribution that weights frames: more than in `smooth`, since a deviation may be real
 _FREEDOM = 2.0
 
 
 class LiveFilter:
-    """One person's poses, made steady frame by frame: `update` takes a frame's pose and gives the steady one.
+    """Smooths one person's poses frame by frame: `update` takes a frame's pose and returns the smoothed one.
 
-    The model is that of `smooth`, of which this is the half that looks back; only a frame that is flipped is not
-    turned back, but hardly counts. skeleton: of all the poses.
+    The model is that of `smooth`, but it only looks back, and a flipped frame is not corrected but gets little weight.
+    skeleton: of all the poses.
     """
 
     def __init__(self, skeleton: Skeleton):
@@ -49,11 +49,11 @@ class LiveFilter:
         self._state = KalmanState.unknown((len(SCALES), len(skeleton)), _SPEED)
 
     def update(self, time: float, pose: Pose | None) -> Pose | None:
-        """The steady pose at `time` s, later than the last one's; pose: as predicted, None where the person was not
-        seen. None before the first pose, and once nothing was seen for `MAX_GAP` s."""
+        """The smoothed pose at `time` s, which must be later than in the last call; pose: as predicted, None if the
+        person was not seen. Returns None before the first pose, and if no pose was seen for `MAX_GAP` s."""
         step = 0.0 if self._time is None else time - self._time
         if self._seen is not None and time - self._seen > MAX_GAP:
-            # whoever comes back may be anywhere
+            # after a long gap the person may be anywhere
             self.__init__(self.skeleton)  # type: ignore[misc]
             step = 0.0
         self._time = time
@@ -74,7 +74,7 @@ class LiveFilter:
         return replace(pose, joints=joints, spread=spread)
 
     def _add(self, step: float, joints: np.ndarray, spread: np.ndarray) -> None:
-        """Learns from a frame's joints (J, 3) m about the origin and their spread (J,) m."""
+        """Updates the filter with a frame's joints (J, 3) m, relative to the origin, and their spread (J,) m."""
         arrays, precision = self._arrays, precisions(spread)
         forecast = self._state.predicted(step, SCALES[:, None] * self._usual)
         if self._frames >= LEAST_FRAMES:
@@ -90,7 +90,7 @@ class LiveFilter:
         self._frames += 1
 
     def _estimate(self) -> tuple[np.ndarray, np.ndarray]:
-        """Joints (J, 3) m and their spread (J,) m."""
+        """The smoothed joints (J, 3) m and their spread (J,) m."""
         probabilities = self._arrays["scale_probabilities"]
         mean = (probabilities[..., None] * self._state.position).sum(0)
         variance = (probabilities * self._state.variance).sum(0)
@@ -100,7 +100,7 @@ class LiveFilter:
         return mean + self._arrays["origin"], steady_spread(variance, self._arrays["precision_sum"] / self._frames)
 
     def state(self) -> dict[str, Any]:
-        """All it knows as JSON holds it; `from_state` goes on from there."""
+        """The complete state of the filter, for JSON; `from_state` restores it."""
         return {
             "skeleton": self.skeleton.name,
             "time": self._time,
@@ -112,7 +112,7 @@ class LiveFilter:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> "LiveFilter":
-        """The filter of a `state`."""
+        """The filter restored from a `state`."""
         live_filter = cls(skeleton_of(state["skeleton"]))
         live_filter._time, live_filter._seen, live_filter._frames = state["time"], state["seen"], state["frames"]
         live_filter._arrays = {name: np.array(value) for name, value in state["arrays"].items()}
@@ -121,6 +121,6 @@ class LiveFilter:
 
 
 def filter_track(track: TrackPoses) -> list[Pose | None]:
-    """The steady pose of each frame of a track, from that frame and those before."""
+    """The smoothed pose of each frame of a track, from that frame and those before."""
     live_filter = LiveFilter(track.skeleton)
     return [live_filter.update(float(time), pose) for time, pose in zip(track.times, track.poses(), strict=True)]

@@ -1,8 +1,8 @@
-"""How joints move: every joint's velocity drifts at random, and how fast it drifts is learned from the track itself.
+"""How joints move: each joint's velocity drifts at random, at a rate that is learned from the track itself.
 
 Each joint is a Kalman filter of position and velocity whose acceleration is white noise (an integrated Wiener process,
 whose smoother is a cubic smoothing spline), the same on x, y and z. Its density is one of `SCALES` times the joint's
-usual one: filters of all scales run side by side, and what they foretell of the next frame says which one holds.
+usual one: filters of all scales run in parallel, and how well each predicts the next frame tells which scale holds.
 
 Legend: T frames, S scales, J joints.
 """
@@ -17,13 +17,13 @@ from lidarpose.skeleton import Skeleton
 _PROCESS_NOISE = {"hand": 0.4, "wrist": 0.25, "elbow": 0.07, "foot": 0.06, "ankle": 0.055, "nose": 0.08, "head": 0.07}
 _TRUNK = 0.035
 SCALES = 10.0 ** np.arange(-2.0, 2.1, 0.5)
-# how long a scale holds, s
+# time constant with which the scale changes, s
 _SCALE_TIME = 20.0
-# how far a joint's scale is that of the whole body: the weight of the other joints' log likelihoods
+# coupling of a joint's scale to the whole body: the weight of the other joints' log likelihoods
 _SHARED = 0.05
-# standard deviation of velocities before the first frame, m/s: anything, where the frames to come will tell
+# standard deviation of velocities before the first frame, m/s: large, since later frames determine the velocity
 _ANY_SPEED = 5.0
-# a position that is not known, variance m^2
+# variance of an unknown position, m^2
 _ANYWHERE = 1e4
 
 
@@ -46,13 +46,13 @@ class KalmanState:
 
     @classmethod
     def unknown(cls, shape: tuple[int, ...], speed: float = _ANY_SPEED) -> "KalmanState":
-        """Of joints that may be anywhere, moving about that fast, m/s."""
+        """The state of joints at an unknown position, with velocities of standard deviation `speed` m/s."""
         zeros = np.zeros(shape)
         vector = np.zeros((*shape, 3))
         return cls(vector, vector, zeros + _ANYWHERE, zeros, zeros + speed**2)
 
     def predicted(self, step: float, process_noise: np.ndarray) -> "KalmanState":
-        """`step` s later."""
+        """The state predicted for `step` s later."""
         covariance = self.covariance + step * self.velocity_variance
         return KalmanState(
             self.position + step * self.velocity,
@@ -63,7 +63,7 @@ class KalmanState:
         )
 
     def updated(self, joints: np.ndarray, precision: np.ndarray) -> tuple["KalmanState", np.ndarray]:
-        """After joints (J, 3) m were seen with precision (J,) 1/m^2, 0 for not at all; and the log
+        """The state after an observation of joints (J, 3) m with precision (J,) 1/m^2, 0 if not observed; and its log
         likelihood (...)."""
         gain = precision / (1 + self.variance * precision)
         offset = joints - self.position
@@ -82,10 +82,10 @@ class KalmanState:
 def smooth_joints(
     times: np.ndarray, joints: np.ndarray, precision: np.ndarray, process_noise: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The best path (T, J, 3) m and its variance (T, J) m^2 on each axis, from all frames (Rauch, Tung and Striebel).
+    """The smoothed path (T, J, 3) m and its variance (T, J) m^2 on each axis, from all frames (Rauch, Tung, Striebel).
 
-    times (T,) s; joints (T, J, 3) m, precision (T, J) 1/m^2, 0 where not seen; process_noise (T, J) m^2/s^3, that of
-    the time before each frame.
+    times (T,) s; joints (T, J, 3) m, precision (T, J) 1/m^2, 0 where not seen; process_noise (T, J) m^2/s^3, for the
+    time before each frame.
     """
     state = KalmanState.unknown(joints.shape[1:2])
     steps = np.diff(times, prepend=times[0])
@@ -104,7 +104,7 @@ def smooth_joints(
 
 
 def _backward(state: KalmanState, forecast: KalmanState, next_state: KalmanState, step: float) -> KalmanState:
-    """The state of a frame, once the frame after it, forecast from it, is known."""
+    """The smoothed state of a frame, from its forecast of the next frame and that frame's smoothed state."""
     determinant = forecast.variance * forecast.velocity_variance - forecast.covariance**2
     # the rows of (covariance with the next frame) (forecast's covariance)^-1
     gains = []
@@ -142,7 +142,7 @@ def _backward(state: KalmanState, forecast: KalmanState, next_state: KalmanState
 
 
 def learn_process_noise(times: np.ndarray, joints: np.ndarray, precision: np.ndarray, usual: np.ndarray) -> np.ndarray:
-    """(T, J) m^2/s^3: how strongly each joint's velocity drifts about each frame. usual (J,): see
+    """(T, J) m^2/s^3: the process noise, or velocity drift, of each joint around each frame. usual (J,): see
     `usual_process_noise`."""
     state = KalmanState.unknown((len(SCALES), joints.shape[1]))
     steps = np.diff(times, prepend=times[0])
@@ -151,7 +151,7 @@ def learn_process_noise(times: np.ndarray, joints: np.ndarray, precision: np.nda
     for row, step in enumerate(steps):
         state, log_likelihoods[row] = state.predicted(step, process_noise).updated(joints[row], precision[row])
     log_likelihood = pooled(log_likelihoods)
-    # how the scales follow each other is a hidden Markov chain: forward, then backward
+    # the scales form a hidden Markov chain: forward pass, then backward pass
     forward, backward = np.empty_like(log_likelihood), np.empty_like(log_likelihood)
     probabilities = np.full(process_noise.shape, 1 / len(SCALES))
     for row, step in enumerate(steps):
@@ -166,17 +166,17 @@ def learn_process_noise(times: np.ndarray, joints: np.ndarray, precision: np.nda
 
 
 def pooled(log_likelihoods: np.ndarray) -> np.ndarray:
-    """Log likelihoods (..., J) of a joint with a share of all the others'."""
+    """Log likelihoods (..., J) of the joints, each with a share of all the others'."""
     return (1 - _SHARED) * log_likelihoods + _SHARED * log_likelihoods.sum(-1, keepdims=True)
 
 
 def scale_probabilities_after(probabilities: np.ndarray, step: float, log_likelihood: np.ndarray) -> np.ndarray:
-    """Probabilities (S, J) of the scales `step` s later, with the log likelihood (S, J) of that frame."""
+    """Probabilities (S, J) of the scales `step` s later, updated with the log likelihood (S, J) of that frame."""
     return _normalized(_after_transition(probabilities, step) * np.exp(log_likelihood - log_likelihood.max(0)))
 
 
 def _after_transition(probabilities: np.ndarray, step: float) -> np.ndarray:
-    """Any scale may follow after a while."""
+    """Probabilities (S, J) of the scales `step` s later: over time a scale may change to any other."""
     stay_probability = np.exp(-step / _SCALE_TIME)
     return stay_probability * probabilities + (1 - stay_probability) * probabilities.mean(0)
 

@@ -1,4 +1,4 @@
-"""A person's poses made steady over a track: `smooth` for recordings, from all frames."""
+"""Smoothing of a person's poses over a track: `smooth` for recordings, from all frames."""
 
 from dataclasses import replace
 
@@ -10,34 +10,34 @@ from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.facing import swapped_frames
 from lidarpose.tracking.motion_model import learn_process_noise, smooth_joints, usual_process_noise
 
-# frames are trusted by Student's t of so many degrees of freedom: a frame that is off as a whole hardly counts
+# frames are weighted by Student's t with this many degrees of freedom: a frame that is off as a whole hardly counts
 _FREEDOM = 1.0
-# rounds of weighing frames; the process noise is learned before each of the last
+# rounds of weighting frames, and the number of last rounds before each of which the process noise is learned
 _ROUNDS, _LEARNED = 6, 3
-# the process noise of the first rounds, times the usual one: of less, fast motion of the whole body looks like frames
-# that are off
+# process noise of the first rounds, as a multiple of the usual one: with less, fast motion of the whole body looks like
+# frames that are off
 _FIRST_SCALE = 10.0
-# spread where the network does not say, and the least that is believed, m
+# spread if the network does not predict it, and lower bound of a predicted spread, m
 _SPREAD, _LEAST_SPREAD = 0.08, 0.005
-# a joint counts by its spread to the power of -3, which is better than -2: at this spread, m, both are the same
+# a joint's weight is its spread to the power of -3, which works better than -2; at this spread, m, both are equal
 _USUAL_SPREAD = 0.06
-# so much of the deviation along a path, and of the frames' spread, is the spread of a steady joint
+# the spread of a smoothed joint combines these multiples of the path's standard deviation and of the frames' spread
 _PATH, _COMMON = 2.5, 0.8
-# bones are not measured in fewer frames
+# bones are not measured with fewer frames
 LEAST_FRAMES = 3
-# longer gaps, and what is before and after a track, are filled in next to seen frames only, s
+# gaps up to MAX_GAP are filled in; in longer ones, and before and after a track, only frames this near to a seen one, s
 MAX_GAP, _MAX_BEYOND = 2.0, 0.5
-# a frame up to so much earlier than the one before, s, comes late; earlier ones say that the clock was set back
+# a frame up to this much earlier than the one before, s, is late; a larger difference means that the clock was set back
 MAX_LATE = 0.3
-# after so long, s, nothing is known of the motion before; variances of longer steps are beyond what floats resolve
+# after this time, s, nothing is known of the earlier motion; variances of longer steps exceed the precision of floats
 _LONGEST_STEP = 60.0
 
 
 def smooth(track: TrackPoses) -> TrackPoses:
-    """The same track made steady: its facing settled, joints on smooth paths, bones of one length.
+    """The same track smoothed: facing corrected, joints on smooth paths, bones of constant length.
 
-    Frames that were not seen are filled in within gaps of up to `MAX_GAP` s, and within half a second of a frame that
-    was, with a spread that says so, `visible` 0 and `filled` true.
+    Frames in which the person was not seen are filled in within gaps of up to `MAX_GAP` s, and within half a second of
+    a frame with the person. They have a correspondingly larger spread, `visible` 0 and `filled` true.
     """
     is_seen = track.seen
     if not is_seen.any():
@@ -47,7 +47,7 @@ def smooth(track: TrackPoses) -> TrackPoses:
     times, usual = np.cumsum(np.minimum(steps, _LONGEST_STEP)), usual_process_noise(track.skeleton)
     spread = known_spread(track.spread, is_seen, len(usual))
     precision = precisions(spread)
-    # numbers stay small about the first place
+    # relative to the first position, which keeps the numbers small
     origin = track.joints[is_seen][0].mean(0)
     joints = np.where(is_seen[:, None, None], track.joints - origin, 0.0)
     weight = np.ones((len(times), 1))
@@ -67,27 +67,27 @@ def smooth(track: TrackPoses) -> TrackPoses:
 
 
 def known_spread(spread: np.ndarray | None, seen: np.ndarray, count: int) -> np.ndarray:
-    """(T, J) m: spread (T, J) or None of frames seen (T,) bool; infinite where nothing was."""
+    """(T, J) m: spread (T, J), or a default if None, for frames seen (T,) bool; infinite for the others."""
     spread = np.full((len(seen), count), _SPREAD) if spread is None else spread
     return np.where(seen[:, None], np.maximum(spread, _LEAST_SPREAD), np.inf)
 
 
 def precisions(spread: np.ndarray) -> np.ndarray:
-    """1/m^2 of spreads m."""
+    """Spreads m -> precisions 1/m^2, the weights of the joints."""
     return _USUAL_SPREAD * spread**-3
 
 
 def steady_spread(variance: np.ndarray, mean_precision: np.ndarray) -> np.ndarray:
-    """(..., J) m: the expected distance from the truth of joints of that variance m^2 on an axis along their paths.
+    """(..., J) m: the expected distance from the truth of smoothed joints whose paths have this variance m^2 per axis.
 
-    What all frames of a person have in common no smoothing takes away: mean_precision (J,) 1/m^2, mean inverse
-    square of the frames' spread.
+    Errors that all frames of a person share cannot be smoothed away: mean_precision (J,) 1/m^2, mean inverse square of
+    the frames' spread.
     """
     return np.sqrt(_PATH**2 * variance + _COMMON**2 / mean_precision)
 
 
 def with_facing_corrected(track: TrackPoses) -> TrackPoses:
-    """A track whose facing is corrected: left and right are exchanged in the frames that were flipped."""
+    """A track with corrected facing: left and right are exchanged in the flipped frames."""
     rows = np.flatnonzero(track.seen)
     variance = known_spread(track.spread, track.seen, len(track.skeleton))[rows] ** 2
     confidence = None if track.confidence is None else track.confidence[rows]
@@ -102,13 +102,13 @@ def with_facing_corrected(track: TrackPoses) -> TrackPoses:
 
 
 def frame_weights(offset: np.ndarray, precision: np.ndarray, freedom: float = _FREEDOM) -> np.ndarray:
-    """(..., 1): how far a frame is trusted whose joints are off by (..., J, 3) m with precision (..., J) 1/m^2."""
+    """(..., 1): the weight of a frame whose joints are off by (..., J, 3) m with precision (..., J) 1/m^2."""
     squared_error = ((offset**2).sum(-1) * precision).mean(-1, keepdims=True)
     return (freedom + 3) / (freedom + squared_error)
 
 
 def likely_hit(spread: np.ndarray) -> np.ndarray:
-    """The probability that a joint of that spread m is within `CONFIDENCE_RADIUS`, if its distance is Rayleigh's."""
+    """The probability that a joint with this spread, m, is within `CONFIDENCE_RADIUS`, for Rayleigh distances."""
     return 1 - np.exp(-np.pi / 4 * (CONFIDENCE_RADIUS / spread) ** 2)
 
 

@@ -1,9 +1,9 @@
-"""`Tracker`: joins the boxes of people over time, so that everybody keeps one number.
+"""`Tracker`: joins the boxes of people over time, so that each person keeps one id.
 
-A Kalman filter a person holds position and velocity, each axis for itself, all people at once; boxes go to people by
-the assignment that is best for all together. The heading is smoothed apart, since angles wrap.
+A Kalman filter per person holds position and velocity, with independent axes, for all people at once. Boxes are
+assigned to people with the least total cost. The heading is smoothed separately, since angles wrap.
 
-Letters: N tracks, B boxes.
+Legend: N tracks, B boxes.
 """
 
 import reprlib
@@ -17,29 +17,29 @@ from lidarpose.errors import InputError, check_finite
 from lidarpose.sample import Box
 from lidarpose.tracking.assignment import assign
 
-# standard deviation of a sure box's center, m, along x, y and z; its square grows as the score falls, no further than
-# at the least: measured on boxes that were detected
+# standard deviation of the center of a box of score 1, m, along x, y and z; its square is divided by the score, but not
+# by less than _LEAST_SCORE: measured on detected boxes
 POSITION_SD, _LEAST_SCORE = np.array([0.12, 0.12, 0.2]), 0.05
-# people are first seen with a velocity of this standard deviation, m/s, and change it: m/s in one second, which grows
-# with the square root of time
+# standard deviation of the velocity of a new track, m/s, and of its change within one second, m/s, which grows with the
+# square root of time
 SPEED_SD, SPEED_CHANGE = np.array([1.2, 1.2, 0.2]), np.array([0.7, 0.7, 0.15])
-# a box farther from where it is expected belongs to nobody: squared Mahalanobis distance, 99.9 % of a chi-square
-# distribution of three degrees of freedom
+# a box farther from the predicted position is not assigned: squared Mahalanobis distance, 99.9 % of a chi-square
+# distribution with three degrees of freedom
 _GATE = 16.3
-# nor does a box go to somebody who may be anywhere: bound of -2 log likelihood, less a constant
+# a box is not assigned to a track of too uncertain position either: bound of -2 log likelihood, less a constant
 _LEAST_LIKELY = 8.0
-# a weak box so near to another one is the same person again, m
+# a weak box this near to one that is not weak is a duplicate, m
 _REPEATED = 0.5
-# heading and size follow what is seen with this time constant, s
+# time constant with which heading and size follow the boxes, s
 _SMOOTHING = 0.5
-# who was seen once, with a score below this, is forgotten this soon, s
+# a track seen only once, with a score below _SURE, is dropped after _UNSURE_GAP s
 _SURE, _UNSURE_GAP = 0.6, 0.6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackState:
-    """A person who is expected: track's id; center (3,) and size (3,) m, yaw rad of the box; age: seconds since the
-    person was seen; position_sd: standard deviation of the center on a level axis, m."""
+    """An expected person: id of the track; center (3,) and size (3,) m, yaw rad of the box; age: seconds since the
+    person was last seen; position_sd: standard deviation of the center on a horizontal axis, m."""
 
     id: int
     center: np.ndarray
@@ -51,9 +51,9 @@ class TrackState:
 
 @dataclass(kw_only=True, eq=False)
 class _Tracks:
-    """Of all tracks: id (N,), -1: no number yet; state (N, 3, 2): position m and velocity m/s along x, y,
-    z; covariance (N, 3, 2, 2); heading (N, 2): mean of cos and sin of yaw; size (N, 3) m; age (N,) s since seen;
-    sightings (N,); sure (N,) bool: seen twice, or by a box of high score."""
+    """All tracks: id (N,), -1 without an id yet; state (N, 3, 2): position m and velocity m/s along x, y, z; covariance
+    (N, 3, 2, 2); heading (N, 2): mean of cos and sin of yaw; size (N, 3) m; age (N,) s since last seen; sightings (N,);
+    sure (N,) bool: seen twice, or with a high score."""
 
     id: np.ndarray
     state: np.ndarray
@@ -69,7 +69,7 @@ class _Tracks:
 
     @property
     def is_expected(self) -> np.ndarray:
-        """(N,) bool: those with a number that were seen twice or for sure."""
+        """(N,) bool: tracks with an id that were seen twice or with a high score."""
         return self.sure & (self.id >= 0)
 
     def take(self, rows: np.ndarray) -> "_Tracks":
@@ -80,9 +80,9 @@ class _Tracks:
         return _Tracks(**{name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in names})
 
     def after(self, seconds: float) -> "_Tracks":
-        """Where everybody is expected later: constant velocity, changed by white noise."""
+        """The tracks predicted for later: constant velocity, changed by white noise."""
         transition = np.array([[1.0, seconds], [0.0, 1.0]])
-        # integrals of white noise of acceleration
+        # integrals of white noise in acceleration
         noise = np.array([[seconds**3 / 3, seconds**2 / 2], [seconds**2 / 2, seconds]])
         later_tracks = self.take(np.arange(len(self)))
         later_tracks.state = self.state @ transition.T
@@ -92,15 +92,15 @@ class _Tracks:
 
 
 class Tracker:
-    """Gives boxes of people in one fixed frame (z up; the world's where it is known) the numbers of their tracks.
+    """Assigns track ids to the boxes of people, which are in one fixed frame (z up; the world frame if known).
 
-    `jumps_back` counts the times that were earlier than the one before.
+    `jumps_back` counts the frames whose time was earlier than the one before.
 
     Args:
-        max_gap: so long a person may be unseen and keep the number, s.
+        max_gap: how long a person may be unseen and keep the id, s.
 
     Raises:
-        InputError: max_gap is no positive number.
+        InputError: max_gap is not a positive number.
     """
 
     def __init__(self, *, max_gap: float = 2.0):
@@ -114,19 +114,20 @@ class Tracker:
         self._tracks = _of_boxes([])
 
     def update(self, time: float, boxes: Sequence[Box], weak_boxes: Sequence[Box] = ()) -> list[int]:
-        """The boxes of a frame.
+        """Assigns the boxes of a frame to tracks.
 
         Args:
-            time: s, of any beginning. One earlier than the last is counted; by more than `max_gap` it begins anew.
-            boxes: those of all people who are seen.
-            weak_boxes: those that may be people, of low score: they continue tracks and begin none.
+            time: s, from any origin. A time earlier than the last one is counted in `jumps_back`; if it is earlier by
+                more than `max_gap`, all tracks are dropped.
+            boxes: of all people that are seen.
+            weak_boxes: detections of low score: they continue tracks but do not start any.
 
         Returns:
-            The id of the track of each of `boxes`: a known person's, or the next number, from 0; a number is never used
-            again. Then the ids of `weak_boxes`, -1 where they are nobody's.
+            The track id of each of `boxes`: a known person's, or the next new one, from 0; ids are never reused. Then
+            the ids of `weak_boxes`, -1 without a track that has an id.
 
         Raises:
-            InputError: time is no finite number, or what is given are no boxes; the tracks stay as they were.
+            InputError: time is not a finite number, or boxes are not `Box` objects; the tracks stay as they were.
         """
         boxes, weak_boxes = (_checked(own) for own in (boxes, weak_boxes))
         detections = _of_boxes([*boxes, *weak_boxes])
@@ -141,7 +142,7 @@ class Tracker:
         track_rows = np.empty(len(detections), int)
         track_rows[columns], track_rows[new_rows] = rows, len(tracks) + np.arange(len(new_rows))
         tracks = tracks.joined(detections.take(new_rows))
-        # whom only weak boxes showed so far is nobody yet, but keeps them from going to others
+        # tracks of weak boxes alone get no id yet, but keep these boxes from being assigned to other tracks
         new_tracks = track_rows[~is_weak & (tracks.id[track_rows] < 0)]
         tracks.id[new_tracks] = self._next_id + np.arange(len(new_tracks))
         self._next_id += len(new_tracks)
@@ -150,7 +151,7 @@ class Tracker:
         return ids.tolist()
 
     def predicted(self, time: float) -> list[TrackState]:
-        """The people expected at a time, s, not before the last frame's: those who were seen twice or for sure."""
+        """The people expected at a time, s, not before the last frame's: those seen twice or with a high score."""
         check_finite("time", time)
         seconds = 0.0 if self._time is None else max(time - self._time, 0.0)
         if seconds > self.max_gap:
@@ -171,7 +172,7 @@ class Tracker:
         ]
 
     def state(self) -> dict[str, Any]:
-        """All that the tracker knows, as JSON holds it."""
+        """The complete state of the tracker, for JSON."""
         tracks = {field.name: getattr(self._tracks, field.name).tolist() for field in fields(_Tracks)}
         names = ("max_gap", "jumps_back")
         settings = {name: getattr(self, name) for name in names}
@@ -179,7 +180,7 @@ class Tracker:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> "Tracker":
-        """The tracker whose `state()` this is: it goes on as that one would. Raises InputError for anything else."""
+        """The tracker restored from its `state()`. Raises InputError for anything else."""
         try:
             tracker = cls(max_gap=state["max_gap"])
             tracker.jumps_back, tracker._time, tracker._next_id = state["jumps_back"], state["time"], state["next_id"]
@@ -200,17 +201,17 @@ class Tracker:
         return tracker
 
     def _elapsed(self, time: float) -> _Tracks:
-        """The tracks at `time`, without those who have been away for too long."""
+        """The tracks predicted for `time`, without those that were unseen for too long."""
         check_finite("time", time)
         seconds = 0.0 if self._time is None else float(time) - self._time
         self._time = float(time)
         if seconds < 0:
             self.jumps_back += 1
-        # a jump far back is another recording
+        # a large jump back means another recording
         if abs(seconds) > self.max_gap:
             return _of_boxes([])
         tracks = self._tracks.after(max(seconds, 0.0))
-        # whoever was in the frame before may be seen again
+        # at low frame rates, a track seen in the previous frame is kept for this one
         gap = np.where(tracks.is_expected, self.max_gap, min(self.max_gap, max(_UNSURE_GAP, seconds)))
         return tracks.take(tracks.age <= gap)
 
@@ -223,7 +224,7 @@ def _checked(boxes: Iterable[Box]) -> list[Box]:
 
 
 def _of_boxes(boxes: Sequence[Box]) -> _Tracks:
-    """Tracks that begin with boxes, without numbers: -1."""
+    """One new track per box, without an id: -1."""
     count = len(boxes)
     state = np.zeros((count, 3, 2))
     state[:, :, 0] = np.reshape([box.center for box in boxes], (-1, 3))
@@ -245,14 +246,14 @@ def _of_boxes(boxes: Sequence[Box]) -> _Tracks:
 
 
 def _repeats(detections: _Tracks, is_weak: np.ndarray) -> np.ndarray:
-    """(B,) bool: weak boxes beside one that is not: the same person again."""
+    """(B,) bool: weak boxes near one that is not weak, which are duplicates of it."""
     places = detections.state[:, :2, 0]
     distances = np.linalg.norm(places[:, None] - places[~is_weak], axis=-1)
     return is_weak & (distances < _REPEATED).any(1)
 
 
 def _costs(tracks: _Tracks, detections: _Tracks) -> np.ndarray:
-    """(N, B): what it costs that a track has a box, below 0 where that is better than neither; inf where it cannot."""
+    """(N, B): the cost of assigning a box to a track, below 0 if that is better than neither; inf if not allowed."""
     offset = detections.state[None, :, :, 0] - tracks.state[:, None, :, 0]
     variance = tracks.covariance[:, None, :, 0, 0] + detections.covariance[None, :, :, 0, 0]
     distance = (offset**2 / variance).sum(-1)
@@ -261,14 +262,14 @@ def _costs(tracks: _Tracks, detections: _Tracks) -> np.ndarray:
 
 
 def _correct(tracks: _Tracks, rows: np.ndarray, detections: _Tracks, columns: np.ndarray) -> None:
-    """Tracks `rows` saw boxes `columns`: the filter's second half, in place."""
+    """The Kalman update of tracks `rows` with boxes `columns`, in place."""
     covariance = tracks.covariance[rows]
     variance = covariance[..., 0, 0] + detections.covariance[columns][..., 0, 0]
     gain = covariance[..., 0] / variance[..., None]
     offset = detections.state[columns, :, 0] - tracks.state[rows, :, 0]
     tracks.state[rows] += gain * offset[..., None]
     tracks.covariance[rows] -= gain[..., :, None] * gain[..., None, :] * variance[..., None, None]
-    # after a few sightings their plain mean, then the newest weigh most
+    # the plain mean of the first few sightings, later a mean that favors the newest
     weight = np.maximum(1 - np.exp(-tracks.age[rows] / _SMOOTHING), 1 / (tracks.sightings[rows] + 1))[:, None]
     tracks.heading[rows] += weight * (detections.heading[columns] - tracks.heading[rows])
     tracks.size[rows] += weight * (detections.size[columns] - tracks.size[rows])

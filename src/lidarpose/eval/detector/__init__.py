@@ -1,1 +1,1 @@
-"""People found in whole scans against labeled ones: `lidarpose evaluate detector`."""
+"""Evaluation of a people detector on labeled scans: `lidarpose evaluate detector`."""

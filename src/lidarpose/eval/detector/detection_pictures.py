@@ -1,4 +1,4 @@
-"""Pictures of a detector's evaluation: crops of false and missed people from above and from the side."""
+"""Pictures of a detector's evaluation: crops of false positives and missed people from above and from the side."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from lidarpose.sample import Box
 from lidarpose.viz.draw import png_of
 from lidarpose.viz.person_view import box_edges
 
-# crops a sheet and beside each other; how far a crop reaches, m
+# crops per sheet and per row; half the edge of a crop's view, m
 MOST, _PER_ROW, _REACH = 30, 6, 2.0
 _BLUE, _ALERT, _INK, _FAINT = "#0072b2", "#b3261e", "#1f2328", "#7a828c"
 _DPI, _MAX_POINTS = 90, 4000
@@ -21,7 +21,7 @@ _DPI, _MAX_POINTS = 90, 4000
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Crop:
-    """Points (n, 3) m about a box, boxes of labeled people near, where the sensor is from there (2,), and a label."""
+    """Points (n, 3) m around a box, nearby boxes of labeled people, the direction (2,) to the sensor, and a label."""
 
     points: np.ndarray
     box: Box
@@ -31,7 +31,7 @@ class _Crop:
 
 
 def draw_false(result: DetectorResult, scans: ScanSet) -> bytes | None:
-    """The strongest false people as crops, None where there are none."""
+    """Crops of the false positives with the highest scores; None if there are none."""
     false_people = result.detections[result.detections.status == FALSE].sort_values(
         "score", ascending=False, kind="stable"
     )
@@ -43,7 +43,7 @@ def draw_false(result: DetectorResult, scans: ScanSet) -> bytes | None:
 
 
 def draw_missed(result: DetectorResult, scans: ScanSet) -> bytes | None:
-    """People whom the detector misses at one false person a scan, the most points first; None where there are none."""
+    """Crops of the people missed at one false positive per scan, most points first; None if there are none."""
     threshold = result.thresholds[f"{REFERENCE:g}"]
     missed_people = result.people[result.people.score < threshold].sort_values("points", ascending=False, kind="stable")
     crops = []
@@ -72,7 +72,7 @@ def _crop(scan: LabeledScan, box: Box, label_parts: Sequence[str]) -> _Crop:
 
 
 def _sheet(crops: Sequence[_Crop], title: str) -> bytes | None:
-    """Each crop from above, the sensor below, and under it from the sensor's side."""
+    """Each crop seen from above with the sensor at the bottom, and below that seen from the sensor."""
     from matplotlib.figure import Figure
 
     if not crops:
@@ -85,7 +85,7 @@ def _sheet(crops: Sequence[_Crop], title: str) -> bytes | None:
         ax.set_axis_off()
     for k, crop in enumerate(crops):
         row, column = divmod(k, _PER_ROW)
-        # right of the view ray, and away from the sensor
+        # to the right as seen from the sensor, and away from the sensor
         right, away = np.array([-crop.towards[1], crop.towards[0], 0]), np.array([*-crop.towards, 0])
         _draw_crop(axes[2 * row, column], crop, right, away)
         _draw_crop(axes[2 * row + 1, column], crop, right, np.array([0, 0, 1.0]))
@@ -94,7 +94,7 @@ def _sheet(crops: Sequence[_Crop], title: str) -> bytes | None:
 
 
 def _draw_crop(ax, crop: _Crop, right: np.ndarray, up: np.ndarray) -> None:
-    """One view in meters about the box's center; points are colored by depth, those in the box dark."""
+    """One view in meters about the box's center: points in the box are dark, the others gray."""
     from matplotlib.collections import LineCollection
 
     axes = np.stack([right, up], 1)

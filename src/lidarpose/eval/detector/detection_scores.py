@@ -1,7 +1,8 @@
-"""Detections against labeled people: matching, recall by false people a scan, average precision, calibration.
+"""Detections against labeled people: matching, recall at false positives per scan, average precision, calibration.
 
-Recall is stated at operating points: the lowest score at which a detector has at most so many false people a scan, over
-all scans, as in FROC curves. Intervals are percentile bootstraps over scans; the score is found anew in every draw.
+Recall is reported at operating points: the lowest score threshold at which a detector has at most a given number of
+false positives per scan, averaged over all scans, as in FROC curves. Intervals are percentile bootstraps over scans;
+the threshold is recomputed in each bootstrap draw.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -20,24 +21,24 @@ from lidarpose.inference.predictor import Predictor
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26, HUMAN15
 
-# a person is found by a detection whose center is so near in x and y, m
+# a detection finds a person if their centers are at most this far apart in x and y, m
 MATCH_RADIUS = 0.5
-# people of fewer points are neither wanted nor false
+# people with fewer points need not be found, and detections of them are not false positives
 LEAST_POINTS = 10
-# operating points: false people a scan; the middle one decides what is missed
+# operating points: false positives per scan. People count as missed, and false positives are analyzed, at REFERENCE
 FALSE_PER_SCAN = (0.3, 1.0, 3.0, 10.0)
 REFERENCE = 1.0
 POINT_EDGES = (LEAST_POINTS, 20, 50, np.inf)
-# conditions: another person or a thing so near, m, and people who are less tall, m
+# conditions: another person or a thing within this distance, m, and people below this height, m
 _COMPANY, _TOUCHING, _LOW = 1.0, 0.3, 1.4
 CONDITIONS = ("person within 1 m", "thing within 0.3 m", "under 1.4 m tall", "none of these")
-# what is known of a whole scan
+# columns that describe a whole scan
 OF_SCAN = ("sensor", "kind", "height", "tilt")
 INDOORS = ("room", "corridor", "hall")
 _REPEATS, _BINS = 1000, 10
-# the calibration error is of scores from here on: most candidates have one of about 0, and would hide it
+# the calibration error counts scores from here on: most candidates score about 0 and would hide it
 _LEAST_SCORE = 0.1
-# what a detection is of
+# what a detection shows
 PERSON, FALSE, NEITHER = "person", "false", "neither"
 
 # points (n, 3) m and the sensor's origin -> boxes with scores 0 to 1
@@ -45,13 +46,16 @@ Detect = Callable[[np.ndarray, np.ndarray | None], tuple[Sequence[Box], np.ndarr
 
 
 def match(centers: np.ndarray, scores: np.ndarray, people: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """(D,) of each detection the person that it finds, or -1, one to one.
+    """(D,) the person that each detection finds, or -1, one to one.
 
-    By falling score, each takes the nearest person within `MATCH_RADIUS` whom none has taken, one who is not wanted
-    only where there is none who is.
+    By falling score, each detection takes the nearest person within `MATCH_RADIUS` that is not taken yet. People that
+    are not wanted are taken only if no wanted person is in reach.
 
     Args:
-        centers: (D, 2) m. scores: (D,). people: (P, 2) m. wanted: (P,) bool.
+        centers: (D, 2) m.
+        scores: (D,).
+        people: (P, 2) m.
+        wanted: (P,) bool, people that the detector is expected to find.
     """
     of_person = np.full(len(centers), -1)
     distance = np.linalg.norm(centers[:, None] - people[None], axis=-1)
@@ -71,14 +75,14 @@ def match(centers: np.ndarray, scores: np.ndarray, people: np.ndarray, wanted: n
 def score_scan(
     number: int, scan: LabeledScan, boxes: Sequence[Box], scores: np.ndarray, *, max_range: float
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """The scan's wanted people, a row each, and its detections. Whom nothing finds has the score -inf."""
+    """Tables of the scan's wanted people and of its detections, one row each. People not found have the score -inf."""
     origin = np.zeros(2) if scan.origin is None else scan.origin[:2]
     positions, centers = (
         np.array([box.center[:2] for box in box_list]).reshape(-1, 2) for box_list in (scan.boxes, boxes)
     )
     distance, detection_distance = (np.linalg.norm(xy - origin, axis=1) for xy in (positions, centers))
     is_wanted = scan.is_person & (scan.num_points >= LEAST_POINTS) & (distance <= max_range)
-    # who has no point at all excuses no detection
+    # a labeled person without any point must not excuse a false positive
     visible_positions = np.where((scan.num_points > 0)[:, None], positions, np.inf)
     of_person = match(centers, scores, visible_positions, is_wanted)
     is_match = np.append(is_wanted, False)[of_person]
@@ -108,11 +112,11 @@ def score_scan(
 
 
 def _conditions(scan: LabeledScan, positions: np.ndarray) -> dict[str, np.ndarray]:
-    """What may make people hard to find, each (P,) bool."""
+    """Conditions that may make people hard to find, each (P,) bool."""
     distance = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
-    # each person is near themselves
+    # a person is also within this distance of themselves
     has_company = (distance[:, scan.is_person] < _COMPANY).sum(1) > 1
-    # without the ground and the ceiling
+    # larger to the sides, but shortened at both ends to leave out the ground and the ceiling
     margin = [2 * _TOUCHING, 2 * _TOUCHING, -2 * _TOUCHING]
     grown_boxes = [replace(box, size=np.maximum(box.size + margin, 0.1)) for box in scan.boxes]
     thing_index = np.full(len(scan.points), -1) if scan.thing is None else scan.thing
@@ -122,7 +126,7 @@ def _conditions(scan: LabeledScan, positions: np.ndarray) -> dict[str, np.ndarra
 
 
 def _things(scan: LabeledScan, boxes: Sequence[Box]) -> list[str]:
-    """What most points of each box lie on; "" where the scan does not say."""
+    """The kind of thing that most points of each box lie on; "" if the scan has no such labels."""
     if scan.thing is None or scan.person is None:
         return [""] * len(boxes)
     names = np.array([*scan.things, "ground or building"], object)[scan.thing]
@@ -136,12 +140,12 @@ def _things(scan: LabeledScan, boxes: Sequence[Box]) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DetectorResult:
-    """A detector on one set of scans.
+    """A detector's scores on one set of scans.
 
-    changed: scans that are not as they were frozen; people, detections: rows as of `score_scan`, people with pose
-    errors `mpjpe_found` and `mpjpe_given`, mm; boxes: of each scan's detections; rows: the figures; thresholds:
-    operating point -> the least score that passes; reliability: by bins of the score its mean, the share of people and
-    the number of detections; things: what false people are, at `REFERENCE`.
+    changed: number of scans that differ from the frozen ones; people, detections: tables as of `score_scan`, people
+    with pose errors `mpjpe_found` and `mpjpe_given`, mm; boxes: the detections of each scan; rows: the metrics;
+    thresholds: operating point -> the lowest score that passes; reliability: for each bin of the score, the mean score,
+    the share of people and the number of detections; things: counts of what false positives lie on, at `REFERENCE`.
     """
 
     dataset: str
@@ -167,14 +171,14 @@ def score_detector(
     seed: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> DetectorResult:
-    """Looks for people in all scans and scores what is found.
+    """Searches all scans for people and scores the detections.
 
     Args:
-        detect: see `Detect`; its boxes should come with all scores, low ones too.
-        max_range: people farther from the sensor, m, are neither wanted nor false.
-        default_score: also an operating point, "default".
-        sensor_unknown: the sensor's position is hidden.
-        predictor: poses matched people in found and in labeled boxes, where joints are known.
+        detect: see `Detect`; it should return boxes of all scores, low ones too.
+        max_range: people farther from the sensor, m, need not be found, and detections there are not false positives.
+        default_score: a score threshold to report as the operating point "default".
+        sensor_unknown: do not pass the sensor's position to the detector.
+        predictor: predicts poses of matched people, in detected and in labeled boxes, where joints are labeled.
         seed: of the intervals.
     """
     scan_results: list[tuple] = []
@@ -220,7 +224,7 @@ def score_detector(
 
 
 def _row(figure: str, at: str = "", group: str = "all", of: str = "all", **values: Any) -> dict[str, Any]:
-    """A figure as it stands in the file. at: operating point; count: people, scans or detections that it is of."""
+    """A metric as written to the file. at: operating point; count: number of people, scans or detections behind it."""
     row = {"figure": figure, "at": at, "group": group, "of": of, "low": None, "high": None} | values
     return row | {name: None if row[name] is None else round(float(row[name]), 4) for name in ("value", "low", "high")}
 
@@ -232,9 +236,10 @@ def _figures(
     rng: np.random.Generator,
     default_score: float | None,
 ) -> tuple[list[dict[str, Any]], dict[str, float]]:
-    """Recall, false people a scan and average precision with intervals; operating point -> score."""
+    """Rows of recall, false positives per scan and average precision with intervals; and operating point -> score
+    threshold."""
     count = len(scans)
-    # how often each scan counts: once, and as drawn
+    # weight of each scan: 1 in the first row, then the number of times that each bootstrap draw contains it
     weights = np.vstack([np.ones(count), rng.multinomial(count, np.full(count, 1 / count), size=_REPEATS)])
     false_people = detections[detections.status == FALSE].sort_values("score", ascending=False, kind="stable")
     operating_bounds = {f"{budget:g}": exclusive_thresholds(false_people, weights, budget) for budget in FALSE_PER_SCAN}
@@ -247,10 +252,10 @@ def _figures(
     rows: list[dict[str, Any]] = []
     thresholds: dict[str, float] = {}
     for at, bounds in operating_bounds.items():
-        # just above the false person that is one too many
+        # just above the score of the first false positive that exceeds the budget
         thresholds[at] = max(0.0, float(np.nextafter(bounds[0], 1)))
         hits = (people.score.to_numpy() > bounds[:, None]) * person_weights
-        # draws without anybody of a group are NaN
+        # draws without a person of a group are NaN
         with np.errstate(invalid="ignore"):
             recall = 100 * (hits @ masks.T) / total
         for (group, of, mask), draws in zip(groups, recall.T, strict=True):
@@ -266,8 +271,8 @@ def _figures(
 
 
 def exclusive_thresholds(false: pd.DataFrame, weights: np.ndarray, budget: float) -> np.ndarray:
-    """(R,) of each row of weights (R, scans) the lowest bound that at most `budget` false detections a scan, sorted by
-    falling score, lie above; -1 where all may."""
+    """(R,) for each row of weights (R, scans), the lowest bound above which at most `budget` false detections per scan
+    score; -1 if all may. false: sorted by falling score."""
     scores, scan = np.append(false.score.to_numpy(float), -1.0), false.scan.to_numpy(int)
     max_false = budget * weights.sum(1) + 1e-9
     return np.array(
@@ -279,10 +284,11 @@ def exclusive_thresholds(false: pd.DataFrame, weights: np.ndarray, budget: float
 
 
 def average_precision(detections: pd.DataFrame, people: pd.DataFrame, weights: np.ndarray) -> np.ndarray:
-    """Area under precision over recall, precision made falling, 0 to 1, NaN of nobody, for weights (R, scans): (R,)."""
+    """(R,) for weights (R, scans): area under the precision-recall curve, 0 to 1, with precision made non-increasing;
+    NaN without people."""
     detections = detections.sort_values("score", ascending=False, kind="stable")
     scan, is_match = detections.scan.to_numpy(int), (detections.status == PERSON).to_numpy()
-    # equal scores come together
+    # equal scores pass a threshold together
     is_last = ~detections.score.duplicated(keep="last").to_numpy()
     areas = np.full(len(weights), np.nan)
     for row, num_people in enumerate(weights[:, people.scan.to_numpy(int)].sum(1)):
@@ -294,7 +300,7 @@ def average_precision(detections: pd.DataFrame, people: pd.DataFrame, weights: n
 
 
 def _with_interval(draws: np.ndarray, units: int) -> dict[str, Any]:
-    """The value, which comes first, and the ends of its interval; None of nobody, and see `Interval.stated`."""
+    """The value, which comes first in `draws`, and its interval, see `Interval.stated`; the value is None if NaN."""
     if np.isnan(draws[0]):
         return {"value": None}
     low, high = np.nanquantile(draws[1:], (0.025, 0.975))
@@ -303,7 +309,7 @@ def _with_interval(draws: np.ndarray, units: int) -> dict[str, Any]:
 
 
 def _groups_of_people(people: pd.DataFrame) -> Iterator[tuple[str, str, np.ndarray]]:
-    """Group, of what of it, and whose rows: people on foot by all that is known of them, mounted ones apart."""
+    """Yields group, subgroup and mask of rows: people on foot by every known attribute; mounted people separately."""
     is_on_foot, points = ~people.mounted.to_numpy(), people.points.to_numpy()
     for prefix, mask in (("", is_on_foot), ("mounted, ", ~is_on_foot)):
         yield f"{prefix}all", "all", mask
@@ -321,7 +327,7 @@ def _groups_of_people(people: pd.DataFrame) -> Iterator[tuple[str, str, np.ndarr
 
 
 def _false_rows(at: str, false_people: pd.DataFrame, scans: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    """False people a scan: of all, of the worst scan, by sensor and kind of scene."""
+    """False positives per scan: the mean of all scans, the worst scan, and means by each column of `OF_SCAN`."""
     counts = false_people.scan.value_counts().reindex(scans.index, fill_value=0)
     yield _row("false_people", at, value=counts.mean(), unit="a scan", count=len(scans))
     yield _row("false_people", at, "worst", "scan", value=counts.max(), unit="a scan", count=1)
@@ -339,7 +345,7 @@ def _false_rows(at: str, false_people: pd.DataFrame, scans: pd.DataFrame) -> Ite
 def _pose_errors(
     people: pd.DataFrame, scan: LabeledScan, boxes: Sequence[Box], predictor: Predictor, origin: np.ndarray | None
 ) -> dict[str, np.ndarray]:
-    """Errors of poses in found and in labeled boxes, mm, NaN without a pose."""
+    """Errors of poses in detected and in labeled boxes, mm, NaN without a pose."""
     assert scan.joints is not None
     matched_people = people[people.detection >= 0]
     sources = {
@@ -360,7 +366,7 @@ def _pose_errors(
 
 
 def _pose_rows(people: pd.DataFrame, at: str, threshold: float, rng: np.random.Generator) -> Iterator[dict[str, Any]]:
-    """MPJPE of people found at an operating point who have a pose in both boxes, and the mean difference."""
+    """MPJPE of people found at an operating point with a pose in both boxes, and the mean difference."""
     if "mpjpe_found" not in people:
         return
     posed_people = people[(people.score >= threshold) & people.mpjpe_found.notna() & people.mpjpe_given.notna()]
@@ -373,7 +379,7 @@ def _pose_rows(people: pd.DataFrame, at: str, threshold: float, rng: np.random.G
 
 
 def _mounted_rows(at: str, matches: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    """Of people's detections, the share whose box says that they ride: of those who do, and of the others."""
+    """The share of matched people whose detected box is marked as mounted, for mounted people and people on foot."""
     for group, people in (("mounted", matches[matches.mounted]), ("on foot", matches[~matches.mounted])):
         value = 100 * people.said_mounted.mean() if len(people) else None
         yield _row("said_mounted", at, group, value=value, unit="%", count=len(people))

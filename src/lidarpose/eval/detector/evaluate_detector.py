@@ -27,16 +27,21 @@ from lidarpose.sample import Box
 SCHEMA = "lidarpose.detector-scores/1"
 FILE = "detector.json"
 METHODS = ("detector", "scorer", "pose", "candidates")
-# the box about a candidate, m
+# size of the box around a candidate, m
 _CANDIDATE = np.array([0.9, 0.9, 2.0])
-# mean spread at which a pose's score has fallen to 1 / e, m
+# mean spread at which the score of a pose has fallen to 1 / e, m
 _SPREAD = 0.1
 
 
 def detector_of(method: str, detector: Detector | None, *, max_range: float) -> Detect:
-    """What looks for people: "detector", as `lidarpose.detect`; "scorer", the same without poses; and baselines on its
-    candidates, which nothing was trained for: "pose", by the spread of `tiny`'s pose, and "candidates" by their order.
-    The last three take the frame as level. detector: of the first two.
+    """The search function of a method.
+
+    "detector" is `lidarpose.detect`, "scorer" the same without poses. Two untrained baselines rank the candidates of
+    the detector: "pose" by the spread of the pose that `tiny` predicts, "candidates" by their order. All but "detector"
+    assume a level frame.
+
+    Args:
+        detector: for the first two methods; None for the bundled one.
     """
     if method == "detector":
         return partial(_detect, Search(max_range=max_range, min_score=0.0, detector=detector))
@@ -85,13 +90,15 @@ def run_detector(
     """Scores a detector on the frozen scenes and on folders of labeled scans.
 
     Args:
-        method: see `detector_of`; detect: anything else instead.
+        method: see `detector_of`.
+        detect: a search function to evaluate instead.
         weights: a detector's ONNX file, None for the bundled one.
+        heldout: score on the frozen scenes.
         folders: see `labeled_scans`.
-        max_range: m, people farther away do not count.
-        network: whose poses in found boxes are compared with those in labeled boxes; None leaves this out.
-        limit: so many scans of each set, evenly spread.
-        sensor_unknown: the sensor's position is hidden, so that people at any distance are looked for.
+        max_range: m, people farther away are ignored.
+        network: weights whose poses in detected boxes are compared with those in labeled boxes; None leaves this out.
+        limit: number of scans of each set, evenly spread; None for all.
+        sensor_unknown: do not pass the sensor's position, so that people are searched for at any distance.
     """
     check_name("method", method, METHODS)
     if limit is not None:
@@ -123,11 +130,12 @@ def write_detector(
     about: dict[str, Any],
     pictures: Path | None = None,
 ) -> list[Path]:
-    """Writes detector.json, and pictures of false and missed people into a folder of their own; returns their paths."""
+    """Writes detector.json and, into the folder `pictures` if given, pictures of false positives and missed people;
+    returns all paths."""
     names = ("dataset", "scans", "changed", "thresholds", "reliability", "things", "rows")
     entries = [{name: getattr(result, name) for name in names} for result in results]
     text = json.dumps({"schema": SCHEMA, "version": __version__} | about | {"results": entries})
-    # a line each row
+    # one line per row
     files: dict[Path, bytes | None] = {folder / FILE: text.replace('{"figure"', '\n{"figure"').encode() + b"\n"}
     if pictures is not None:
         for result, scans in zip(results, sets, strict=True):

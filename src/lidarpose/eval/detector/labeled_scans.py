@@ -1,4 +1,4 @@
-"""Whole scans whose people are labeled: the frozen list of synthesized ones, and folders of real ones."""
+"""Whole scans with labeled people: the frozen list of synthetic scenes, and folders of real scans."""
 
 import json
 import os
@@ -23,9 +23,9 @@ from lidarpose.sample import Box
 
 HELDOUT = "heldout"
 _HELDOUT_FILE = "detector-heldout-1.json"
-# edges of the groups of sensors by height, m, and by tilt, degrees
+# edges of the groups of sensors by height above the ground, m, and by tilt, degrees
 _HEIGHTS, _TILTS = (1.0, 2.2), (3.0, 10.0)
-# what nuScenes, Argoverse 2, Waymo and KITTI call people on foot, people with wheels, and what may pass for a person
+# categories of nuScenes, Argoverse 2, Waymo and KITTI: people on foot, mounted people, and things that resemble people
 _ON_FOOT = set(
     "pedestrian person people human adult child construction_worker police_officer personal_mobility official_signaler "
     "person_sitting".split()
@@ -38,12 +38,12 @@ _LIKE_PEOPLE = set("stroller bicycle motorcycle bicycle_rack wheeled_device anim
 class LabeledScan:
     """A scan with P labeled people, z up.
 
-    points (n, 3) m; origin: the sensor's position (3,) m, None where nobody knows it; boxes: P; num_points (P,): how
-    many points each person has; is_person (P,) bool: False where something else is labeled; mounted (P,) bool: riders
-    and wheelchairs; activities: P names; sensor, kind of scene, the sensor's height above the ground and its tilt, in
-    words: "" where it is not known; thing (n,): the kind of thing that a point lies on, an index of `things`, or -1;
-    person (n,): an index of `boxes`, or -1; joints (P, 26, 3) m, body26; changed: the scan is not what it was when its
-    list was frozen.
+    points (n, 3) m; origin: the sensor's position (3,) m, None if unknown; boxes: P; num_points (P,): number of points
+    on each person; is_person (P,) bool: False where the label is not a person; mounted (P,) bool: riders and people in
+    wheelchairs; activities: P names; sensor, kind of scene, the sensor's height above the ground and its tilt, in
+    words: "" if unknown; thing (n,): the kind of thing that each point lies on, an index of `things`, or -1;
+    person (n,): an index of `boxes`, or -1; joints (P, 26, 3) m, body26; changed: the scan differs from the one that
+    was frozen.
     """
 
     name: str
@@ -67,14 +67,14 @@ class LabeledScan:
 
 @dataclass(frozen=True, kw_only=True)
 class ScanSet:
-    """Scans that are made or read when they are needed."""
+    """Scans that are generated or read on demand."""
 
     name: str
     loaders: Sequence[Callable[[], LabeledScan]]
 
 
 def heldout_scans(limit: int | None = None) -> ScanSet:
-    """The frozen scenes with kinds of things, rooms and poses that no detector was trained on."""
+    """The frozen scenes, with kinds of things, rooms and poses that are not in any detector's training data."""
     content = json.loads((resources.files("lidarpose.eval") / "assets" / _HELDOUT_FILE).read_text("utf-8"))
     rows = evenly_drawn(len(content["indices"]), limit)
     scenes = [(content["seed"], content["indices"][k], content["family"], content["sha256"][k]) for k in rows]
@@ -82,7 +82,7 @@ def heldout_scans(limit: int | None = None) -> ScanSet:
 
 
 def synthetic_scan(seed: int, index: int, family: str = HELDOUT, digest: str | None = None) -> LabeledScan:
-    """A scene of `synth.detection_scene` as a labeled scan. digest: what its points had when it was frozen."""
+    """A scene of `synth.detection_scene` as a labeled scan. digest: of its points when it was frozen."""
     from lidarpose.synth.detection_scene import detection_scene
 
     scene = detection_scene(seed, index, family=family)
@@ -100,7 +100,7 @@ def synthetic_scan(seed: int, index: int, family: str = HELDOUT, digest: str | N
 
 
 def _in_words(value: float, edges: tuple[float, float], unit: str) -> str:
-    """Between which of the two edges a value lies."""
+    """The interval of the two edges that a value lies in."""
     low, high = edges
     if value < low:
         return f"under {low:g} {unit}"
@@ -108,13 +108,19 @@ def _in_words(value: float, edges: tuple[float, float], unit: str) -> str:
 
 
 def labeled_scans(folder: str | os.PathLike, limit: int | None = None) -> ScanSet:
-    """The scans of a folder: SCAN.json of people beside SCAN.pcd, .bin, .ply, .npy or another format.
+    """The scans of a folder: SCAN.json with people next to SCAN.pcd, .bin, .ply, .npy or another format.
 
-    SCAN.json holds what `read_boxes` takes, and of each of its "people" a `category` ("PEDESTRIAN" where it is
-    missing; riders and wheelchairs are mounted, as is who has `mounted`; strollers, riderless two-wheelers, animals and
-    mannequins are no people; other things are left out) and `num_points`, else the points in the box are counted;
-    beside "people" `sensor`, `kind` of scene and `sensor_origin` (0, 0, 0 where it is missing).
-    Raises InputError where the folder has none, or labels have no scan.
+    SCAN.json holds the boxes that `read_boxes` reads. Each of its "people" may also have:
+
+    - `category`, "PEDESTRIAN" by default. Riders and people in wheelchairs are mounted, as are all boxes with
+      `mounted`. Strollers, riderless two-wheelers, animals and mannequins are labels that are not people. Labels of
+      other categories are dropped.
+    - `num_points`; by default the points in the box are counted.
+
+    Next to "people", SCAN.json may have `sensor`, `kind` of scene and `sensor_origin` (0, 0, 0 by default).
+
+    Raises:
+        InputError: the folder has no labels, or a label file has no scan.
     """
     folder = Path(folder)
     labels = sorted(folder.glob("*.json"))
@@ -167,6 +173,6 @@ def _read_scan(labels: Path, cloud: Path) -> LabeledScan:
 
 
 def _kind(category: str) -> str:
-    """The last part of a label's name: of human.pedestrian.adult, TYPE_CYCLIST and "Person sitting" adult, cyclist and
-    person_sitting."""
+    """The last part of a label's name: adult for human.pedestrian.adult, cyclist for TYPE_CYCLIST, person_sitting for
+    "Person sitting"."""
     return re.sub(r"[\s-]+", "_", category.lower().rpartition(".")[2].strip()).removeprefix("type_")

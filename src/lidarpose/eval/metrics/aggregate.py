@@ -1,12 +1,12 @@
-"""From errors of joints to scores: means, bootstrap intervals, groups of joints, spans of people, calibration.
+"""From joint errors to scores: means, bootstrap intervals, groups of joints, spans of people, calibration.
 
-A table is (n, J), a row a person and a column a joint, in millimeters or percent, or (n,) for a value of the whole
-person. NaN stands where there is nothing to score: a joint without a label.
+A table is (n, J), one row per person and one column per joint, in millimeters or percent, or (n,) for one value per
+person. NaN means that there is nothing to score: a joint without a label.
 
 Intervals are percentile bootstraps (Efron & Tibshirani 1993, chapter 13). With clusters, whole clusters are drawn
 instead of people: frames of one sequence show the same person in nearly the same pose, and drawing them one by one
-gives far too narrow intervals. Intervals of few units are too narrow as well: of normal ones, 95 % intervals held the
-truth in 93 % of trials with 20 units, in 90 % with 10, in 49 % with two.
+gives far too narrow intervals. Intervals of few units are too narrow as well: for normally distributed values, 95 %
+intervals covered the truth in 93 % of trials with 20 units, in 90 % with 10, in 49 % with two.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ from lidarpose.arrays import to_numpy
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.skeleton import Skeleton, as_skeleton
 
-# how people and joints are averaged: over people the mean of each one's joints, or over all joints alike
+# ways to average: "person", over people the mean of each person's joints; "joint", over all joints alike
 AVERAGES = ("person", "joint")
 _LIMB_JOINTS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 # the groups that the paper and Waymo report (head to ankles), and groups for the joints that only SMPL has
@@ -31,22 +31,21 @@ GROUPS = {
     "hands": ("left_hand", "right_hand"),
     "feet": ("left_foot", "right_foot"),
 }
-# edges of this project's own reports: meters, points a person, share of the body that is hidden
+# edges of spans in this project's reports: meters, points per person, share of the body that is hidden
 DISTANCE_EDGES = (0.0, 10.0, 20.0, 30.0, np.inf)
 POINT_EDGES = (0, 50, 100, 200, 400, np.inf)
 OCCLUSION_EDGES = (0.0, 0.1, 0.3, 0.5, 1.0)
-# an evaluation states no interval of fewer people or clusters
+# an evaluation reports no interval for fewer people or clusters
 LEAST_UNITS = 10
 # random indices held in memory at once
 _BLOCK = 1 << 21
 
 
-# ---- arguments, checked once where they come in
+# ---- validation of arguments
 
 
 def as_numbers(name: str, value: ArrayLike) -> np.ndarray:
-    """An array of floats, NaN where it is masked; raises InputError where it holds something else, or lists of unequal
-    length."""
+    """An array of floats, NaN where masked. Raises InputError for other content or lists of unequal length."""
     try:
         value = list(map(to_numpy, value)) if isinstance(value, list | tuple) else to_numpy(value)
         return np.asarray(value, float)
@@ -55,8 +54,11 @@ def as_numbers(name: str, value: ArrayLike) -> np.ndarray:
 
 
 def as_flags(name: str, value: ArrayLike, shape: tuple[int, ...], *, of: str = "joint") -> np.ndarray:
-    """bool of a shape, one a joint or another thing, from bool or 0 and 1, False where it is masked; raises InputError
-    otherwise."""
+    """A bool array of a shape, from bool or 0 and 1, False where masked. Raises InputError for anything else.
+
+    Args:
+        of: what each flag belongs to, for the error message.
+    """
     flags = as_numbers(name, np.ma.filled(value, 0) if isinstance(value, np.ma.MaskedArray) else value)
     if flags.shape != shape:
         raise InputError(f"{name} must be {shape}, one a {of}, got {flags.shape}")
@@ -66,7 +68,7 @@ def as_flags(name: str, value: ArrayLike, shape: tuple[int, ...], *, of: str = "
 
 
 def as_table(table: ArrayLike) -> np.ndarray:
-    """A table as (n, J) float; raises InputError for another shape or for infinite entries."""
+    """A table as (n, J) float. Raises InputError for another shape or infinite entries."""
     table = as_numbers("a table of scores", table)
     if table.ndim not in (1, 2):
         raise InputError(f"a table of scores must be (people, joints) or (people,), got {table.shape}")
@@ -90,7 +92,7 @@ def _cluster_labels(clusters: ArrayLike | None, count: int) -> np.ndarray | None
     try:
         np.unique(labels)
     except TypeError:
-        # of several kinds, such as text and None where it is missing, which have no order
+        # labels of several types, such as text and None for missing ones, cannot be sorted
         return np.array([repr(label) for label in labels.tolist()])
     return labels
 
@@ -101,8 +103,8 @@ def _cluster_labels(clusters: ArrayLike | None, count: int) -> np.ndarray | None
 class Score(float):
     """A score in millimeters or percent with the number of people and joints behind it.
 
-    people: how many it is a mean of; joints: how many labeled joints of theirs; skipped: people without anything to
-    score, who are not part of it. A score of nobody is NaN.
+    people: number of people averaged over; joints: number of their labeled joints; skipped: people without anything to
+    score, who are excluded. The score of no people is NaN.
     """
 
     people: int
@@ -119,10 +121,10 @@ def mean(table: ArrayLike, average: str = "person", *, empty: float | None = Non
     """The mean of a table (n, J) or (n,).
 
     Args:
-        average: "person", the mean over people of the mean over each one's labeled joints; "joint", the mean over all
-            labeled joints of everybody, so that who has more of them weighs more.
-        empty: what a person without labeled joints counts as in the mean over people; None leaves these people out
-            and counts them as skipped.
+        average: "person", the mean over people of the mean over each person's labeled joints; "joint", the mean over
+            all labeled joints of all people, so that people with more labeled joints weigh more.
+        empty: the value of a person without labeled joints in the mean over people; None excludes these people and
+            counts them as skipped.
     """
     check_name("average", average, AVERAGES)
     if average == "joint" and empty is not None:
@@ -138,7 +140,7 @@ def mean(table: ArrayLike, average: str = "person", *, empty: float | None = Non
 
 
 def _person_sums(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Table (n, J) -> (n,) sum over each person's labeled joints, (n,) their number."""
+    """Table (n, J) -> (n,) sum over each person's labeled joints, (n,) number of these."""
     is_labeled = ~np.isnan(table)
     return np.where(is_labeled, table, 0.0).sum(1), is_labeled.sum(1)
 
@@ -148,8 +150,8 @@ def _person_sums(table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, kw_only=True)
 class Interval:
-    """low, high: ends, in the table's unit, NaN where nothing was drawn; level: share of draws between them; units: how
-    many people or clusters were drawn from; repeats: how often."""
+    """low, high: ends, in the table's unit, NaN if there was nothing to draw; level: share of draws between them;
+    units: number of people or clusters drawn from; repeats: number of draws."""
 
     low: float
     high: float
@@ -159,8 +161,8 @@ class Interval:
 
     @property
     def stated(self) -> tuple[float, float] | tuple[None, None]:
-        """low and high as an evaluation states them: None of fewer than `LEAST_UNITS`, and where all draws are alike,
-        as of 100 %: the interval would have no width."""
+        """low and high as an evaluation reports them; None for fewer than `LEAST_UNITS` units or if all draws are
+        equal, such as 100 %: the interval would have no width."""
         return (self.low, self.high) if self.units >= LEAST_UNITS and self.low < self.high else (None, None)
 
 
@@ -173,11 +175,11 @@ def interval(
     level: float = 0.95,
     repeats: int = 2000,
 ) -> Interval:
-    """The interval of `mean` of a table (n, J) or (n,), by drawing people with replacement.
+    """The bootstrap interval of `mean` of a table (n, J) or (n,).
 
     Args:
-        clusters: (n,) a label a person, sequence or subject, which are drawn whole. People without labeled joints are
-            left out, as in the mean.
+        clusters: (n,) each person's sequence, subject or other label; people with the same label are drawn together.
+            People without labeled joints are excluded, as in the mean.
     """
     if not isinstance(rng, np.random.Generator):
         raise InputError(f"rng must be a numpy.random.Generator, such as default_rng(0), got {type(rng).__name__}")
@@ -204,7 +206,7 @@ def paired_interval(
 ) -> Interval:
     """The interval of mean(first) - mean(second): two models' tables of the same people with the same labels.
 
-    Both are drawn with the same people, so what is hard for both does not widen it.
+    Each draw takes the same people from both tables, so people that are hard for both do not widen the interval.
     """
     first, second = as_table(first), as_table(second)
     if first.shape != second.shape or (np.isnan(first) != np.isnan(second)).any():
@@ -215,7 +217,7 @@ def paired_interval(
 def bootstrap_means(
     table: np.ndarray, rng: np.random.Generator, average: str, *, clusters: np.ndarray | None, repeats: int
 ) -> tuple[np.ndarray, int]:
-    """The means of `repeats` draws (repeats,), and how many units were drawn from; of nobody NaN and 0."""
+    """(repeats,) means of the draws, and the number of units drawn from; without any, NaN and 0."""
     total, count = _person_sums(table)
     has_label = count > 0
     total, count = total[has_label], count[has_label]
@@ -237,8 +239,11 @@ def bootstrap_means(
 
 
 def joint_groups(of: Skeleton | str, groups: Mapping[str, Sequence[str]] = GROUPS) -> dict[str, np.ndarray]:
-    """Group -> indices of its joints in the skeleton, by name; groups without a joint there are left out, "all" is
-    last. of: a skeleton or its name."""
+    """Group -> indices of its joints in the skeleton, by name. Groups without such a joint are left out; "all" is last.
+
+    Args:
+        of: a skeleton or its name.
+    """
     of = as_skeleton(of)
     indices = {
         name: np.array([of.index(joint) for joint in joints if joint in of.joints], int)
@@ -255,26 +260,26 @@ def by_group(
     groups: Mapping[str, Sequence[str]] = GROUPS,
     empty: float | None = None,
 ) -> dict[str, Score]:
-    """`mean` of a table (n, J) for each joint group of the skeleton. A group that nobody has a label in is NaN."""
+    """`mean` of a table (n, J) for each joint group of the skeleton; NaN for a group without any label."""
     table, of = as_table(table), as_skeleton(of)
     if table.shape[1] != len(of):
         raise InputError(f"a table of {of.name} has {len(of)} columns, one a joint, got {table.shape[1]}")
     return {name: mean(table[:, index], average, empty=empty) for name, index in joint_groups(of, groups).items()}
 
 
-# ---- spans of people: distance, number of points, occlusion or any other number that each person has
+# ---- spans of people: distance, number of points, occlusion or any other number per person
 
 
 @dataclass(frozen=True, kw_only=True)
 class Slice:
-    """People of one span of distance, points or occlusion: their score and, where asked for, its interval."""
+    """The people in one span of distance, points or occlusion: their score and, if requested, its interval."""
 
     score: Score
     interval: Interval | None = None
 
 
 def span_rows(values: np.ndarray, edges: Sequence[float] | np.ndarray) -> dict[str, np.ndarray]:
-    """Span -> (n,) bool: whose value (n,) lies in it. A span holds its lower edge, the last one its upper edge too."""
+    """Span -> (n,) bool: values (n,) in it. A span includes its lower edge; the last one also its upper edge."""
     rows = {}
     for low, high in zip(edges[:-1], edges[1:], strict=True):
         name = f"{low:g} and more" if np.isinf(high) else f"{low:g} to {high:g}"
@@ -291,12 +296,12 @@ def by_span(
     rng: np.random.Generator | None = None,
     clusters: ArrayLike | None = None,
 ) -> dict[str, Slice]:
-    """The mean of a table (n, J) or (n,) for people whose value lies between two edges: distance, points, occlusion.
+    """The mean of a table (n, J) or (n,) for each span of a value: distance, points, occlusion.
 
     Args:
-        values: (n,) one a person.
-        edges: (k,) rising; see `span_rows`. People in no span, or whose value is NaN, come last as "elsewhere".
-        rng: adds an interval to each span.
+        values: (n,) one per person.
+        edges: (k,) increasing; see `span_rows`. People in no span, or whose value is NaN, come last as "elsewhere".
+        rng: if given, each span gets an interval.
         clusters: (n,), see `interval`.
     """
     table = as_table(table)
@@ -318,15 +323,17 @@ def by_span(
     return slices
 
 
-# ---- whether confidence means what it says, and whether it ranks hits before misses
+# ---- calibration of confidence, and how well it ranks hits before misses
 
 
 def calibration_error(confidence: ArrayLike, hit: ArrayLike, *, bins: int = 10) -> float:
-    """Expected calibration error, 0 to 1: mean distance of confidence (n,) and share of hits (n,), over equal bins; NaN
-    of nothing.
+    """Expected calibration error, 0 to 1: weighted mean gap between confidence (n,) and share of hits (n,) over bins of
+    equal width; NaN for empty arrays.
 
     Args:
-        confidence: (n,) 0 to 1. hit: (n,) bool or 0/1.
+        confidence: (n,) 0 to 1.
+        hit: (n,) bool or 0/1.
+        bins: number of bins.
 
     Raises:
         InputError: for NaN and other values: leave out what is not known.
@@ -347,10 +354,11 @@ def auroc(score: ArrayLike, hit: ArrayLike) -> float:
     """Area under the ROC curve, 0 to 1, of scores (n,) for hits (n,): how well the score ranks hits before misses.
 
     Args:
-        score: (n,) any numbers, more is surer. hit: (n,) bool or 0/1.
+        score: (n,) any numbers, higher is more confident.
+        hit: (n,) bool or 0/1.
 
     Raises:
-        InputError: for NaN, which has no rank, and where there are not both hits and misses.
+        InputError: for NaN, which has no rank, and if hits or misses are missing.
     """
     score = _without_nan("score", score)
     hit = as_flags("hit", hit, score.shape, of="score")
@@ -358,7 +366,7 @@ def auroc(score: ArrayLike, hit: ArrayLike) -> float:
     if not positives or not negatives:
         raise InputError(f"AUROC needs hits and misses, got {positives} hits and {negatives} misses")
     _, inverse, counts = np.unique(score, return_inverse=True, return_counts=True)
-    # ties share the mean of their ranks
+    # ties get the mean of their ranks
     rank = (np.cumsum(counts) - (counts - 1) / 2)[inverse]
     return float((rank[hit].sum() - positives * (positives + 1) / 2) / (positives * negatives))
 

@@ -1,13 +1,13 @@
-"""Distances between predicted and true joints. Meters in, millimeters or percent out. Works on plain arrays of anyone's
-poses.
+"""Distances between predicted and true joints. Meters in, millimeters or percent out. Works on plain arrays of poses
+from any source.
 
     n people, J joints, T frames
     pred, true (n, J, 3) m in one frame; any leading shape, (J, 3) too, and nested lists
-    visible (n, J) bool or 0/1: which joints have a label; a joint whose truth is NaN has none
+    visible (n, J) bool or 0/1: which joints have a label; a joint whose true position is NaN has none
 
 A score is the `mean` of a table (n, J) of joints; the tables are public too, for groups, slices and intervals.
-dapt_compat=True (`legacy` is its old name): the arithmetic of the paper's released code, faults included;
-docs/evaluate.md says which.
+dapt_compat=True (`legacy` is its old name): the arithmetic of the paper's released code, faults included; see
+docs/evaluate.md.
 """
 
 import numpy as np
@@ -17,11 +17,11 @@ from lidarpose.errors import InputError, check_name
 from lidarpose.eval.metrics.aggregate import AVERAGES, Score, as_flags, as_numbers, check_positive, mean
 from lidarpose.geometry import similarity_align
 
-# the released code's length of a torso, m, the same for everybody; it comes from LiDARCap
+# the released code's length of the torso, m, one value for all people; it comes from LiDARCap
 TORSO = 0.5127067
-# shares of the torso within which a joint is correct: PCK-3 (15.4 cm), PCK-5 (25.6 cm)
+# fractions of the torso within which a joint is correct: PCK-3 (15.4 cm), PCK-5 (25.6 cm)
 PCK3, PCK5 = 0.3, 0.5
-# a similarity has 7 unknowns; two joints always fit
+# a similarity has 7 unknowns; it always fits two joints exactly
 LEAST_ALIGNED = 3
 
 
@@ -39,8 +39,8 @@ def mpjpe(
     Args:
         pred: (n, J, 3) m.
         true: (n, J, 3) m, in the same frame.
-        visible: (n, J), which joints have a label; None: all whose truth is not NaN.
-        dapt_compat: people without a label count as free of error.
+        visible: (n, J), which joints have a label; None: all joints whose true position is not NaN.
+        dapt_compat: people without a label count as having no error.
         average: "person" or "joint", see `mean`.
     """
     return _mean(joint_errors(pred, true, visible), average, dapt_compat or legacy, empty=0.0)
@@ -55,17 +55,17 @@ def pa_mpjpe(
     average: str = "person",
     legacy: bool = False,
 ) -> Score:
-    """`mpjpe` after each person's prediction was moved onto the truth by its best similarity (Procrustes).
+    """`mpjpe` after each person's prediction is aligned with the truth by the best similarity (Procrustes).
 
-    The similarity is that of the labeled joints; people with fewer than three are skipped.
+    The alignment uses the labeled joints; people with fewer than three are skipped.
 
     Args:
         pred: (n, J, 3) m.
         true: (n, J, 3) m.
-        visible: as of `mpjpe`.
-        average: as of `mpjpe`.
-        dapt_compat: the similarity of all joints, labeled or not, and for two or three people at once that of their
-            transposed arrays.
+        visible: as in `mpjpe`.
+        average: as in `mpjpe`.
+        dapt_compat: align all joints, labeled or not; for a batch of two or three people, align their transposed
+            arrays.
     """
     table = aligned_errors(pred, true, visible, dapt_compat or legacy)
     return _mean(table, average, dapt_compat or legacy, empty=0.0)
@@ -82,16 +82,16 @@ def pck(
     average: str = "person",
     legacy: bool = False,
 ) -> Score:
-    """Percentage of correct keypoints: joints nearer to the truth than threshold times torso, meters.
+    """Percentage of correct keypoints: joints nearer to the truth than threshold times torso, m.
 
     Args:
         pred: (n, J, 3) m.
         true: (n, J, 3) m, in the same frame.
-        visible: as of `mpjpe`.
-        average: as of `mpjpe`.
+        visible: as in `mpjpe`.
+        average: as in `mpjpe`.
         dapt_compat: NaN as soon as one person has no label.
-        threshold: a share of the torso; by default PCK-3, 0.5 is PCK-5.
-        torso: m, the same for everybody.
+        threshold: a fraction of the torso; the default is PCK-3, 0.5 is PCK-5.
+        torso: m, one value for all people.
     """
     table = joint_hits(pred, true, visible, threshold=threshold, torso=torso)
     return _mean(table, average, dapt_compat or legacy, empty=np.nan)
@@ -100,11 +100,11 @@ def pck(
 def acceleration_error(
     pred: ArrayLike, true: ArrayLike, rate: float, visible: ArrayLike | None = None, *, average: str = "person"
 ) -> Score:
-    """Mean distance of predicted and true acceleration of joints, in mm/s^2; `rate` in frames a second.
+    """Mean distance between predicted and true acceleration of joints, in mm/s^2; `rate` in frames per second.
 
-    pred, true (n, T, J, 3) m, T frames evenly apart, T of 3 or more; visible (n, T, J). Accelerations are second
-    differences times rate^2; rate=1 gives mm per frame^2, the score that most papers print. One counts where the joint
-    is labeled in all its three frames. average "person" is over sequences here, and `people` counts sequences.
+    pred, true (n, T, J, 3) m, T >= 3 evenly spaced frames; visible (n, T, J). Accelerations are second differences
+    times rate^2; rate=1 gives mm per frame^2, the score that most papers report. An acceleration counts if the joint is
+    labeled in all three frames. With average="person" the mean is over sequences, and `people` counts sequences.
     """
     return mean(acceleration_errors(pred, true, rate, visible), average)
 
@@ -125,18 +125,20 @@ def aligned_errors(
     *,
     legacy: bool = False,
 ) -> np.ndarray:
-    """`joint_errors` after the best similarity of each person's labeled joints (Umeyama 1991, no reflections); NaN for
-    everything of people with fewer than three. dapt_compat: as in `pa_mpjpe`."""
+    """`joint_errors` after the best similarity of each person's labeled joints (Umeyama 1991, no reflections).
+
+    All NaN for people with fewer than three labeled joints. dapt_compat: as in `pa_mpjpe`.
+    """
     pred, true, is_labeled = checked_poses(pred, true, visible)
     if dapt_compat or legacy:
         if np.isnan(true).any():
             raise InputError("dapt_compat aligns all joints, labeled or not: true must hold no NaN")
-        # the released code asks the number of people whether the array is transposed
+        # the released code decides by the number of people whether the array is transposed
         axes = (0, 2, 1) if len(pred) in (2, 3) else (0, 1, 2)
         aligned_pred = similarity_align(pred.transpose(axes), true.transpose(axes)).transpose(axes)
         return _distances(aligned_pred, true, is_labeled)
     is_labeled &= (is_labeled.sum(1) >= LEAST_ALIGNED)[:, None]
-    # joints without a label go to the mean of the others, where they neither move nor turn anything
+    # joints without a label are placed at the mean of the others, where they do not affect the alignment
     joint_mask, count = is_labeled[..., None], np.maximum(is_labeled.sum(1), 1)[:, None, None]
     pred, filled_true = (
         np.where(joint_mask, joints, np.where(joint_mask, joints, 0.0).sum(1, keepdims=True) / count)
@@ -146,7 +148,7 @@ def aligned_errors(
 
 
 def acceleration_errors(pred: ArrayLike, true: ArrayLike, rate: float, visible: ArrayLike | None = None) -> np.ndarray:
-    """(n, (T - 2) J) mm/s^2: distance of predicted and true acceleration, see `acceleration_error`; NaN where none."""
+    """(n, (T - 2) J) mm/s^2: errors of acceleration, see `acceleration_error`; NaN where there is none."""
     pred, true, is_labeled = checked_poses(pred, true, visible, trailing=("frames", "joints", "3"))
     if pred.shape[1] < 3:
         raise InputError(f"acceleration needs sequences of 3 frames or more, got {pred.shape[1]}")
@@ -160,7 +162,7 @@ def acceleration_errors(pred: ArrayLike, true: ArrayLike, rate: float, visible: 
 def joint_hits(
     pred: ArrayLike, true: ArrayLike, visible: ArrayLike | None = None, *, threshold: float = PCK3, torso: float = TORSO
 ) -> np.ndarray:
-    """(n, J) percent: 100 where a joint is nearer to the truth than threshold * torso, m, else 0; NaN without label."""
+    """(n, J) percent: 100 if a joint is nearer to the truth than threshold * torso, m, else 0; NaN without a label."""
     check_positive("threshold", threshold)
     check_positive("torso", torso)
     error = joint_errors(pred, true, visible)
@@ -179,11 +181,11 @@ def _mean(table: np.ndarray, average: str, dapt_compat: bool, *, empty: float) -
     return mean(table, average, empty=empty if dapt_compat else None)
 
 
-# ---- arguments, checked once where they come in
+# ---- validation of arguments
 
 
 def checked_poses(pred, true, visible, trailing=("joints", "3")) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """pred, true (n, ..., 3), is_labeled (n, ...) bool, a new array, where the dots are as many as `trailing` says."""
+    """pred, true (n, ..., 3), is_labeled (n, ...) bool, a new array; the trailing axes are those in `trailing`."""
     pred, true = as_numbers("pred", pred), as_numbers("true", true)
     if pred.shape != true.shape or pred.ndim < len(trailing) or pred.shape[-1] != 3 or not pred.shape[-2]:
         expected_shape = ", ".join(("...", *trailing))

@@ -1,8 +1,8 @@
 """The Waymo Open Dataset's pose metrics: PCK by box size, object keypoint similarity (OKS), the Pose Estimation Metric.
 
 Definitions: docs/pose_estimation_metric.md and keypoint_metrics.py of github.com/waymo-research/waymo-open-dataset,
-commits 419b532 and 7275bc1 (pose challenge, 2023). Its means over joints are over everybody's labeled joints at once,
-so average="joint" is the default. Meters in; millimeters or percent out.
+commits 419b532 and 7275bc1 (pose challenge, 2023). Its means over joints pool the labeled joints of all people, so
+average="joint" is the default. Meters in; millimeters or percent out.
 """
 
 from collections.abc import Sequence
@@ -17,19 +17,19 @@ from lidarpose.eval.metrics.joint_errors import checked_poses, joint_errors
 from lidarpose.skeleton import WAYMO14, Skeleton, as_skeleton
 from lidarpose.tracking.assignment import assign_plain
 
-# spread of each joint in units of the box's scale; twice COCO's sigmas, the head's center by the same method
+# spread of each joint in units of the box's scale: twice COCO's sigmas; head_center is derived by the same method
 SIGMAS = {"nose": 0.052, "head_center": 0.158, "shoulder": 0.158, "elbow": 0.144, "wrist": 0.124}
 SIGMAS |= {"hip": 0.214, "knee": 0.174, "ankle": 0.178}
 OKS_THRESHOLDS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95)
 PCK_THRESHOLDS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
-# cost of a keypoint that is missed or made up, and farthest distance of a match, m
+# cost of a missed or extra keypoint, and maximum distance of a match, m
 PENALTY = 0.25
-# nearer than this to a box counts as within it, m
+# a point nearer to a box than this counts as inside, m
 _WITHIN = 1e-5
 
 
 def oks_sigmas(of: Skeleton | str = WAYMO14) -> np.ndarray:
-    """(J,) Waymo's sigmas for a skeleton's joints; raises InputError where Waymo has none for a joint."""
+    """(J,) Waymo's sigmas for a skeleton's joints. Raises InputError if Waymo has none for a joint."""
     of = as_skeleton(of)
     sigmas = [SIGMAS.get(name.removeprefix("left_").removeprefix("right_")) for name in of.joints]
     if None in sigmas:
@@ -47,8 +47,13 @@ def box_hits(
     threshold: float = 0.2,
     sigmas: ArrayLike | None = None,
 ) -> np.ndarray:
-    """(n, J) percent: 100 where a joint is within threshold times its box's scale of the truth, else 0; NaN without
-    label. size (n, 3) m; sigmas (J,): times these, too, which Waymo's code does and its text does not."""
+    """(n, J) percent: 100 if a joint is within threshold times its box's scale of the truth, else 0; NaN without a
+    label.
+
+    Args:
+        size: (n, 3) m.
+        sigmas: (J,) additional factors per joint, which Waymo's code applies but its text does not mention.
+    """
     check_positive("threshold", threshold)
     error = joint_errors(pred, true, visible)
     reach = threshold * _box_scale(size, len(error)) * 1e3
@@ -81,8 +86,9 @@ def oks(
 ) -> np.ndarray:
     """(n,) object keypoint similarity in [0, 1]; NaN for people without a labeled joint.
 
-    The mean over a person's labeled joints of exp(-d^2 / (2 (sigma s)^2)): d the distance, s the cube root of the
-    box's volume, sigma the joint's own. size (n, 3) m; sigmas (J,): Waymo's for the joints of waymo14 by default.
+    The mean over a person's labeled joints of exp(-d^2 / (2 (sigma s)^2)), with d the joint's distance to the truth, s
+    the cube root of the box's volume and sigma the joint's own. size (n, 3) m; sigmas (J,): by default Waymo's for
+    waymo14.
     """
     error = joint_errors(pred, true, visible) / 1e3
     if sigmas is None:
@@ -97,7 +103,8 @@ def oks(
 
 
 def oks_hits(similarity: ArrayLike, thresholds: ArrayLike = OKS_THRESHOLDS) -> np.ndarray:
-    """OKS (n,) -> (n,) percent: the share of the thresholds that it is above; NaN stays. One threshold: P at it."""
+    """OKS (n,) -> (n,) percent: the share of the thresholds that each exceeds; NaN stays NaN. With one threshold, the
+    precision at it."""
     similarity, thresholds = as_numbers("similarity", similarity), np.atleast_1d(as_numbers("thresholds", thresholds))
     if similarity.ndim != 1 or not thresholds.size:
         raise InputError(f"similarity must be (people,) and thresholds one or more, got {similarity.shape}")
@@ -114,13 +121,13 @@ def oks_ap(
     sigmas: ArrayLike | None = None,
     thresholds: ArrayLike = OKS_THRESHOLDS,
 ) -> Score:
-    """Percent: the share of people whose OKS is above a threshold, averaged over the thresholds. Waymo's OKS-AP is this
-    precision of matched people; it ranks nothing by confidence."""
+    """Percent: the share of people whose OKS exceeds a threshold, averaged over the thresholds. Waymo's OKS-AP is this
+    precision of matched people; it does not rank by confidence."""
     return mean(oks_hits(oks(pred, true, size, visible, sigmas=sigmas), thresholds))
 
 
 def _box_scale(size: ArrayLike, people: int) -> np.ndarray:
-    """size (n, 3) m, length, width and height of each person's box -> (n, 1) m: the cube root of its volume."""
+    """size (n, 3) m, length, width and height of each person's box -> (n, 1) m: the cube root of the volume."""
     size = as_numbers("size", size)
     size = size.reshape(1, 3) if size.size == 3 else size
     if size.shape != (people, 3):
@@ -142,11 +149,11 @@ def _checked_sigmas(sigmas: ArrayLike, joints: int) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class Pem:
-    """The Pose Estimation Metric and what it is made of.
+    """The Pose Estimation Metric and its parts.
 
-    pem: mm; matched_error: mm, mean of the matched keypoints' distances, each at most the penalty; both NaN where there
-    is nothing. Keypoints: matched, missed (labeled, not predicted), extra (predicted, not labeled). People: people
-    matched, people_missed, people_extra, people_excused, who were predicted in the box of somebody without labels.
+    pem: mm; matched_error: mm, mean distance of the matched keypoints, each at most the penalty; both NaN without
+    keypoints. Keypoints: matched, missed (labeled, not predicted), extra (predicted, not labeled). People: people
+    matched, people_missed, people_extra, people_excused: predictions in the box of a person without labels.
     """
 
     pem: float
@@ -169,15 +176,16 @@ def pem(
     predicted: Sequence[ArrayLike] | None = None,
     penalty: float = PENALTY,
 ) -> Pem:
-    """Waymo's PEM over frames: the mean, over all keypoints of all frames, of the matched ones' distances and of
-    `penalty` for each one that is missed or made up.
+    """Waymo's PEM over frames: the mean over all keypoints of all frames, where a matched keypoint counts its distance
+    and a missed or extra one counts `penalty`.
 
-    Args: one entry a frame of each:
-        pred: (P, J, 3) m, the people that were found, their number free.
-        true: (G, J, 3) m. boxes: (G, 7) of the true people: center, (length, width, height), yaw.
+    Args: one entry per frame:
+        pred: (P, J, 3) m, the predicted people, any number.
+        true: (G, J, 3) m.
+        boxes: (G, 7) of the true people: center, (length, width, height), yaw.
         visible: (G, J) labeled and not occluded.
-        predicted: (P, J) False where a joint is not claimed, by default all are.
-        penalty: m. Matching is `match_people`'s.
+        predicted: (P, J) False where a joint is not predicted; by default all are.
+        penalty: m. Matching is done by `match_people`.
     """
     check_positive("penalty", penalty)
     columns = {"pred": pred, "true": true, "boxes": boxes, "visible": visible, "predicted": predicted}
@@ -244,8 +252,9 @@ def _people(name: str, value: ArrayLike) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Matches:
-    """Of one frame: pairs (k, 2) of (true, predicted) rows; missed: true rows with labels that nobody predicted; extra:
-    predicted rows of nobody; excused: predicted rows of people without labels, which neither help nor harm."""
+    """Matches of one frame: pairs (k, 2) of (true, predicted) rows; missed: true rows with labels and no prediction;
+    extra: predicted rows without a person; excused: predicted rows matched to people without labels, which are not
+    scored."""
 
     pairs: np.ndarray
     missed: np.ndarray
@@ -265,10 +274,10 @@ def match_people(
     """Matches the predictions of one frame with its people.
 
     pred (P, J, 3), true (G, J, 3) m, boxes (G, 7) of the people: center, (length, width, height), yaw; predicted
-    (P, J), labeled (G, J) bool. First, people without labels take away the predictions that lie in their boxes and
-    near nobody else's labels, as many keypoints as possible. Then predictions and labeled people are matched so that
-    the sum of the mean keypoint costs is least, among pairs with a predicted keypoint within `penalty` meters of the
-    box.
+    (P, J), labeled (G, J) bool. First, each person without labels excuses at most one prediction that has keypoints in
+    the person's box and is not near any label, such that the number of these keypoints is largest. Then the other
+    predictions and the labeled people are matched with the smallest sum of mean keypoint costs, among pairs with a
+    predicted keypoint within `penalty` meters of the box.
     """
     has_label = np.any(labeled, axis=1)
     distance = np.where(predicted[None], distance_to_boxes(pred, boxes), np.inf)
@@ -285,7 +294,7 @@ def match_people(
     cost = keypoint_costs(
         pred[None, candidates], true[people, None], predicted[None, candidates], labeled[people, None], penalty
     )
-    # joints that neither has count as free of error, so that the mean is over all J
+    # joints that are neither labeled nor predicted cost nothing, so that the mean is over all J
     total = np.nan_to_num(cost).mean(-1)
     total[distance[np.ix_(people, candidates)].min(-1, initial=np.inf) > penalty] = penalty
     rows, columns = assign_plain(total)
@@ -298,8 +307,8 @@ def match_people(
 def keypoint_costs(
     pred: np.ndarray, true: np.ndarray, predicted: np.ndarray, labeled: np.ndarray, penalty: float
 ) -> np.ndarray:
-    """(..., J) m: a joint's distance, at most `penalty`, where it is labeled and predicted; `penalty` where it is only
-    one of both; NaN where it is neither. The arguments broadcast."""
+    """(..., J) m: a joint's distance, at most `penalty`, if it is labeled and predicted; `penalty` if it is only one of
+    the two; NaN if it is neither. The arguments broadcast."""
     offset = np.where(labeled[..., None], pred - np.where(labeled[..., None], true, 0), 0)
     distance = np.minimum(np.linalg.norm(offset, axis=-1), penalty)
     return np.where(predicted & labeled, distance, np.where(predicted | labeled, penalty, np.nan))
