@@ -176,7 +176,7 @@ def draw_bodies(
         count: number of bodies.
         moving: whether bodies move within a frame; False is faster.
         clothes, mix: see `SceneConfig` and `sample_rotations`; rig: the body, None: the shipped one.
-        clear_limbs: see `SceneConfig`; the later poses (`moved`) are corrected, too.
+        clear_limbs: see `SceneConfig`; the poses `FRAME_TIME` s later get the same correction.
     """
     rng = np.random.default_rng([seed, RandomStream.BLOCK, block])
     rig = load_rig() if rig is None else rig

@@ -1,6 +1,6 @@
 """(seed, i) -> a crop without a person: an object that stands where a person might, cropped like a person.
 
-These are the negatives for training and evaluating the verifier, which decides whether a crop shows a person.
+These are the negatives for training and evaluating networks that decide whether a crop shows a person.
 """
 
 from dataclasses import replace
