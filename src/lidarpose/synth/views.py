@@ -14,7 +14,7 @@ from lidarpose.synth.simulate import Scene, View, draw_conditions
 
 # maximum deviation of merged sensors from equal angles around the person, rad
 _OFF_ANGLE = 0.4
-# if a person behind the sensor is nearer than this to its line of travel, the sensor moves away from the person, m
+# if a person behind the sensor is nearer than this to its x axis, the sensor moves along -x instead of +x, m
 _BESIDE_LANE = 1.5
 
 
@@ -60,7 +60,7 @@ def _merged_views(
 def _earlier_views(scene: Scene) -> tuple[View, ...]:
     """The frames before the last, each from the position of the sensor at that time."""
     feet, views = scene.place.feet, []
-    # the sensor has not driven through the person
+    # along +x, it could have driven through a person behind it
     forward = -1 if feet[0] < 0 and abs(feet[1]) < _BESIDE_LANE else 1
     for earlier in range(1, scene.acquisition.frames):
         position = np.array([-forward * scene.acquisition.speed * earlier / CLIP_HZ, 0, 0])
