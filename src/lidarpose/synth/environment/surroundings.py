@@ -33,7 +33,7 @@ def surroundings(config: SceneConfig, feet: np.ndarray, radius: float, rng: np.r
     """Things near a person who stands at feet (3,) m and reaches `radius` m to the sides; none of them is a person.
 
     With probability clutter * hard there are one to three, with their near sides 5 to 60 cm beyond the person's reach,
-    or luggage that touches the body. Things that would contain the sensor are left out.
+    or luggage that touches the body. Things that would reach the sensor are left out.
     """
     if rng.random() >= config.clutter * config.hard:
         return []
