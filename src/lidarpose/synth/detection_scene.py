@@ -105,7 +105,7 @@ def detection_scene(seed: int, index: int, *, family: str = "train") -> Detectio
     place = pick(rng, _TRAINING_PLACES if is_training else _PLACES)
     layout = LAYOUTS[place](rng)
     if not is_training:
-        # scenes of the frozen benches: everything not in the middle of the road stands at pavement height
+        # the heldout and bench scenes are frozen: everything not in the middle of the road stands at sidewalk height
         layout = replace(layout, road=None)
     device = draw_sensor(layout.indoors, is_training, rng)
     mount = draw_mount(device, layout, rng)

@@ -1,5 +1,4 @@
-"""Where things and people stand around a sensor: free places in a layout, scattered things, slope and waves of the
-ground.
+"""Where things and people stand around a sensor: free places in a layout, scattered things, the ground's relief.
 
 Coordinates are the layout's, moved so that the sensor is above x = y = 0. Legend: k places, M footprints of objects.
 """

@@ -117,7 +117,7 @@ def _draw_car(a: float, b: float, c: float) -> tuple[Mesh, float, float, float]:
         length, width = 4.6 + b, width + 0.2
         mesh = shape("van", length, width, 1.9 + 0.4 * a)
     if b < 0.35:
-        # end on
+        # seen from its end
         return mesh, length / 2, width, 0.15
     return mesh.moved((0, 0, 0), pi / 2), width / 2, length, 0.1
 
