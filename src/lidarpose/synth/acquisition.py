@@ -1,4 +1,4 @@
-"""How a person's cloud is acquired: one scan of an upright sensor, or several of several ones, or otherwise."""
+"""How a person's cloud is acquired: in one scan of an upright sensor, or merged, accumulated, inverted and so on."""
 
 from dataclasses import dataclass, replace
 
@@ -7,14 +7,15 @@ import numpy as np
 from lidarpose.lidar.presets import sensor
 from lidarpose.synth.scene import SceneConfig
 
-# sensors of few rings, and how far away people are who are seen by them, m
+# sensors with few rings, and the maximum distance of people from them, m
 _SPARSE, _SPARSE_FAR = ("vlp-16", "hdl-32e", "vlp-32c"), 25.0
-# sensors that are merged: how many, how far from the person, m, and how often they are of one model
+# merged sensors: their number, their distance from the person, m, and the probability that all are of one model
 _MERGED, _MERGED_AWAY, _ONE_MODEL = (2, 4), (3.0, 15.0), 0.5
-# frames added up: how many, and the sensor's speed, m/s, in the half of cases in which it drives
+# accumulated frames: their number, and the sensor's maximum speed, m/s, in the half of the cases in which it moves
 _FRAMES, _FASTEST = (2, 5), 15.0
+# numbers of frames that a rosette integrates
 _INTEGRATED = (1, 2, 5)
-# numbers in [0, 1) that decide on an acquisition
+# uniform numbers in [0, 1) that determine an acquisition
 ACQUISITION_DRAWS = 13
 
 
@@ -23,13 +24,14 @@ class Acquisition:
     """How a person's cloud is acquired, by default in one scan of an upright sensor.
 
     Args:
-        sensors: names; those after the first stand around the person too, and all scans are merged. None: one of the
-            scene's sensors, drawn with the scene.
-        frames: scans at 10 Hz that are added up in the frame of the last one, which the pose is of.
-        speed: of the sensor along its x axis meanwhile, m/s; what stands still agrees all the same.
+        sensors: names. If there are several, they stand around the person and their scans are merged. Empty: one of
+            the scene's sensors, drawn with the scene.
+        frames: number of scans at 10 Hz that are accumulated in the frame of the last one; the pose is of that frame.
+        speed: of the sensor along its x axis during these scans, m/s. The scans are compensated for it, so static
+            objects stay aligned.
         inverted, crowded: as in `SceneConfig`.
-        distance: nearest and farthest, m, uniform; None: by the scene.
-        conditions: names of what holds: merged, accumulated, integrated, inverted, sparse, crowded.
+        distance: minimum and maximum distance of the person, m, drawn uniformly; None: by the scene.
+        conditions: names of the conditions that apply: merged, accumulated, integrated, inverted, sparse, crowded.
     """
 
     sensors: tuple[str, ...] = ()
@@ -41,21 +43,21 @@ class Acquisition:
     conditions: tuple[str, ...] = ()
 
     def source(self, scene: str, sensor: str) -> str:
-        """`Sample.source` of a scene and a sensor of these names; `Sample.conditions` reads it."""
+        """`Sample.source` for the names of a scene and a sensor; `Sample.conditions` parses it."""
         return "/".join(("synth", scene, sensor, *filter(None, ["+".join(self.conditions)])))
 
     def placing(self, config: SceneConfig) -> SceneConfig:
-        """The scene as far as it says where somebody stands."""
+        """The configuration from which the person's place is drawn: the scene's, with this acquisition's distance."""
         return replace(config, distance=self.distance, median_points=0) if self.distance else config
 
 
 SINGLE_SCAN = Acquisition()
-# a person's frames that may be added up: the last one is that of the pose
+# maximum number of a person's frames that are accumulated; the pose is of the last one
 MOST_FRAMES = _FRAMES[1]
 
 
 def draw_acquisition(config: SceneConfig, draws: np.ndarray) -> Acquisition:
-    """The acquisition that `draws` (ACQUISITION_DRAWS,), uniform in [0, 1), decide on; merged ones have one frame."""
+    """The acquisition for `draws` (ACQUISITION_DRAWS,), uniform in [0, 1); merged acquisitions have one frame."""
     merged, accumulated, integration, inverted, sparse, crowded, number, variant, speed, *devices = draws.tolist()
     hard = float(config.hard)
     names, distance, frames, sensor_speed, conditions = config.sensors, None, 1, 0.0, []
@@ -86,5 +88,5 @@ def draw_acquisition(config: SceneConfig, draws: np.ndarray) -> Acquisition:
 
 
 def _between(ends: tuple[int, int], share: float) -> int:
-    """The whole number at a share in [0, 1) of those from the one to the other."""
+    """The integer at `share` in [0, 1) of the range from ends[0] to ends[1], both included."""
     return ends[0] + int(share * (ends[1] - ends[0] + 1))

@@ -1,4 +1,4 @@
-"""Posed, clothed bodies for the generator: blocks of single poses, and clips of one person who moves."""
+"""Posed, clothed bodies for the generator: blocks of single poses, and clips of one moving person."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,30 +26,32 @@ try:
 except ImportError as error:  # pragma: no cover - numba is an optional extra
     raise MissingExtra("synthesis", "synth") from error
 
-# how long a frame lasts, s, and how far bodies are moved on for it
+# duration of a frame, s; `moved` bodies are this much later
 FRAME_TIME = 0.1
-# frames a second of clips
+# frame rate of clips
 CLIP_HZ = 10.0
+# captured motion of a higher frame rate is resampled to this one
 _MOST_HZ = 30.0
-# spread of the small turns that make two draws of one captured pose differ, rad
+# standard deviation of the random bone rotations that make two draws of one captured pose differ, rad
 _VARIATION = 0.06
 _MIRROR = np.diag([1.0, -1.0, 1.0])
-# shapes that are drawn of a user's body where motion has none
+# number of shapes drawn for a user's body if the motion has no shapes
 _SHAPES = 256
-# how high a captured foot may be above its clip's lowest and still stand on the ground, m
+# a captured body whose lowest point is at most this far above the lowest of its clip stands on the ground, m
 _JUMP = 0.06
-# a recording whose median distance from its origin is between these was made by a LiDAR that stands there, as
-# LiDARHuman26M; others are of rooms or walks, and their middle is set so far ahead of the sensor, m
+# if the median distance of people from a recording's origin is in the range `_SENSED`, the origin is the LiDAR, as in
+# LiDARHuman26M; other recordings are of rooms or walks, and their median position is moved to `_AHEAD` m ahead of the
+# sensor
 _SENSED, _AHEAD = (4.0, 40.0), 12.0
 
 
 def smpl_rig(body: str | Path, motion: str | Path | None = None) -> Rig:
-    """The user's SMPL, SMPL+H or SMPL-X file as the body of synthesis.
+    """The user's SMPL, SMPL+H or SMPL-X file as the body for synthesis.
 
     Args:
         body: the file.
-        motion: a file or folder of motion whose people's shapes are taken, see `load_betas`; where it has none, shapes
-            are `_SHAPES` normal ones.
+        motion: a file or folder of motion; its people's shapes are used, see `load_betas`. If there are none,
+            `_SHAPES` shapes are drawn from a normal distribution.
     """
     betas = np.zeros((0, 1)) if motion is None else load_betas(motion)
     if not len(betas):
@@ -61,8 +63,9 @@ def smpl_rig(body: str | Path, motion: str | Path | None = None) -> Rig:
 @dataclass(frozen=True, kw_only=True)
 class PoseBank:
     """Captured poses in the rest frame of `body.rig`: local rotations (n, 24, 3, 3) float32, facing +x; moved
-    (n, 24, 3, 3) and step (n, 3) m, `FRAME_TIME` s later (see `Motion.pairs`); places (n, 3): where a sensor at
-    the origin saw them, x, y m and heading rad; clips: their motion."""
+    (n, 24, 3, 3), the rotations `FRAME_TIME` s later, and step (n, 3) m, the translation until then (see
+    `Motion.pairs`); places (n, 3): where they were recorded relative to a sensor at the origin, x, y m and heading
+    rad; clips: the motion that they are from."""
 
     rotations: np.ndarray
     moved: np.ndarray
@@ -72,7 +75,7 @@ class PoseBank:
 
     @classmethod
     def of_motion(cls, motion: Motion) -> "PoseBank":
-        """All poses of a motion that go on for `FRAME_TIME` s. Raises InputError where none does."""
+        """All poses of a motion whose clip continues for `FRAME_TIME` s. Raises InputError if there is none."""
         rotations, moved, step = motion.pairs(FRAME_TIME)
         if not len(rotations):
             raise InputError(f"{motion.source}: no clip goes on for {FRAME_TIME:g} s")
@@ -83,19 +86,19 @@ class PoseBank:
 
     @classmethod
     def from_clips(cls, path: str | Path, subjects: tuple[str, ...] | None = None) -> "PoseBank":
-        """A file or folder of motion of any format of `body.mocap`; the clips whose names begin with one of
+        """Reads a file or folder of motion in any format of `body.mocap`: the clips whose names begin with one of
         `subjects`, by default all."""
         motion = load_motion(path)
-        # more frames a second are hardly more poses
+        # a higher frame rate adds hardly any different poses
         motion = motion.resampled(_MOST_HZ) if motion.fps > _MOST_HZ else motion
         return cls.of_motion(motion.of(subjects) if subjects else motion)
 
     def clip(
         self, frames: int, rng: np.random.Generator, *, tempo: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Rotations (frames, 24, 3, 3) and the pelvis's place (frames, 3) m at `CLIP_HZ`, beginning over the origin,
-        facing +x; None where no clip is so long. tempo: see `SceneConfig`; where no clip is long enough to be played
-        faster, it is played as it was."""
+        """Rotations (frames, 24, 3, 3) and pelvis positions (frames, 3) m of a random clip at `CLIP_HZ`, starting above
+        the origin, facing +x; None if no clip is long enough. tempo: see `SceneConfig`; if no clip is long enough for
+        the drawn speed, the original speed is used."""
         speed = np.exp(rng.uniform(-tempo, tempo)) if tempo else 1.0
         windows = self.clips.windows(ceil((frames - 1) * speed) + 1)
         if not len(windows):
@@ -110,10 +113,10 @@ class PoseBank:
 
 @dataclass(frozen=True, kw_only=True)
 class Bodies:
-    """Posed, clothed bodies: a block of n people in one frame, or the n frames of one person.
+    """Posed, clothed bodies: a block of n people in one frame, or n frames of one person.
 
-    In their own frame: people face +x with their lowest point at z = 0; a person's first frame is on the origin and
-    faces +x, the ground at z = 0.
+    Coordinates are the body's own: in a block, people face +x with their lowest point at z = 0; in a sequence, the
+    first frame is at the origin and faces +x, with the ground at z = 0.
 
     Args:
         vertices: (n, V, 3) float32 m.
@@ -121,10 +124,10 @@ class Bodies:
         rotations: (n, 24, 3, 3) as in `body.rig`.
         kinds: (n,) activities, names of `body.pose_prior.activities.KINDS`.
         heading: (n,) rad.
-        extent: (n,), least and greatest x, y, z along the heading, m.
+        extent: (n,), minimum and maximum x, y, z in axes aligned with the heading, m.
         faces, face_part: (Q, 3) and (Q,) as in `body.rig`.
         moved: row -> vertices (V, 3) and joints (26, 3) of a body `FRAME_TIME` s later.
-        places: (n, 3), where captured poses were recorded, see `PoseBank`; NaN of other poses; None without a bank.
+        places: (n, 3), where captured poses were recorded, see `PoseBank`; NaN for other poses; None without a bank.
     """
 
     vertices: np.ndarray
@@ -139,8 +142,8 @@ class Bodies:
     places: np.ndarray | None = None
 
     def between(self, row: int, share: float) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (V, 3) and joints (26, 3) m of a body after a `share` of `FRAME_TIME`, moving evenly; below 0:
-        before, above 1: after."""
+        """Vertices (V, 3) and joints (26, 3) m of a body after a `share` of `FRAME_TIME`, linearly interpolated;
+        extrapolated if below 0 or above 1."""
         if share == 0:
             return self.vertices[row], self.joints[row]
         end_state = self.moved(row)
@@ -166,14 +169,14 @@ def draw_bodies(
     rig: Rig | None = None,
     clear_limbs: bool = False,
 ) -> Bodies:
-    """The people of a block; a function of (seed, block) and of where poses come from.
+    """The bodies of a block; a function of (seed, block) and of the pose source.
 
     Args:
-        bank: captured poses, or None; captured: share of the poses that comes from it.
+        bank: captured poses, or None; captured: share of the poses that come from it.
         count: number of bodies.
-        moving: False is faster; then nobody goes anywhere.
+        moving: whether bodies move within a frame; False is faster.
         clothes, mix: see `SceneConfig` and `sample_rotations`; rig: the body, None: the shipped one.
-        clear_limbs: see `SceneConfig`; how people move on is corrected as the pose is.
+        clear_limbs: see `SceneConfig`; the poses `FRAME_TIME` s later get the same correction.
     """
     rng = np.random.default_rng([seed, RandomStream.BLOCK, block])
     rig = load_rig() if rig is None else rig
@@ -202,7 +205,7 @@ def draw_bodies(
     low[:, 2], high[:, 2] = 0, high[:, 2] - lift
     step = step * _stride_ratio(rest_bodies, kinds)
 
-    # asked for twice: for when a frame begins and when it ends
+    # called twice for each frame: for its start and its end
     @lru_cache(maxsize=1)
     def moved(row: int) -> tuple[np.ndarray, np.ndarray]:
         rows = slice(row, row + 1)
@@ -239,13 +242,13 @@ def draw_moving_bodies(
     rig: Rig | None = None,
     clear_limbs: bool = False,
 ) -> list[Bodies]:
-    """The frames of `count` people who move, at `CLIP_HZ`.
+    """The frames of `count` moving people, at `CLIP_HZ`.
 
     Args:
         bank: captured poses, or None.
-        captured: chance of a clip of the bank instead of the prior's.
+        captured: probability of a clip from the bank instead of one from the prior.
         clothes, tempo, mix, clear_limbs: see `SceneConfig` and `sample_clips`.
-        to_last: the last frame is on the origin and faces +x, instead of the first.
+        to_last: the last frame, instead of the first, is at the origin and faces +x.
         rig: the body, None: the shipped one.
     """
     rig = load_rig() if rig is None else rig
@@ -287,10 +290,10 @@ def _moving_body(
     rig: Rig, person: RestBody, cloth_offsets: np.ndarray, rotations: np.ndarray, translation: np.ndarray, kind: str,
     clearance: np.ndarray | None, *, to_last: bool,
 ) -> Bodies:  # fmt: skip
-    """One person's F frames, of one more: rotations (F + 1, 24, 3, 3), translation (F + 1, 3) m; clearance (F + 1,) m,
-    see `sampling.DrawnClips`, None of captured motion."""
+    """One person's F frames from the motion of F + 1: rotations (F + 1, 24, 3, 3), translation (F + 1, 3) m; clearance
+    (F + 1,) m, see `sampling.DrawnClips`, None for captured motion."""
     frames = len(rotations) - 1
-    # where the pelvis's x axis points
+    # heading of the pelvis's x axis
     yaw = np.arctan2(rotations[:, 0, 1, 0], rotations[:, 0, 0, 0])
     if to_last:
         rotation = rotation_about("z", -yaw[frames - 1]).astype(np.float32)
@@ -305,7 +308,7 @@ def _moving_body(
     vertices, joints, low, _ = _dressed(rig, rest_bodies, cloth_offsets, rotations, translation)
     lowest_z = low[:, 2]
     if clearance is None:
-        # the body is not as tall as who was captured: what is little above the lowest frame stands on the ground
+        # the body is not as tall as the captured person: frames little above the lowest one stand on the ground
         clearance = np.maximum(lowest_z - lowest_z.min() - _JUMP, 0)
     rise = (clearance - lowest_z)[:, None, None] * np.array([0, 0, 1], np.float32)
     vertices, joints = vertices + rise, joints + rise
@@ -324,15 +327,15 @@ def _moving_body(
 
 
 def _stride_ratio(rest_bodies: RestBody, kinds: Sequence[str]) -> np.ndarray:
-    """(n, 1) float32: length of people's steps relative to the mean adult's, whose way all motion has: as their
-    legs, or feet would slide. Cyclists' are as long."""
+    """(n, 1) float32: factor for each person's translation. All motion has the translation of a mean adult; it is
+    scaled with the length of the legs, or feet would slide. 1 for cyclists."""
     mean_length = _leg_length(mean_adult_joints()[None])
     is_cycling = np.array([kind == "cycle" for kind in kinds])
     return np.where(is_cycling, 1.0, _leg_length(rest_bodies.joints) / mean_length)[:, None].astype(np.float32)
 
 
 def _leg_length(joints: np.ndarray) -> np.ndarray:
-    """(n,) m: from the left hip over the knee to the ankle."""
+    """(n,) m: length from the left hip via the knee to the ankle."""
     hip, knee, ankle = (joints[:, SMPL24.index(f"left_{name}")] for name in ("hip", "knee", "ankle"))
     return np.linalg.norm(hip - knee, axis=-1) + np.linalg.norm(knee - ankle, axis=-1)
 
@@ -340,8 +343,8 @@ def _leg_length(joints: np.ndarray) -> np.ndarray:
 def _dressed(
     rig: Rig, rest_bodies: RestBody, clothes: np.ndarray, rotations: np.ndarray, translation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (n, V, 3) and joints (n, 26, 3) m of posed bodies whose clothes stand off (n, V) m; the vertices' least
-    and greatest x, y, z (n, 3)."""
+    """Vertices (n, V, 3) and joints (n, 26, 3) m of posed bodies whose clothes are offset from the skin by (n, V) m;
+    the vertices' minimum and maximum x, y, z (n, 3)."""
     vertices, joints = pose_bodies(rig, rest_bodies, rotations, translation)
     low, high = np.empty((len(vertices), 3), np.float32), np.empty((len(vertices), 3), np.float32)
     dress_people(rig.faces, vertices, clothes, low, high)
@@ -355,8 +358,8 @@ def _extents(low: np.ndarray, high: np.ndarray) -> tuple[tuple[list[float], list
 def _vary(
     rotations: np.ndarray, rng: np.random.Generator, *translations: np.ndarray
 ) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
-    """Captured rotations (n, F, 24, 3, 3) and translations (n, F, 3): each bone of a person turned a little at random,
-    the same in all F frames, and half of the people mirrored."""
+    """Captured rotations (n, F, 24, 3, 3) and translations (n, F, 3) with a small random rotation of each bone, the
+    same in all F frames of a person, and half of the people mirrored."""
     perturbed_rotations = rotations @ axis_angle_to_matrix(
         rng.normal(0, _VARIATION, (len(rotations), 1, len(SMPL24), 3))
     )

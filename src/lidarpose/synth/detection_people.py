@@ -1,4 +1,4 @@
-"""The people of whole scans: groups of them in the free areas of a place, with what they carry, push and ride."""
+"""The people of whole scans: groups in the free areas of a place, with the things they carry, push and ride."""
 
 from dataclasses import dataclass
 from math import pi
@@ -12,26 +12,26 @@ from lidarpose.synth.place import Place
 from lidarpose.synth.props import Prop, draw_props
 from lidarpose.synth.props.attachments import MOUNTS, PELVIS, rigid_prop, upright
 
-# people by activity, outdoors and indoors
+# share of people by activity, outdoors and indoors
 _MIX_OUTDOORS = {"idle": 0.31, "walk": 0.34, "captured": 0.07, "run": 0.03, "step": 0.02, "bend": 0.035}
 _MIX_OUTDOORS |= {"crouch": 0.035, "kneel": 0.01, "sit": 0.1, "cycle": 0.09, "push": 0.05, "sport": 0.02}
 _MIX_INDOORS = _MIX_OUTDOORS | {"idle": 0.36, "walk": 0.2, "sit": 0.25, "cycle": 0.004, "run": 0.0}
-# in training more of those who do not stand; who sits outdoors and indoors
+# in training more people do not stand; shares of sitting people outdoors and indoors
 _TRAINING_MIX, _TRAINING_SITS = {"bend": 0.07, "crouch": 0.1, "kneel": 0.08}, (0.16, 0.3)
-# who sits, outdoors: what on, and how often
+# seats of people who sit outdoors, and how often each is used
 _SEATS = (("moped", 0.3), ("wheelchair", 0.25), ("chair", 0.45))
 _MOUNTED = ("bicycle", "moped", "wheelchair")
 _PROP_KINDS = {name: name for name in ("chair", "table", "bicycle", "moped")} | {"pram": "cart", "trolley": "cart"}
-# in training: how many of those who sit do so at a table, and who needs half as much more room
+# in training: share of sitting people who sit at a table, and activities that need half of the extra space `_MORE`
 _AT_TABLES = 0.3
 _LOW = ("bend", "crouch", "kneel", "sit")
-# people stand at least so far apart, and who rides or pushes something needs more, m
+# minimum distance between people, and extra distance for people who ride or push something, m
 _APART, _MORE = 0.42, 0.4
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlacedPerson:
-    """Row `row` of `bodies` at a place, with props; mounted: on what rolls."""
+    """Row `row` of `bodies` at a place, with props; mounted: on a bicycle, moped or wheelchair."""
 
     bodies: Bodies
     row: int
@@ -43,23 +43,25 @@ class PlacedPerson:
         return any(prop.name in _MOUNTED for prop in self.props)
 
     def _poses(self, duration: float) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Vertices, joints and what to add to them, m, when a frame of `duration` s begins and, if it lasts, ends."""
+        """Vertices, joints and an offset to add to both, m, at the start of a frame of `duration` s and, unless that
+        is 0, at its end."""
         poses = [(self.bodies.vertices[self.row], self.bodies.joints[self.row], np.zeros(3, np.float32))]
         if duration:
             vertices, joints = self.bodies.moved(self.row)
-            # strides do not go on for longer than the bodies' time: only the way does
+            # the pose is not extrapolated beyond `FRAME_TIME`, only the translation is
             displacement = (joints[0] - poses[0][1][0]) * [1, 1, 0] * (duration / FRAME_TIME - 1)
             poses.append((vertices, joints, displacement.astype(np.float32)))
         return poses
 
     def label(self, duration: float) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (k V, 3) m of the body at all times of a frame, and joints (26, 3) m in the middle of it."""
+        """Vertices (k V, 3) m of the body at the k times of `_poses`, concatenated, and joints (26, 3) m in the middle
+        of the frame."""
         place, poses = self.place.on_props(self.props), self._poses(duration)
         vertices = np.concatenate([place.of_body(vertices + displacement) for vertices, _, displacement in poses])
         return vertices, np.mean([place.of_body(joints + displacement) for _, joints, displacement in poses], axis=0)
 
     def meshes(self, duration: float) -> list[tuple[str | None, Mesh]]:
-        """Kinds, None for the body and clothes, and meshes; with where they are when the frame ends."""
+        """Kinds (None for the body and clothes) and meshes; `Mesh.later` is their position at the end of the frame."""
         place, poses = self.place.on_props(self.props), self._poses(duration)
         body = [place.of_body(vertices + displacement) for vertices, _, displacement in poses]
         meshes: list[tuple[str | None, Mesh]] = [(None, Mesh(body[0], self.bodies.faces, None, *body[1:]))]
@@ -74,7 +76,7 @@ class PlacedPerson:
 
 
 def draw_people(site: Site, is_smeared: bool, is_training: bool, rng: np.random.Generator) -> list[PlacedPerson]:
-    """Groups of one to five, some beside what stands there; who finds no room stays away."""
+    """Groups of one to five people, some beside things that stand there; people without free space are left out."""
     indoors = site.layout.indoors
     area = float(np.prod(site.areas[:, [1, 3]] - site.areas[:, [0, 2]], axis=1).max())
     groups = rng.integers(4, 11) if not indoors else rng.integers(1 + is_training, int(np.clip(area / 12, 2, 7)) + 1)
@@ -124,7 +126,7 @@ def draw_people(site: Site, is_smeared: bool, is_training: bool, rng: np.random.
 
 
 def _draw_belongings(bodies: Bodies, row: int, indoors: bool, rng: np.random.Generator) -> list[Prop]:
-    """What somebody carries, pushes, sits on or rides."""
+    """The things that a person carries, pushes, sits on or rides."""
     kind, joints = bodies.kinds[row], bodies.joints[row]
     if kind == "sit" and (not indoors or rng.random() < 0.15):
         mount = MOUNTS[pick(rng, dict(_SEATS))](joints.tolist(), rng.random(12).tolist())
@@ -134,7 +136,7 @@ def _draw_belongings(bodies: Bodies, row: int, indoors: bool, rng: np.random.Gen
 
 
 def _draw_table(rng: np.random.Generator) -> Prop:
-    """Before somebody who sits: it hides the legs or the lap."""
+    """A table in front of a sitting person; it occludes the legs or the lap."""
     depth, distance = rng.uniform(0.4, 0.9), rng.uniform(0.25, 0.5)
     mesh = shape("table", depth, rng.uniform(0.6, 1.8), rng.uniform(0.65, 0.78))
 

@@ -1,4 +1,4 @@
-"""How whole scans are acquired: the sensor, its mount, the ray cast, what gets lost or goes astray, and the frame."""
+"""How whole scans are acquired: the sensor, its mount, the ray cast, lost and stray points, and the frame."""
 
 from dataclasses import dataclass, replace
 from functools import cache
@@ -17,23 +17,23 @@ from lidarpose.synth.environment.site import Mount, pick
 from lidarpose.synth.environment.things import KINDS
 from lidarpose.synth.simulate import ScanConditions, add_sensor_noise
 
-# sensors by name and how often they are drawn outdoors and indoors; "random": rings at random
+# sensors by name and their weights outdoors and indoors; "random": a sensor with random rings
 _SENSORS = {
     "vlp-16": (1.0, 1.0), "vlp-32c": (1.0, 0.3), "hdl-32e": (0.8, 0.3), "hdl-64e": (0.8, 0.0), "os1-64": (1.0, 0.6),
     "os1-128": (0.5, 0.4), "os0-128": (0.6, 1.0), "pandar64": (1.0, 0.2), "av2": (1.2, 0.0), "waymo-top": (0.5, 0.0),
     "livox-mid360": (1.3, 1.5), "livox-avia": (1.0, 0.4), "livox-mid100": (0.4, 0.1), "depth-camera": (0.3, 1.5),
     "random": (2.5, 1.5),
 }  # fmt: skip
-# the same in training, where it differs
+# weights that differ in training
 _TRAINING_SENSORS = {"depth-camera": (0.3, 1.8)}
-# beams of a scan at most: what has more sends fewer columns
+# maximum number of beams in a scan: sensors with more get fewer columns
 _MOST_BEAMS = 140_000
-# points of a piece of a place at least
+# minimum number of points in a piece of a place
 _LEAST_PIECE = 300
 
 
 def draw_sensor(indoors: bool, is_training: bool, rng: np.random.Generator) -> Sensor | RayPattern:
-    """One of `_SENSORS`, or one of random rings."""
+    """One of `_SENSORS`, or a sensor with random rings."""
     weights = _SENSORS | (_TRAINING_SENSORS if is_training else {})
     name = pick(rng, {name: shares[int(indoors)] for name, shares in weights.items()})
     device: Sensor | RayPattern
@@ -65,7 +65,7 @@ def draw_sensor(indoors: bool, is_training: bool, rng: np.random.Generator) -> S
 
 @cache
 def _integrated(name: str, frames: int) -> RayPattern:
-    """A rosette that collects `frames` of its frames into one."""
+    """A rosette that integrates `frames` of its frames into one."""
     base_pattern = named_sensor(name)
     assert isinstance(base_pattern, RayPattern)
 
@@ -79,7 +79,7 @@ def _integrated(name: str, frames: int) -> RayPattern:
 
 
 def draw_mount(device: Sensor | RayPattern, layout: Layout, rng: np.random.Generator) -> Mount:
-    """On a robot, a tripod, a car, a mast or under a ceiling; what is high looks down."""
+    """A mount on a robot, a tripod, a car, a mast or under a ceiling; high mounts are pitched down."""
     mount_draw, height_draw, direction_draw = rng.random(3)
     if layout.indoors:
         height = 0.3 + 1.5 * height_draw if mount_draw < 0.7 else layout.ceiling - 0.15 - 0.8 * height_draw
@@ -96,7 +96,7 @@ def draw_mount(device: Sensor | RayPattern, layout: Layout, rng: np.random.Gener
             [np.cos(2 * pi * direction_draw), np.sin(2 * pi * direction_draw)]
         )
     if device.name == "livox-mid360" and (height > 2.0 or rng.random() < 0.2):
-        # it sees little below itself: hung upside down
+        # it sees little below itself, so it is mounted upside down
         roll += pi
     is_narrow = isinstance(device, RayPattern) and device.is_narrow
     half_width = device.field_of_view / 2 if isinstance(device, RayPattern) else pi
@@ -114,7 +114,7 @@ def draw_mount(device: Sensor | RayPattern, layout: Layout, rng: np.random.Gener
 def scan_scene(
     device: Sensor | RayPattern, mesh: Mesh, R_sensor_level: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) m in the level frame about the sensor and their faces."""
+    """Points (n, 3) m in the level frame at the sensor, and the face (n,) that each was returned from."""
     R = R_sensor_level.astype(np.float32)
     vertices = mesh.vertices @ R.T
     hits: Hits
@@ -138,7 +138,7 @@ def scan_scene(
 
 
 def scatter_leaves(points: np.ndarray, leaves: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Points (n, 3) m, those on leaves (n,) a little behind the few large ones of a mesh."""
+    """Points (n, 3) m with those on leaves (mask (n,)) moved a little behind the few large leaves of the mesh."""
     rows = np.flatnonzero(leaves)
     depth = rng.uniform(0.02, 0.2) * rng.standard_exponential(len(rows))
     moved_points = points.copy()
@@ -149,7 +149,8 @@ def scatter_leaves(points: np.ndarray, leaves: np.ndarray, rng: np.random.Genera
 
 
 def add_strays(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Some returns come from between: mixed pixels, dust, rain. Points and the indices (k,) of strays."""
+    """Moves some points nearer to the sensor, as mixed pixels, dust and rain do. Returns points and indices (k,) of
+    stray points."""
     share = rng.choice([0.0, 0.0005, 0.004], p=[0.4, 0.4, 0.2])
     stray_rows = np.flatnonzero(rng.random(len(points)) < share)
     moved_points = points.copy()
@@ -158,8 +159,8 @@ def add_strays(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray
 
 
 def cut_scan(points: np.ndarray, thing: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, bool]:
-    """(n,) bool: points that a user's file holds: all, without what is near the sensor, without the ground, or a piece
-    of the place; and whether it is a piece."""
+    """(n,) bool: which points a user's file holds, and whether it holds only a piece of the place. A file may hold all
+    points, or lack those near the sensor or the ground, or hold a piece only."""
     keep_mask, draws = np.ones(len(points), bool), rng.random(3)
     if draws[0] < 0.1:
         keep_mask &= np.hypot(points[:, 0], points[:, 1]) > rng.uniform(1, 3)
@@ -176,15 +177,15 @@ def cut_scan(points: np.ndarray, thing: np.ndarray, rng: np.random.Generator) ->
 
 @dataclass(frozen=True)
 class SceneFrame:
-    """The frame in which a scene is given: R (3, 3) from the level one, and where the sensor is in it, (3,) m."""
+    """The frame of a scene: rotation R (3, 3) from the level frame, and the sensor's position in it, (3,) m."""
 
     R: np.ndarray
     origin: np.ndarray
 
     @classmethod
     def draw(cls, mount: Mount, rng: np.random.Generator, *, most: float) -> "SceneFrame":
-        """Level within a degree or two, in a tenth tilted by 3 to `most` degrees. The sensor is its origin, or stands
-        above a vehicle's."""
+        """Level within a degree or two; in a tenth of the cases tilted by 3 to `most` degrees. The origin is the
+        sensor, a point near the ground below it (as of a vehicle), or a point up to 200 m away."""
         angle, degrees = rng.uniform(-pi, pi), abs(rng.normal(0, 1.2))
         if rng.random() < 0.1:
             degrees = rng.uniform(3, most)

@@ -1,9 +1,9 @@
-"""Whole scans to find people in: places of all kinds, crowds, and what is taken for people, seen by any sensor.
+"""Whole scans for detecting people: all kinds of places, crowds, and objects that resemble people, with any sensor.
 
-A scene is laid out as `environment.layouts` draws it, with groups of people and the things of `environment.things` in
-its free areas, a fifth of them beside people; then the ground is sloped and waved, all is seen by a sensor that may be
-tilted, and points get lost or go astray. What is drawn depends on (seed, index, family) alone. Family "train" never
-draws the things and rooms that are left out for judging; "heldout" draws them most often; "bench" draws all alike.
+A scene has a layout of `environment.layouts`, with groups of people and the things of `environment.things` in its free
+areas, a fifth of the things beside people. The ground gets a slope and waves, the sensor may be tilted, and points are
+lost or stray. A scene depends on (seed, index, family) alone. Family "train" never draws the things and rooms that are
+held out for evaluation; "heldout" draws the held-out things most often; "bench" draws all with the same weights.
 
 Letters: P people, n points of a scene.
 """
@@ -45,29 +45,29 @@ from lidarpose.synth.scene import RandomStream
 from lidarpose.synth.simulate import label_box
 
 FAMILIES = ("train", "heldout", "bench")
-# how often each place is drawn; the left-out ones only where they may be
+# weight of each place; held-out places only outside training
 _PLACES = {"street": 4.0, "square": 2.0, "path": 2.0, "room": 2.0, "car park": 0.8, "corridor": 1.2, "hall": 1.2}
 _TRAINING_PLACES = {"street": 4.0, "square": 2.0, "path": 2.0, "room": 2.4, "small room": 1.8, "car park": 0.8}
-# in training, what stands among people besides
+# in training, additional things among people, with their weights
 _AMONG_PEOPLE = {"pole": 2.0, "sign": 1.0, "bollard": 0.5, "moped": 0.5, "bicycle": 0.5, "wall end": 0.5, "bush": 0.5}
 
 
 @dataclass(frozen=True, kw_only=True)
 class DetectionScene:
-    """A scan and who is in it, in one frame, z about up, meters.
+    """A scan and the people in it, in one frame, z approximately up, meters.
 
     Args:
         points: (n, 3) float32.
-        origin: (3,), the sensor.
-        boxes: of all P people, seen or not: tight around the body, 0.1 added; ids 0 to P - 1.
-        person: (n,) int16, index into `boxes`, -1: none.
+        origin: (3,), position of the sensor.
+        boxes: of all P people, visible or not: tight around the body, 0.1 added; ids 0 to P - 1.
+        person: (n,) int16, index into `boxes`, -1: no person.
         joints: (P, 26, 3) float32, body26.
-        mounted: (P,) bool: rides or sits in a wheelchair.
+        mounted: (P,) bool: whether a person rides or sits in a wheelchair.
         sensor: name.
-        kind: of the place; "fragment": a piece of one.
-        negatives: kinds of `things.KINDS` that the scene holds.
-        thing: (n,) int16, index into `things.KINDS`, -1: a person or no thing at all.
-        up: (3,), what is truly up; its z is 1 where the frame is level.
+        kind: of the place; "fragment": a piece of a place.
+        negatives: kinds of `things.KINDS` in the scene.
+        thing: (n,) int16, index into `things.KINDS`, -1: a person or a stray point.
+        up: (3,), the true up direction; its z is 1 if the frame is level.
         height: of the sensor above the ground beneath it.
         activities: (P,) names of `body.pose_prior.activities.KINDS`.
     """
@@ -88,7 +88,7 @@ class DetectionScene:
 
     @property
     def things(self) -> tuple[str, ...]:
-        """Names of all kinds, which `thing` counts."""
+        """Names of all kinds; `thing` holds indices into them."""
         return KINDS
 
     def points_digest(self) -> str:
@@ -105,7 +105,7 @@ def detection_scene(seed: int, index: int, *, family: str = "train") -> Detectio
     place = pick(rng, _TRAINING_PLACES if is_training else _PLACES)
     layout = LAYOUTS[place](rng)
     if not is_training:
-        # frozen scenes: beside a road's middle all stand as high as on the pavement
+        # the heldout and bench scenes are frozen: everything not in the middle of the road stands at sidewalk height
         layout = replace(layout, road=None)
     device = draw_sensor(layout.indoors, is_training, rng)
     mount = draw_mount(device, layout, rng)
@@ -129,7 +129,7 @@ def detection_scene(seed: int, index: int, *, family: str = "train") -> Detectio
     people, items = _on_relief(people, items, Relief.draw(layout.indoors, rng), mount.height + layout.sensor[2])
     meshes = [(number, *item) for number, person in enumerate(people) for item in person.meshes(duration)]
     meshes += [(-1, *item) for item in items]
-    # a person's body and clothes are no thing, things are nobody
+    # bodies and clothes have an owner and no kind; things, belongings included, have a kind and no owner
     owners = [number if name is None else -1 for number, name, _ in meshes]
     kinds = [-1 if name is None else KINDS.index(name) for _, name, _ in meshes]
     counts = [len(mesh.faces) for _, _, mesh in meshes]
@@ -168,7 +168,8 @@ def detection_scene(seed: int, index: int, *, family: str = "train") -> Detectio
 def _on_relief(
     people: list[PlacedPerson], items: list[tuple[str, Mesh]], relief: Relief, height: float
 ) -> tuple[list[PlacedPerson], list[tuple[str, Mesh]]]:
-    """People and things on the ground's slope and waves, the sensor at z = 0, so high above its flat ground."""
+    """People and things lifted onto the ground's slope and waves, with the sensor, `height` m above its flat ground, at
+    z = 0."""
     offset = np.array([0, 0, -height])
 
     def lifted(vertices: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """(seed, i) -> one person as a LiDAR sees them: body, scene, scan, sample.
 
-Person i of a seed is the same whatever was asked for before and whoever asks: poses and shapes are drawn for blocks of
+Person i of a seed does not depend on the order of calls or on the process: poses and shapes are drawn for blocks of
 `BLOCK` people (vectorized, from the block's own generator), everything else from the person's own generator.
 """
 
@@ -40,16 +40,16 @@ from lidarpose.synth.simulate import (
 )
 from lidarpose.synth.views import with_views
 
-# people whose poses and shapes are drawn together
+# number of people whose poses and shapes are drawn together
 BLOCK = 256
-# a person of fewer returns is drawn again, so often at most, each time easier to see
+# a person with fewer returns is redrawn, each time easier to see; at most `_TRIES` draws
 LEAST_POINTS = 15
 _TRIES = 8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SyntheticPerson:
-    """A sample with its true pose (body26, the level frame at the sensor) and parts, and the facts if asked for."""
+    """A sample with its true pose (body26, level frame at the sensor) and parts; its facts, None if not measured."""
 
     sample: Sample
     facts: PersonInfo | None
@@ -64,9 +64,9 @@ class Generator:
         bank: captured poses.
         captured: share of poses from `bank`, the rest from the prior.
         rig: the body, None: the shipped one.
-        measure: also find the facts, which costs a second cast: the sample is the same either way.
-        redraw: somebody of whom hardly anything is seen is drawn again, each time easier to see; else they stay as
-            they are, without points too.
+        measure: also compute the facts, which costs a second ray cast; the sample is the same either way.
+        redraw: True: a person with fewer than `LEAST_POINTS` points is redrawn, each time easier to see. False: the
+            first draw is used, even without points.
     """
 
     scene: SceneConfig | str
@@ -91,31 +91,31 @@ class Generator:
             raise InputError(
                 f"recorded=1 keeps the places of single frames, several together have none: set {settings}"
             )
-        # at once: an unknown sensor is an error here
+        # an unknown sensor raises here rather than at the first person
         self._bodies  # noqa: B018
 
     def __getstate__(self) -> dict:
-        # the caches of blocks stay in their process
+        # the caches of blocks are not pickled
         return {name: value for name, value in vars(self).items() if name not in ("_bodies", "_acquisitions")}
 
     @property
     def config(self) -> SceneConfig:
-        """The scene's configuration, whichever way it was given."""
+        """The scene's configuration, whether it was given as such or by name."""
         return cast("SceneConfig", self.scene)
 
     @cached_property
     def _mix(self) -> dict[str, float] | None:
-        """What people who are not captured do."""
+        """The mix of activities of poses that are not captured."""
         return unusual_mix(self.config.unusual)
 
     @cached_property
     def _bodies(self) -> Callable[[int, int], Bodies]:
         """(seed, block) -> its bodies."""
-        # the same wherever somebody stands
+        # whether a scan takes time does not depend on where a person stands
         moving = bool(self.config.merged) or any(
             len(looks(sensor(name), np.zeros(3))) > 1 for name in self.config.sensors
         )
-        # neighbors share a block; two suffice for a reader that crosses from one to the next
+        # neighboring indices share a block; two blocks suffice for sequential access across their border
         draw_block = partial(
             draw_bodies, self.bank, self.captured, BLOCK, moving=moving, clothes=self.config.clothes, mix=self._mix,
             rig=self.rig, clear_limbs=bool(self.config.clear_limbs),
@@ -124,12 +124,12 @@ class Generator:
 
     @cached_property
     def _acquisitions(self) -> Callable[[int, int], tuple[np.ndarray, dict[int, Bodies]]]:
-        """(seed, block) -> what decides on its people's acquisitions, (BLOCK, ACQUISITION_DRAWS) in [0, 1), and by row
-        the frames of those of whom several may be added up."""
+        """(seed, block) -> the draws (BLOCK, ACQUISITION_DRAWS) in [0, 1) for its people's acquisitions, and, by row,
+        the moving bodies of people who may have several frames."""
 
         def draw(seed: int, block: int) -> tuple[np.ndarray, dict[int, Bodies]]:
             draws = np.random.default_rng([seed, RandomStream.ACQUISITION, block]).random((BLOCK, ACQUISITION_DRAWS))
-            # whoever has several frames at some difficulty has them here
+            # includes every person who has several frames at any difficulty
             hard_config = replace(self.config, hard=1.0, merged=0.0, sparse=0.0)
             rows = [row for row in range(BLOCK) if draw_acquisition(hard_config, draws[row]).frames > 1]
             rng = np.random.default_rng([seed, RandomStream.MOTION, block])
@@ -158,9 +158,9 @@ class Generator:
     def clip(
         self, seed: int, index: int, *, frames: int = CLIP_FRAMES, hard: float | None = None
     ) -> list[SyntheticPerson]:
-        """Clip `index` of `seed`: one person who moves, `frames` samples at 10 Hz; things and sensor stay where they
-        are. Frames in which nothing of the person is seen have samples without points. Samples have what networks of
-        clips need: the pose's rotations, the pelvis, and the two clouds about the person."""
+        """Clip `index` of `seed`: `frames` samples at 10 Hz of one moving person; things and the sensor do not move.
+        Frames in which the person has no returns have samples without points. Samples have the fields that clip
+        networks need: the pose's rotations, the pelvis position, and the two clouds around the person."""
         if self.config.recorded:
             raise InputError("clips have no recorded places: set recorded=0")
         frames = check_int("a clip's frames", frames, least=1)
@@ -185,9 +185,9 @@ class Generator:
         in_clip: bool = False,
         acquisition: Acquisition = SINGLE_SCAN,
     ) -> list[SyntheticPerson]:
-        """A person's frames, `rows` of `bodies`. While hardly anything of them is seen, the scene is drawn again,
-        easier each time; after the last try the best one counts, if it has any points at all. A second person is
-        anybody of `block` but `row`."""
+        """A person's frames, `rows` of `bodies`. While the person has fewer than `LEAST_POINTS` points, the scene is
+        redrawn, easier each time; after the last try, the draw with the most points is used, if it has any. A second
+        person is any body of `block` other than `row`."""
         config = self.config if hard is None else self.config.eased(hard)
         best_draw, most_points = None, 0.0
         draw = _draw_clip_frame if in_clip else _draw_sample
@@ -195,7 +195,7 @@ class Generator:
             eased_config = config.eased(config.hard * (1 - attempt / (_TRIES - 1))) if attempt else config
             scene = _draw_scene(eased_config, bodies, rows[0], block, row, 0.8**attempt, rng, acquisition)
             samples = [draw(scene, bodies, k, frame, rng) for frame, k in enumerate(rows)]
-            # of the middle frame: half of a clip's frames have more
+            # half of a clip's frames have at least this many points
             points = float(np.median([np.count_nonzero(_truth(sample)[0]) for sample in samples]))
             if points > most_points or not self.redraw:
                 best_draw, most_points = (scene, samples), points
@@ -218,7 +218,7 @@ def _draw_scene(
     config: SceneConfig, bodies: Bodies, first_row: int, block: Bodies, row: int, nearer: float,
     rng: np.random.Generator, acquisition: Acquisition = SINGLE_SCAN,
 ) -> Scene:  # fmt: skip
-    """Paper: section "Scene sampling". A person too far to be seen comes nearer with every attempt."""
+    """Paper: section "Scene sampling". `nearer` scales the distance, so that each attempt moves the person nearer."""
     sensors = acquisition.sensors[:1] or (config.sensors[rng.integers(len(config.sensors))],)
     device = sensor(sensors[0])
     low, high = bodies.extent[first_row]
@@ -236,7 +236,7 @@ def _draw_scene(
         background.append(_second_person(block, row, place, rng, close=acquisition.crowded, first_body=first_body))
     props = []
     kind = bodies.kinds[first_row]
-    # what carries somebody, or is pushed, is there however easy the scene is
+    # props that a person sits on, rides or pushes do not depend on the difficulty
     if rng.random() < config.carry * (1.0 if kind in POSED_WITH_A_PROP else config.hard):
         props = draw_props(rng, kind=kind, joints=bodies.joints[first_row])
     conditions = draw_conditions(config, device, rng)
@@ -253,27 +253,29 @@ def _draw_scene(
     return with_views(scene, place_config, height, reach, nearer, rng)
 
 
-# part of a second person's points until they are counted
+# part that marks a second person's points until they are counted
 _OTHER = 255
-# a second person: how often before the first one, as seen by the sensor; else beside
+# probability that a second person stands between the sensor and the first one; else beside the first one
 _BEFORE = 0.3
+# distance between the two people, beside and in front, m
 _BESIDE, _NEARER = (0.4, 1.0), (0.4, 2.5)
-# how far apart two people in one crop are, m
+# distance between two people in a crowded crop, m
 _CLOSE = (0.35, 0.8)
-# the cells in which two bodies are compared, as seen along the line between them, m
+# size, m, and number per side of the grid cells in which two bodies are compared, viewed along the line between them
 _CELL, _CELLS = 0.08, 48
 
 
 def _second_person(
     block: Bodies, row: int, place: Place, rng: np.random.Generator, *, close: bool, first_body: np.ndarray | None
 ) -> Mesh:
-    """Another body of the block, an arm's length away or between the sensor and the person; `close`: always beside;
-    first_body: (V, 3) m, the person's vertices, from which the other is moved away until clear; None: it stays."""
+    """Another body of the block, an arm's length away or between the sensor and the person. close: always beside, at
+    `_CLOSE`; first_body: (V, 3) m, the person's vertices: the other body is moved away until the two do not overlap;
+    None: it is not moved."""
     other_row = (row + rng.integers(1, len(block.vertices))) % len(block.vertices)
     before_draw, gap, angle, lateral_share, yaw = rng.random(5)
     direction = place.feet[:2] / max(np.hypot(*place.feet[:2]), 1e-6)
     if before_draw < _BEFORE and not close:
-        # not nearer to the sensor than a third of the way
+        # no nearer to the sensor than a third of the person's distance
         distance = min(_NEARER[0] + gap * (_NEARER[1] - _NEARER[0]), 0.67 * place.distance)
         shift = -distance * direction + (lateral_share - 0.5) * np.array([-direction[1], direction[0]])
     else:
@@ -288,13 +290,13 @@ def _second_person(
 
 
 def _moved_clear(vertices: np.ndarray, body: np.ndarray, feet: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Vertices (V, 3) m, moved along `direction` (2,), of length 1, until they are beyond a `body` (W, 3) that stands
-    at `feet` (3,), in every cell as seen along it."""
+    """Vertices (V, 3) m, moved along the unit vector `direction` (2,) until they are beyond a `body` (W, 3) with its
+    feet at `feet` (3,), in every cell of a grid viewed along `direction`."""
     across = np.array([-direction[1], direction[0]])
     reach = np.full((2, _CELLS * _CELLS), -np.inf)
     for sign, points, row in ((1, body, 0), (-1, vertices, 1)):
         offset = points.astype(float) - feet
-        # the body's middle is that of the cells
+        # the grid is centered on the body
         cells = np.stack([offset[:, :2] @ across / _CELL + _CELLS / 2, offset[:, 2] / _CELL + 2], 1)
         columns, rows = cells.astype(int).clip(0, _CELLS - 1).T
         np.maximum.at(reach[row], rows * _CELLS + columns, sign * (offset[:, :2] @ direction))
@@ -308,7 +310,7 @@ def _draw_sample(scene: Scene, bodies: Bodies, row: int, frame: int, rng: np.ran
 
 
 def _draw_clip_frame(scene: Scene, bodies: Bodies, row: int, frame: int, rng: np.random.Generator) -> Sample:
-    """The same with the pose's rotations and the clouds about the person."""
+    """Like `_draw_sample`, with the pose's rotations and the clouds around the person."""
     meshes = scene.meshes(bodies, row)
     box = _box(scene, bodies, row, rng) if scene.config.box_window else None
     scan = simulate_scan(scene, meshes, rng, frame=frame, box=box)
@@ -330,7 +332,7 @@ def _smpl_pose(place: Place, bodies: Bodies, row: int) -> np.ndarray:
 
 
 def _box(scene: Scene, bodies: Bodies, row: int, rng: np.random.Generator) -> Box:
-    """A box as a detector draws it, of two people in crowded crops."""
+    """A box with a detector's errors; in crowded crops it holds both people."""
     config, place = scene.config, scene.body_place
     box = noise.draw_box(config.crop, config.hard, _extent(scene, bodies, row, rng), place, rng, bodies.heading[row])
     if scene.acquisition.crowded:
@@ -342,7 +344,7 @@ def _box(scene: Scene, bodies: Bodies, row: int, rng: np.random.Generator) -> Bo
 def _crop(
     scene: Scene, bodies: Bodies, row: int, scan: SimulatedScan, rng: np.random.Generator, box: Box | None = None
 ) -> Sample:
-    """The points in a box; None: it is drawn after the scan."""
+    """The sample of a scan's points in a box; None: the box is drawn here, after the scan."""
     config, acquisition = scene.config, scene.acquisition
     box = _box(scene, bodies, row, rng) if box is None else box
     points, ring, part = scan.points, scan.ring, scan.part
@@ -365,7 +367,7 @@ def _crop(
         points, ring, part = points[keep_mask], ring[keep_mask], part[keep_mask]
     return Sample(
         points=points,
-        # of two people the box says who is meant
+        # if the crop holds two people, the box's center tells which one is meant
         center=center_of(points) if len(points) and not acquisition.crowded else box.center,
         part=part,
         ring=ring,
@@ -377,7 +379,8 @@ def _crop(
 
 
 def _extent(scene: Scene, bodies: Bodies, row: int, rng: np.random.Generator) -> tuple[list[float], list[float]]:
-    """What a box is drawn about, as in `Bodies.extent`: the body; of several frames half of the time all bodies."""
+    """The extent for drawing a box, as in `Bodies.extent`: the body's or, for several frames, in half of the cases that
+    of the bodies of all frames."""
     if scene.acquisition.frames == 1 or rng.random() < 0.5:
         return bodies.extent[row]
     vertices = bodies.vertices[row + 1 - scene.acquisition.frames : row + 1].reshape(-1, 3)
@@ -390,12 +393,12 @@ _GROUND = 0.1
 
 
 def _truth(sample: Sample) -> tuple[np.ndarray, Pose]:
-    """Part and pose, which every sample of a scene has."""
+    """Part and pose; synthetic samples always have both."""
     return cast("tuple[np.ndarray, Pose]", (sample.part, sample.pose))
 
 
 def _measure(sample: Sample, scene: Scene, bodies: Bodies, row: int, frame: int) -> PersonInfo:
-    """What is known of a sample: see `PersonInfo`."""
+    """The facts of a sample, see `PersonInfo`."""
     low, high = bodies.extent[row]
     alone_count = sum(count_alone(view, meshes[0], k) for view, meshes, k, _ in scene.scans(bodies, row, frame))
     part, pose = _truth(sample)
@@ -413,7 +416,8 @@ def _measure(sample: Sample, scene: Scene, bodies: Bodies, row: int, frame: int)
 
 
 def _is_upright(joints: np.ndarray) -> bool:
-    """Stands or walks: trunk within 35 degrees of upright, and a hip above its ankle by over four fifths of the leg."""
+    """Whether a person stands or walks: the trunk is within 35 degrees of vertical, and a hip is above its ankle by
+    more than four fifths of the leg's length."""
     pelvis, neck = joints[BODY26.index("pelvis")], joints[BODY26.index("neck")]
     if (neck - pelvis)[2] < np.cos(np.radians(35)) * np.linalg.norm(neck - pelvis):
         return False

@@ -1,4 +1,4 @@
-"""What goes wrong with points, laser grids and boxes, in numpy: each a pure function of its arguments and a generator.
+"""Errors of points, laser grids and boxes, in numpy: each a pure function of its arguments and a random generator.
 
 Legend: n points; parts are 0 for background, 1 + j for the bone of SMPL-24's joint j.
 """
@@ -13,11 +13,11 @@ from lidarpose.sample import Box
 from lidarpose.synth.place import Place
 from lidarpose.synth.scene import CropErrors
 
-# --- the paper's laser-level mask: patches of the laser grid go missing, as behind something in the foreground
+# --- the paper's laser-level mask: patches of the laser grid are removed, as if occluded by a foreground object
 
 # Paper: section "Laser-level masking": the shorter side of the window is this many patches
 _PATCHES = 8
-# without a grid, at most so many patches along the longer side
+# without a grid, the longer side has at most this many patches
 _LONGEST = 64
 
 
@@ -35,9 +35,9 @@ def laser_mask(columns: int, rows: int, *, keep: float, rng: np.random.Generator
 
 
 def direction_mask(directions: np.ndarray, *, keep: float, rng: np.random.Generator) -> np.ndarray:
-    """(n,) bool: the same for beams without a grid, such as a rosette's.
+    """(n,) bool: the laser-level mask for beams without a grid, such as a rosette's.
 
-    The window is what the directions span in azimuth and elevation; patches are squares of an eighth of its shorter
+    The window is the range of the directions' azimuths and elevations; patches are squares of an eighth of its shorter
     side. A share 1 - keep of all patches is masked.
 
     Args:
@@ -47,13 +47,13 @@ def direction_mask(directions: np.ndarray, *, keep: float, rng: np.random.Genera
         return np.zeros(0, bool)
     x, y, z = np.asarray(directions, np.float32).T
     c, s = x.mean(), y.mean()
-    # azimuths about the window's own middle: no seam
+    # azimuths relative to the window's mean direction, to avoid the seam at +-pi
     azimuth = np.arctan2(c * y - s * x, c * x + s * y)
     elevation = np.arctan2(z, np.sqrt(x * x + y * y))
     azimuth -= azimuth.min()
     elevation -= elevation.min()
     width, height = float(azimuth.max()), float(elevation.max())
-    # a window that is a line has no shorter side
+    # a window that is a line has a shorter side of 0
     patch = max(min(width, height) / _PATCHES, max(width, height) / _LONGEST, 1e-6)
     columns, rows = int(width / patch) + 1, int(height / patch) + 1
     cell = (azimuth / np.float32(patch)).astype(np.int32) * rows + (elevation / np.float32(patch)).astype(np.int32)
@@ -61,7 +61,7 @@ def direction_mask(directions: np.ndarray, *, keep: float, rng: np.random.Genera
 
 
 def _kept_patches(patches: int, keep: float, rng: np.random.Generator) -> np.ndarray:
-    """(patches,) bool: a share `keep` of them, rounded down, drawn at random."""
+    """(patches,) bool: True for a random share `keep` of the patches, rounded down."""
     mask = np.zeros(patches, bool)
     mask[rng.permutation(patches)[: int(patches * keep)]] = True
     return mask
@@ -69,14 +69,14 @@ def _kept_patches(patches: int, keep: float, rng: np.random.Generator) -> np.nda
 
 # --- clutter points
 
-# half the extents of where clusters may lie and their radius, m: the released code's
+# half extents of the region for clusters' centers, and clusters' radius, m, as in the released code
 _CLUSTER_REACH = np.array([0.4, 0.4, 0.8])
 _CLUSTER_RADIUS = 0.3
 _CLUSTER_POINTS = 150
 
 
 def noise_clusters(center: np.ndarray, *, most: int, rng: np.random.Generator) -> np.ndarray:
-    """(k, 3) m: one or two `noise_cluster`s of 0 to `most` points, as the paper's stability study adds them."""
+    """(k, 3) m: one or two `noise_cluster`s of 0 to `most` points each, as in the paper's stability study."""
     clusters = []
     for _ in range(rng.integers(1, 3)):
         count = int(rng.integers(0, most + 1))
@@ -85,7 +85,7 @@ def noise_clusters(center: np.ndarray, *, most: int, rng: np.random.Generator) -
 
 
 def noise_cluster(center: np.ndarray, *, count: int, rng: np.random.Generator) -> np.ndarray:
-    """(count, 3) m: points within 0.3 m of a place up to 0.4 m (0.8 m in height) from `center`."""
+    """(count, 3) m: points within 0.3 m of a random point that is up to 0.4 m (0.8 m in z) per axis from `center`."""
     cluster_center = center + rng.uniform(-1, 1, 3) * _CLUSTER_REACH
     direction = rng.normal(size=(count, 3))
     direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
@@ -93,8 +93,9 @@ def noise_cluster(center: np.ndarray, *, count: int, rng: np.random.Generator) -
 
 
 def dapt_clusters(center: np.ndarray, *, rng: np.random.Generator) -> np.ndarray:
-    """(k, 3) m: the released code's law. Two areas, each of 0 to 149 points about a place within +-0.4 m (+-0.8 m in
-    height) of `center`; spherical coordinates uniform: radius to 0.3 m, polar angle, azimuth (denser at the poles)."""
+    """(k, 3) m: clusters with the released code's distribution. Two clusters of 0 to 149 points each, around points
+    within +-0.4 m (+-0.8 m in z) per axis of `center`; spherical coordinates are uniform: radius up to 0.3 m, polar
+    angle, azimuth (so points are denser at the poles)."""
     cluster_centers = center + rng.uniform(-1, 1, (2, 3)) * _CLUSTER_REACH
     point_centers = np.repeat(cluster_centers, rng.integers(0, _CLUSTER_POINTS, 2), axis=0)
     radius, polar, azimuth = rng.random((3, len(point_centers))) * [[_CLUSTER_RADIUS], [np.pi], [2 * np.pi]]
@@ -108,24 +109,24 @@ def dapt_clusters(center: np.ndarray, *, rng: np.random.Generator) -> np.ndarray
 
 
 def random_keep(count: int, *, share: float, rng: np.random.Generator) -> np.ndarray:
-    """(count,) bool: all but a random `share` of the returns, each on its own."""
+    """(count,) bool: drops each return independently with probability `share`."""
     return rng.random(count) >= share
 
 
 def part_removal(part: np.ndarray, *, rng: np.random.Generator) -> np.ndarray:
-    """(n,) bool: keeps all but the points of one body part that is present, drawn at random.
+    """(n,) bool: drops the points of one body part, drawn at random from those present.
 
-    Give the parts of the points inside the crop: a part outside cannot go missing.
+    Pass the parts of the points inside the crop only; otherwise a part outside the crop may be drawn.
     """
     parts = np.flatnonzero(np.bincount(part)[1:]) + 1 if len(part) else part
     return np.ones(len(part), bool) if len(parts) == 0 else part != parts[rng.integers(len(parts))]
 
 
 def half_space_keep(points: np.ndarray, *, most: float, rng: np.random.Generator) -> np.ndarray:
-    """(n,) bool: what lies on one side of a random plane that cuts up to a share `most` off the cloud's extent.
+    """(n,) bool: keeps one side of a random plane that cuts up to a share `most` off the cloud's extent.
 
-    As behind the end of a wall, or where a neighbor's box has taken its share. The plane is upright, lies flat or
-    leans; the share is of the extent along its normal, and never all points go.
+    Simulates occlusion by the end of a wall, or a neighbor's box that has taken some of the points. The plane has a
+    random orientation; the share is of the extent along its normal, and at least one point remains.
     """
     if len(points) == 0:
         return np.ones(0, bool)
@@ -136,24 +137,24 @@ def half_space_keep(points: np.ndarray, *, most: float, rng: np.random.Generator
 
 
 def jitter(points: np.ndarray, *, sigma: float, clip: float, rng: np.random.Generator) -> np.ndarray:
-    """points (n, 3) m, each moved by a normal step of `sigma` m an axis, cut at +-`clip` m."""
+    """points (n, 3) m, each moved by Gaussian noise of `sigma` m per axis, clipped to +-`clip` m."""
     return points + np.clip(rng.normal(0, sigma, points.shape), -clip, clip)
 
 
-# --- the box about a person as a detector draws it
+# --- the box around a person with a detector's errors
 
-# what every box adds to the body's extent, and at most as much again at random, m
+# margin that every box adds to the body's size, and the maximum of an additional random margin, m
 _ROOM, _MORE = 0.05, 0.2
-# a box that is far too large adds between these, m
+# range of the additional margin of a box that is far too large, m
 _LOOSE = (0.1, 0.8)
-# the bottom edge: how often it is above the soles and how often in the ground, and between which depths, m
+# the bottom face: probability that it is above the soles or below the ground, and the range of the offset, m
 _RAISED, _RAISED_BY = 0.2, (0.03, 0.15)
 _SUNK, _SUNK_BY = 0.3, (0.03, 0.25)
-# no box is smaller, m
+# minimum size of a box, m
 _LEAST_SIZE = 0.4
-# what a crop without errors adds on each side, m
+# margin on each side of a box without errors, m
 _ALL = 2.5
-# the center of a box that holds two people is at most this share of the way from the one meant to the other
+# the center of a box with two people is at most this share of the way from the person meant to the other
 _TOWARDS = 0.4
 
 
@@ -167,12 +168,12 @@ def draw_box(
 ) -> Box:
     """The box of a body, level frame, with the errors of a detector.
 
-    Without errors the box has much room: nothing is cut but what the window of beams had not, as the paper crops
-    nothing.
+    Without errors, the box has a large margin and thus holds all points within the window of beams: the paper does not
+    crop.
 
     Args:
-        difficulty: in [0, 1], scales how often a box is cut.
-        extent: the body's least and greatest x, y, z in m along its `heading` rad, in its own frame.
+        difficulty: in [0, 1], scales the probability that a box is cut.
+        extent: the body's minimum and maximum x, y, z in m, in its own frame, axes aligned with its `heading` rad.
         place: of the body.
     """
     low, high = np.array(extent)
@@ -188,10 +189,10 @@ def draw_box(
         elif bottom_draw < _RAISED + _SUNK:
             low[2] -= _SUNK_BY[0] + depth_share * (_SUNK_BY[1] - _SUNK_BY[0])
         margin = (_ROOM + _MORE * np.array(room_draws) + extra_size) / 2
-        # heights are estimated better than places
+        # a detector's z is more accurate than its x and y
         shift = np.array(shift) / [1, 1, 2]
         low, high, yaw = low - margin + shift, high + margin + shift, yaw + yaw_error
-    # the extent's middle, along the true heading
+    # the center of the extent, rotated by the true heading
     c, s = cos(place.yaw + heading), sin(place.yaw + heading)
     x, y, z = ((low + high) / 2).tolist()
     center = place.feet + np.array([c * x - s * y, s * x + c * y, z])
@@ -200,15 +201,15 @@ def draw_box(
 
 
 def box_of_two(box: Box, body: np.ndarray, other: np.ndarray, rng: np.random.Generator) -> Box:
-    """A box about a body, grown to hold another one too; its center stays nearer to the first.
+    """A box around a body, enlarged to hold another body, too; its center stays nearer to the first body.
 
     Args:
-        box: about the body, with a detector's errors.
-        body, other: (V, 3) m, vertices; who is nearer is a matter of the middles of their extents from above.
+        box: of the body, with a detector's errors.
+        body, other: (V, 3) m, vertices. "Nearer" refers to the centers of their extents in x and y.
     """
     middles = [(vertices[:, :2].min(0) + vertices[:, :2].max(0)) / 2 for vertices in (body, other)]
     offset = middles[1] - middles[0]
-    # the share of the way to the other's middle at which the center lies: the box's own errors, and a shift
+    # the center's position on the way to the other body's middle, as a share: from the box's own errors, then shifted
     squared_distance = float(offset @ offset)
     center_share = float((box.center[:2] - middles[0]) @ offset) / max(squared_distance, 1e-9)
     center = box.center.copy()
@@ -216,7 +217,7 @@ def box_of_two(box: Box, body: np.ndarray, other: np.ndarray, rng: np.random.Gen
     R_level_box = rotation_about("z", box.yaw)
     local = np.concatenate([body, other]) @ R_level_box - center @ R_level_box
     low, high = local.min(0), local.max(0)
-    # heights are not shared about the middle
+    # in z the box need not be symmetric about its center
     half_size = np.maximum(np.maximum(-low, high), box.size / 2)
     shift = (min(low[2], -box.size[2] / 2) + max(high[2], box.size[2] / 2)) / 2
     half_size[2] = max(high[2], box.size[2] / 2) - shift
@@ -224,11 +225,11 @@ def box_of_two(box: Box, body: np.ndarray, other: np.ndarray, rng: np.random.Gen
 
 
 def cut_box(box: Box, *, most: float = 0.3, rng: np.random.Generator) -> Box:
-    """A box that loses up to a share `most` of its height (the feet twice as often as the head) or of one side, as
-    detectors that stop at a bonnet or a table edge do."""
+    """The box with up to a share `most` cut off its height (at the feet twice as often as at the head) or off one side,
+    as by detectors whose box ends at a car's hood or a table edge."""
     side_draw, amount = rng.random(2)
     lost_share = most * amount
-    # axis and the side of it that goes
+    # axis and the side of it that is cut off
     axis, side = ((2, -1), (2, -1), (2, 1), (1, -1), (1, 1), (0, 1))[int(side_draw * 6)]
     shift = np.zeros(3)
     shift[axis] = -side * lost_share * box.size[axis] / 2

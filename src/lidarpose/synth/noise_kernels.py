@@ -1,4 +1,4 @@
-"""Which returns of a scan a sensor loses, compiled: the generator asks for every person.
+"""Selects the returns of a scan that a sensor loses; compiled, as it runs for every synthetic person.
 
 Slow twin: `lose_returns_reference` in tests/reference.
 """
@@ -10,16 +10,16 @@ from lidarpose.lidar.raycast_kernels import compiled
 
 @compiled
 def lose_returns(points, face, vertices, faces, keep, error, chance, dropout, intensity_dropout, reach):
-    """The returns (k, 3) float32 m that come back, and their indices (k,).
+    """The returns (k, 3) float32 m that are not lost, and their indices (k,).
 
-    A return of points (n, 3) m, which lies on face (n,) of faces (F, 3), counts where keep (n,) and where its chance
-    (n,), uniform, is above the probability that it is lost at random (`dropout`) or because it is weak
-    (`intensity_dropout` times the probability below); it moves along its beam by error (n,) m.
+    Each of points (n, 3) m lies on face (n,), an index into faces (F, 3). It is returned if keep (n,) is True and its
+    uniform chance (n,) is at least the probability that it is lost at random (`dropout`) or because it is weak
+    (`intensity_dropout` times the probability below). It is moved along its beam by error (n,) m.
 
-    The power that comes back from a matt surface larger than the beam goes with cos(incidence) / range^2 (the LiDAR
-    range equation for extended Lambertian targets). At `reach` m, half of what faces the sensor comes back; clothes
-    differ in reflectivity, which makes the step soft: 1 / (1 + power^2) is lost, power 1 there. What a face without
-    area returns is weak.
+    The power returned from a matte surface larger than the beam is proportional to cos(incidence) / range^2 (the LiDAR
+    range equation for extended Lambertian targets); it is 1 for a surface facing the sensor at `reach` m. A return is
+    weak with probability 1 / (1 + power^2), a soft threshold since clothes differ in reflectivity: half of the returns
+    of a surface facing the sensor at `reach` m are weak. A face without area has power 0.
     """
     return_index = np.empty(len(points), np.int64)
     moved_points = np.empty((len(points), 3), np.float32)
@@ -39,7 +39,7 @@ def lose_returns(points, face, vertices, faces, keep, error, chance, dropout, in
             vy = np.float64(vertices[c, 1]) - vertices[a, 1]
             vz = np.float64(vertices[c, 2]) - vertices[a, 2]
             nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-            # 1 / (1 + power^2) with power = |n . p| reach^2 / (|n| |p|^3), without its roots
+            # 1 / (1 + power^2) with power = |n . p| reach^2 / (|n| |p|^3), without computing the roots
             dark = max(nx * nx + ny * ny + nz * nz, 1e-30) * max(squared_range, 1e-6) ** 3
             lit = (nx * x + ny * y + nz * z) ** 2 * reach**4
             loss_probability = 1 - (1 - dropout) * (1 - intensity_dropout * dark / (dark + lit))

@@ -1,6 +1,6 @@
-"""(seed, i) -> a crop in which nobody is: a thing that stands where a person might, cut out as if it were one.
+"""(seed, i) -> a crop without a person: an object that stands where a person might, cropped like a person.
 
-What a network learns from, and is judged by, that says whether a crop shows a person.
+These are the negatives for training and evaluating networks that decide whether a crop shows a person.
 """
 
 from dataclasses import replace
@@ -20,35 +20,35 @@ from lidarpose.synth.scene import RandomStream, SceneConfig
 from lidarpose.synth.simulate import Scene, draw_conditions, simulate_still
 from lidarpose.synth.views import with_views
 
-# fewest points of an object's crop, and how often it is drawn again, each time nearer to the sensor
+# minimum number of points in an object's crop, and the maximum number of draws, each nearer to the sensor
 LEAST_POINTS = 15
 _TRIES = 16
-# boxes: length and width, height, and how far their middle is off the thing, m
+# boxes: range of length and width, range of height, and standard deviation of their center's offset, m
 _WIDE, _TALL, _OFF = (0.5, 1.2), (1.0, 2.2), 0.2
-# how often a box does not stand on the ground: part of something larger or higher
+# probability that a box does not stand on the ground: it shows part of something larger or higher
 _RAISED = 0.3
-# how often clusters of points stand alone, without a thing, and their largest number
+# probability of clusters of points without a thing, and the maximum number of points in a cluster
 _CLUTTER, _MOST_CLUTTER = 0.05, 200
-# a thing wider than this is not looked at as a whole, m
+# maximum half width of a thing for placing it before the sensor, m: larger ones need not be inside its field of view
 _REACH = 1.0
 
 
 def draw_object(
     config: SceneConfig, seed: int, index: int, *, left_out: bool = False, hard: float | None = None
 ) -> tuple[Sample, str]:
-    """Object `index` of `seed`, seen as the scene's people are: by several sensors or frames where they are, too.
+    """Object `index` of `seed`, scanned like the scene's people, including by several sensors or in several frames.
 
     Args:
         config: scenes: sensors, distances, surroundings, noise.
-        left_out: a thing of the kinds that training never sees, or else of the others.
-        hard: the difficulty in [0, 1] at which the ways of scanning are drawn, as of `Generator.person`; None: the
-            scene's. All else is as difficult as the scene.
+        left_out: True: a thing of the kinds held out from training; False: of the other kinds.
+        hard: the difficulty in [0, 1] for drawing the acquisition, as in `Generator.person`; None: the scene's. All
+            else has the scene's difficulty.
 
     Returns:
         The sample (level frame at the sensor, parts 0, no pose) and the kind of thing, a name of `THINGS` or "clutter".
 
     Raises:
-        InputError: no draw left enough points, as where people stand out of the sensors' range.
+        InputError: no draw left enough points, for example because the distances exceed the sensors' range.
     """
     seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
     rng = np.random.default_rng([seed, RandomStream.OBJECT, index])
@@ -74,7 +74,7 @@ def draw_object(
 def _draw_sample(
     config: SceneConfig, name: str, acquisition: Acquisition, nearer: float, rng: np.random.Generator
 ) -> Sample:
-    """A crop about a thing, perhaps without points."""
+    """A crop around a thing; it may have no points."""
     (sensor_name,) = acquisition.sensors[:1] or (config.sensors[rng.integers(len(config.sensors))],)
     device, place_config = sensor(sensor_name), acquisition.placing(config)
     thing = draw_thing(name, rng) if name in THINGS else Mesh(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.int32))
@@ -113,7 +113,7 @@ def _draw_sample(
 
 
 def _draw_box(middle: np.ndarray, floor: float, rng: np.random.Generator) -> Box:
-    """A box of a person's size about `middle` (3,) m, as a detector that is wrong draws it; floor: z of the ground."""
+    """A box of a person's size around `middle` (3,) m, like a false positive of a detector; floor: z of the ground."""
     size = np.array([*rng.uniform(*_WIDE, 2), rng.uniform(*_TALL)])
     center = middle + [*(_OFF * rng.standard_normal(2)), 0]
     raised_draw, below_share = rng.random(2)

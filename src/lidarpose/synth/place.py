@@ -1,6 +1,6 @@
 """Where a person stands before a sensor, and how the sensor is mounted.
 
-Frames: the level frame at the sensor, z up, the ground under the person at -height, and the sensor's own.
+Frames: the level frame at the sensor (z up, the ground under the person at z = -height), and the sensor's own frame.
 """
 
 from collections.abc import Sequence
@@ -16,30 +16,30 @@ from lidarpose.lidar.sensor import Sensor
 from lidarpose.synth.props.attachments import Prop
 from lidarpose.synth.scene import SceneConfig
 
-# a standing adult fills about this much of a sphere seen from one meter (silhouette, m2)
+# approximate area of a standing adult's silhouette, m2: its solid angle from a distance of one meter
 _SILHOUETTE = 0.55
-# log-normal spread of point counts about the median: 5 to 95 percent are a factor of about 5
+# standard deviation of the logarithm of point counts: the 5 and 95 percent quantiles are the median / 5 and * 5, about
 _COUNT_SPREAD = 0.95
-# height of a sensor that hangs, m
+# height range of an inverted sensor, m
 _HANGS = (2.0, 5.0)
-# share of people whom the edge of the sensor's field of view may cut
+# share of people who may be cut by the edge of the sensor's field of view
 _CUT = 0.05
 # standard deviation of a mount's pitch and roll, rad, in scenes whose mounts vary
 _MOUNT_TILT = np.radians(1.5)
-# a sensor tilted by more than this looks at people ahead of it, within this azimuth, rad
+# before a sensor tilted by more than the first, people stand at azimuths within +- the second, rad
 _TILTED, _AHEAD = np.radians(10.0), np.radians(50.0)
-# lasers nearer than this share one elevation, rad
+# lasers whose elevations differ by less than this count as one elevation, rad
 _SAME_ELEVATION = 1e-9
-# nearer people, m, stand on the ground that the sensor is at least so high above, m
+# people nearer than the first, m, stand on the sensor's own ground, which is at least the second below the sensor, m
 _ON_OWN_GROUND, _LOWEST = 8.0, 0.1
-# edges of a field of view steeper than this leave room for anybody, rad
+# edges of a field of view steeper than this do not constrain the height, rad
 _STEEPEST = np.radians(80.0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Place:
-    """Where somebody stands, in the level frame at the sensor: feet (3,) m, yaw rad, distance m (horizontal);
-    R_sensor_level (3, 3): the mount, None where the sensor is level."""
+    """Where a person stands, in the level frame at the sensor: feet (3,) m, yaw rad, distance m (horizontal);
+    R_sensor_level (3, 3): the mount, None if the sensor is level."""
 
     feet: np.ndarray
     yaw: float
@@ -47,22 +47,22 @@ class Place:
     R_sensor_level: np.ndarray | None = None
 
     def on_props(self, props: Sequence[Prop]) -> "Place":
-        """Where a body is that stands on some of these: above the ground."""
+        """The place of a body with these props: above the ground by the largest lift of a prop."""
         lift = max((prop.lift for prop in props), default=0.0)
         return replace(self, feet=self.feet + [0, 0, lift]) if lift else self
 
     def of_body(self, points: np.ndarray) -> np.ndarray:
-        """Points (n, 3) of a body that faces +x on the origin, where it stands: in the level frame."""
+        """Points (n, 3) of a body at the origin, facing +x, transformed to this place in the level frame."""
         c, s = cos(self.yaw), sin(self.yaw)
         turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], points.dtype)
         return points @ turn + self.feet.astype(points.dtype)
 
     def to_sensor(self, points: np.ndarray) -> np.ndarray:
-        """Points (n, 3) of the level frame in the sensor's."""
+        """Transforms points (n, 3) from the level frame to the sensor's."""
         return points if self.R_sensor_level is None else points @ self.R_sensor_level.T.astype(points.dtype)
 
     def to_level(self, points: np.ndarray) -> np.ndarray:
-        """Points (n, 3) of the sensor's frame in the level one."""
+        """Transforms points (n, 3) from the sensor's frame to the level one."""
         return points if self.R_sensor_level is None else points @ self.R_sensor_level.astype(points.dtype)
 
 
@@ -70,9 +70,9 @@ def draw_place(
     config: SceneConfig, device: Sensor | RayPattern, tall: float, wide: float, nearer: float, rng: np.random.Generator,
     inverted: bool = False,
 ) -> Place:  # fmt: skip
-    """Somebody `tall` m, who reaches `wide` m to the sides, before a sensor. Paper: section "Scene sampling".
+    """The place of a person `tall` m high, who reaches `wide` m to the sides. Paper: section "Scene sampling".
 
-    `nearer` scales the distance, for another try at somebody of whom too little was seen; `inverted`: the sensor hangs
+    `nearer` scales the distance, for another draw of a person with too few points; `inverted`: the sensor is mounted
     upside down.
     """
     distance = max(draw_distance(config, device, rng) * nearer, config.distance[0])
@@ -98,13 +98,13 @@ def draw_place(
 
 
 def recorded_place(place: Place, recorded: np.ndarray) -> Place:
-    """`place` with x, y m and heading rad of a recording (3,) instead of random ones."""
+    """`place` with x, y m and heading rad replaced by those of a recording (3,)."""
     x, y, yaw = recorded.astype(float)
     return replace(place, feet=np.array([x, y, place.feet[2]]), yaw=float(yaw), distance=float(np.hypot(x, y)))
 
 
 def _azimuth(device: Sensor | RayPattern, half_width: float, share: float, may_cut: bool) -> float:
-    """Uniform over the sensor's field of view, with the whole person inside it unless it `may_cut` them."""
+    """Azimuth at a `share` of the sensor's field of view; unless `may_cut`, the whole person is inside it."""
     low, high = (-np.pi, np.pi) if isinstance(device, Sensor) else device.azimuths
     if abs(device.tilt) > _TILTED:
         low, high = max(low, -_AHEAD), min(high, _AHEAD)
@@ -117,7 +117,7 @@ def _azimuth(device: Sensor | RayPattern, half_width: float, share: float, may_c
 def draw_distance(config: SceneConfig, device: Sensor | RayPattern, rng: np.random.Generator) -> float:
     """Horizontal distance to the person in meters.
 
-    Paper: uniform. Else the distance at which this sensor returns a log-normal number of points.
+    Paper: uniform. If `median_points` is set, the distance at which this sensor returns a log-normal number of points.
     """
     near, far = config.distance
     if config.median_points == 0:
@@ -128,8 +128,8 @@ def draw_distance(config: SceneConfig, device: Sensor | RayPattern, rng: np.rand
 
 @lru_cache(maxsize=64)
 def _beam(device: Sensor | RayPattern) -> float:
-    """Solid angle that a beam of the sensor stands for (where its rings lie closest), sr. Where most lasers share their
-    elevations, those of one elevation share the gap to the next."""
+    """Solid angle per beam of the sensor (where its rings are densest), sr. If most lasers share their elevations, the
+    gap to the next elevation is divided among the lasers of one elevation."""
     if isinstance(device, Sensor):
         gaps = np.diff(device.elevations)
         gap = np.median(gaps) if len(gaps) else 0.0
@@ -144,8 +144,8 @@ def _beam(device: Sensor | RayPattern) -> float:
 def _aim_inverted(
     device: Sensor | RayPattern, distance: float, person_height: float, height: float, azimuth: float
 ) -> np.ndarray:
-    """(3, 3) turn of a sensor before it is mounted upside down, `height` m above the ground: none where its fan, which
-    is mirrored, holds the whole person; else its middle is tilted to theirs."""
+    """(3, 3) rotation of a sensor before it is mounted upside down, `height` m above the ground: the identity if its
+    inverted fan holds the whole person; else a pitch that points the middle of the fan at the middle of the person."""
     low, high = -device.elevations[-1], -device.elevations[0]
     feet, head = atan2(-height, distance), atan2(person_height - height, distance)
     if low <= feet and head <= high:
@@ -158,11 +158,11 @@ def draw_height(
     device: Sensor | RayPattern, distance: float, tall: float, spread: float, pitch: float, azimuth: float,
     rng: np.random.Generator, cut: float = _CUT,
 ) -> float:  # fmt: skip
-    """Height of the sensor above the person's ground in meters, jittered for mounts and slopes.
+    """Height of the sensor above the person's ground in meters, with random variation for mounts and slopes.
 
-    Where the person of `tall` m would reach out of the sensor's fan although there is room for them, the height is
-    moved until they fit, but for a share `cut` of people. `spread` m is the height's standard
-    deviation, `pitch` rad tilts the fan down at azimuth 0, `azimuth` rad is the person's.
+    Except for a share `cut` of people, the height is then changed so that the person, `tall` m high, fits in the
+    sensor's fan or, if taller than the fan, is centered in it. `spread` m is the height's standard deviation, `pitch`
+    rad tilts the fan down at azimuth 0, `azimuth` rad is the person's.
     """
     mount_normal, slope_normal = rng.standard_normal(2).tolist()
     height = device.height + spread * mount_normal + 0.02 * slope_normal * distance
@@ -171,7 +171,7 @@ def draw_height(
     low, high = distance * tan(edges[0]), distance * tan(edges[1])
     if rng.random() >= cut:
         if high - low <= tall:
-            # taller than the fan: the middle of the fan looks at the middle of the person
+            # the person is taller than the fan: center the fan on the person
             height = tall / 2 - (low + high) / 2
         else:
             # feet, at -height, not below the fan; head, at tall - height, not above it

@@ -14,11 +14,12 @@ from lidarpose.lidar.presets import sensor
 
 
 class RandomStream(IntEnum):
-    """Second word of a generator's seed, (seed, stream, index): what is drawn for one never shifts another.
+    """Second word of a random generator's seed, (seed, stream, index): draws of one stream never affect another.
 
-    Values must not change: every dataset and bench was made with them. 5 has two uses: boxes in datasets of streets and
-    stored people in training, which never share a sample. 9 and 10 are the training loop's, of torch. Numpy takes
-    (seed, stream, index, 0) for (seed, stream, index): a further word separates only where it is not 0.
+    Values must not change: every dataset and bench was made with them. 5 has two uses, boxes in street datasets and
+    augmentation of stored people in training, which never share a sample. 9 and 10 are for torch, in the training loop.
+    Numpy treats (seed, stream, index, 0) like (seed, stream, index): a further word gives a separate stream only if it
+    is not 0.
     """
 
     BLOCK = 0
@@ -40,9 +41,9 @@ class RandomStream(IntEnum):
     OBJECT_ACQUISITION = 16
 
 
-# the most that a ground's tilt may vary by, rad; more are degrees
+# maximum standard deviation of the ground's tilt, rad; a larger value was probably meant in degrees
 _STEEPEST = pi / 4
-# fields that are between 0 and 1
+# fields with values between 0 and 1
 _SHARES = frozenset(
     "clutter occluder company apart unusual tempo merged double_rate accumulated inverted integration sparse crowded "
     "recorded clear_limbs hard mask ground_window box_window mask_keep missing_part intensity_dropout beam_divergence "
@@ -51,8 +52,8 @@ _SHARES = frozenset(
 
 
 def _check_fields(config: Any) -> None:
-    """Raises InputError for numbers and pairs of numbers that are negative, infinite, or above 1 and a share; makes
-    tuples of pairs."""
+    """Raises InputError if a number, or one of a pair, is negative, infinite or, for a share, above 1; converts pairs
+    to tuples."""
     for field in fields(config):
         value, is_pair = getattr(config, field.name), field.type == tuple[float, float]
         if is_pair and isinstance(value, list | np.ndarray):
@@ -73,19 +74,19 @@ def _check_fields(config: Any) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseConfig:
-    """What goes wrong with returns. Probabilities unless a unit is named; each is off by default.
+    """Errors of returns. Values are probabilities unless a unit is named; each is off by default.
 
     Args:
-        mask: laser-level mask, which keeps a share of the patches between the two of `mask_keep`.
+        mask: laser-level mask; the share of patches that it keeps is drawn from the range `mask_keep`.
         clutter: clusters of points that no surface returned, at most `most_clutter` points each.
-        missing_part: one body part's returns are gone.
-        intensity_dropout: how much of what grazes a surface or is far may be lost.
-        beam_divergence: beams of 1.5 to 3 mrad instead of lines, so that silhouettes fatten and edges give mixed
+        missing_part: all returns of one body part are dropped.
+        intensity_dropout: maximum loss probability of returns at grazing incidence or far away.
+        beam_divergence: beams of 1.5 to 3 mrad instead of lines, so that silhouettes become wider and edges give mixed
             ranges (spinning sensors only).
-        sigma: the sensor's range noise is multiplied by a factor between the two.
-        ring_bias: standard deviation of an error that a ring's points share, between the two, m.
-        dapt_compat: what the released code does instead: ranges 0 to 2 cm too long, clutter by its own law, the
-            beams at +-pi twice.
+        sigma: range of a factor on the sensor's range noise.
+        ring_bias: range of the standard deviation of an error that all points of a ring share, m.
+        dapt_compat: behavior of the released code instead: ranges 0 to 2 cm too long, clutter with its own
+            distribution, the beams at +-pi twice.
     """
 
     mask: float = 0.0
@@ -105,8 +106,8 @@ class NoiseConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class CropErrors:
-    """How wrong a crop's box is. jitter m: standard deviation of its center (and, in rad, of its yaw); loose: share
-    of boxes far too large, as drawn by hand; cut: share of boxes that lose the feet, the head or a side."""
+    """Errors of a crop's box. jitter m: standard deviation of its center (and, in rad, of its yaw); loose: share of
+    boxes that are far too large, as if drawn by hand; cut: share of boxes that cut off the feet, the head or a side."""
 
     jitter: float = 0.0
     loose: float = 0.0
@@ -118,47 +119,47 @@ class CropErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneConfig:
-    """How scenes are drawn. Probabilities unless a unit is named.
+    """How scenes are drawn. Values are probabilities unless a unit is named.
 
     Args:
         name: of the preset, part of each sample's source.
-        sensors: names or files of tables, each as often as it stands there.
-        distance: nearest and farthest, m.
-        median_points: of the law of point counts; 0: distance uniform as in the paper.
-        mount: standard deviation of the sensor's height, m; 0: its own height whether the person fits or not.
+        sensors: names or files of tables; a repeated entry is drawn more often.
+        distance: minimum and maximum, m.
+        median_points: median of the log-normal distribution of point counts; 0: distance uniform as in the paper.
+        mount: standard deviation of the sensor's height, m; 0: its nominal height whether the person fits or not.
         slope: standard deviation of the ground's tilt, rad.
-        margin: how much farther than the body beams are cast, rad.
-        around: the same, m.
-        ground_window: 1: the window of beams, and with it the laser mask, is about the body and the ground, as in the
-            paper's Eq. 3; 0: about the body alone, as in the released code.
-        box_window: 1: the window of beams holds the crop's box too, whatever is in it; 0: a large box has an empty rim.
+        margin: margin of the window of beams around the body, rad.
+        around: additional margin of this window, m at the person.
+        ground_window: 1: the window of beams, and with it the laser mask, is around the body and the ground, as in the
+            paper's Eq. 3; 0: around the body alone, as in the released code.
+        box_window: 1: the window of beams covers the crop's box, too; 0: a large box has an empty rim.
         clutter: things near the person.
-        occluder: something in front.
+        occluder: an object in front of the person.
         company: a second person in or before the crop.
-        apart: 1: a second person stands clear of the first; 0: the two may overlap.
-        unusual: share of people, of those not captured, who do what the default mix of poses has hardly any of: squat,
-            kick, throw, hop, pick something up, sit and lie on the floor and so on.
-        carry: how often something is carried or used, relative to the street's habit.
+        apart: 1: a second person does not overlap the first; 0: the two may overlap.
+        unusual: share of poses, of those not captured, that the default mix has hardly any of: squat, kick, throw, hop,
+            pick something up, sit and lie on the floor and so on.
+        carry: how often things are carried or used, relative to `draw_props`.
         tempo: captured motion of clips and accumulated frames is played at exp(-tempo) to exp(tempo) times its speed.
-        merged: the cloud of 2 to 4 sensors around the person, see `Acquisition`; this and the next six hold for single
-            people only, clips have none of them.
+        merged: the cloud of 2 to 4 sensors around the person, see `Acquisition`; this and the next six apply to single
+            people only, not to clips.
         double_rate: of the spinning sensors that are merged with the first one, the share that turns twice as fast:
             two scans of half as many columns, half a period apart.
-        accumulated: 2 to 5 frames of somebody who moves in one cloud.
+        accumulated: 2 to 5 frames of a moving person in one cloud.
         inverted: sensors mounted upside down, 2 to 5 m above the ground.
-        integration: rosettes that collect 0.1, 0.2 or 0.5 s, each as often.
+        integration: rosettes that integrate 0.1, 0.2 or 0.5 s, with equal probability.
         sparse: sensors of 16 and 32 rings at a uniform distance of up to 25 m.
-        crowded: crops that hold a second person besides the one whom the box's center is nearer to.
-        noise: what goes wrong with returns.
+        crowded: crops with a second person; the box's center is nearer to the person meant.
+        noise: errors of returns.
         crop: errors of the crop's box.
-        recorded: 1: captured people stay where they were recorded, as without the paper's scene sampling; 0: they are
+        recorded: 1: captured people stand where they were recorded, without the paper's scene sampling; 0: they are
             placed at random.
         clear_limbs: 1: forearms, hands and shanks that a captured pose puts inside the drawn body, which may be wider
-            than who was captured, are turned out of it; 0: they stay there.
-        clothes: how far cloth and hair stand off the skin, relative to the street's; 0: bare but for skirts and hats,
-            which `carry` draws.
-        hard: difficulty in [0, 1]; scales what hides a person or spoils their crop, not the sensor's own noise.
-            Whatever it is, boxes jitter and the field of view ends.
+            than the captured person, are rotated out of it; 0: they stay there.
+        clothes: factor on the offset of clothes and hair from the skin; 0: no clothes but skirts and hats, which
+            `carry` draws.
+        hard: difficulty in [0, 1]; scales the probability of occlusion and of errors in the crop, not the sensor's own
+            noise. Jitter of boxes and the limits of the field of view do not depend on it.
     """
 
     name: str
@@ -201,12 +202,12 @@ class SceneConfig:
 
     @property
     def varied(self) -> bool:
-        """Whether people may be seen otherwise than in one scan of an upright sensor."""
+        """Whether people may be scanned in other ways than by one scan of an upright sensor."""
         return any((self.merged, self.accumulated, self.inverted, self.integration, self.sparse, self.crowded))
 
     @property
     def follows_paper(self) -> bool:
-        """Whether every sample is as the paper says: on bare ground, of one difficulty, masked always."""
+        """Whether every sample follows the paper: on bare ground, with one difficulty, always masked."""
         return self.name in ("paper", "reference")
 
     def eased(self, hard: float) -> "SceneConfig":
@@ -214,10 +215,10 @@ class SceneConfig:
         return replace(self, hard=hard)
 
     def changed(self, settings: Sequence[str]) -> "SceneConfig":
-        """The same scenes but for some fields, each given as "name=value": of the scene, its noise or its crops; two
-        ends as "distance=4:12"; the noise's clutter is "noise.clutter". "keep=R" is the paper's r_keep: every sample is
-        masked and keeps a share R; several sensors are "sensors=NAME:NAME". Raises InputError for what is no field or
-        no value of it.
+        """The same scenes with some fields changed, each given as "name=value": a field of the scene, its noise or its
+        crops; a range is "distance=4:12"; the noise's clutter is "noise.clutter". "keep=R" is the paper's r_keep: every
+        sample is masked and keeps a share R; several sensors are "sensors=NAME:NAME". Raises InputError for an unknown
+        field or an invalid value.
         """
         scene = self
         for setting in settings:
@@ -232,7 +233,7 @@ def _changed(scene: SceneConfig, name: str, text: str) -> SceneConfig:
     for group, config in groups.items():
         for field in fields(config):
             if isinstance(getattr(config, field.name), int | float | tuple) and field.name != "sensors":
-                # two have a field clutter
+                # the scene and its noise both have a field `clutter`
                 targets[f"{group}.{field.name}" if field.name in targets else field.name] = (group, field.name)
     if name == "sensors":
         for sensor_name in text.split(":"):
@@ -272,8 +273,9 @@ _PAPER = SceneConfig(
 
 SCENES = {
     "paper": _PAPER,
-    # where the released code departs from the paper: 5 to 20 m, 1.8 degrees about the body, ranges 0 to 2 cm too
-    # long, clusters of noise in half of the samples, in half of them one body part gone, the seam's beams twice
+    # differences of the released code from the paper: 5 to 20 m, a margin of 1.8 degrees around the body, ranges 0 to
+    # 2 cm too long, clusters of noise in half of the samples, one body part missing in half of them, the beams at the
+    # seam twice
     "reference": replace(
         _PAPER,
         name="reference",
@@ -281,7 +283,7 @@ SCENES = {
         margin=np.radians(1.8),
         noise=NoiseConfig(mask=1.0, clutter=0.5, missing_part=0.5, dapt_compat=True),
     ),
-    # sensors, counts and crops as users have them: 50 to 900 points a person, boxes of real detectors
+    # sensors, point counts and crops as in users' data: 50 to 900 points per person, boxes of real detectors
     "wild": SceneConfig(
         name="wild",
         sensors=(
@@ -316,8 +318,8 @@ SCENES = {
 }
 
 
-# unusual poses, clouds of several scans, hung sensors, few rings and two people in one crop besides; limbs of captured
-# people are outside the drawn body, second people clear of the first, and boxes full
+# "wild" plus unusual poses, clouds of several scans, inverted sensors, few rings and two people in one crop; limbs of
+# captured people are outside the drawn body, second people do not overlap the first, and boxes have no empty rim
 SCENES["wide"] = replace(
     SCENES["wild"],
     name="wide",

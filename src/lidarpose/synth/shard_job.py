@@ -1,4 +1,4 @@
-"""The job behind `lidarpose synth`: people, clips or streets into Parquet shards; see `data.writer` for how."""
+"""The job behind `lidarpose synth`: writes people, clips or streets to Parquet shards, see `data.writer`."""
 
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -22,24 +22,25 @@ from lidarpose.synth.scene import RandomStream, scene_config
 if TYPE_CHECKING:
     from lidarpose.synth.generator import Generator
 
-# persons, clips or streets a shard
+# persons, clips or streets per shard
 PER_SHARD = {"people": 2000, "clips": 125, "streets": 2}
 _TABLES = {"people": ("people",), "clips": ("people",), "streets": ("people", "frames")}
 STREET_FRAMES = 10
-# rows of a table that one of them has, where that is known
+# number of rows in a table per person or clip; not fixed for streets
 _ROWS = {"people": {"people": 1}, "clips": {"people": CLIP_FRAMES}}
-# share of captured poses where a file of them is given
+# default share of captured poses if a motion file is given
 _CAPTURED = 0.5
-# as many as names of five digits can number
+# shard numbers have five digits
 _MOST_SHARDS = 100_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class SynthesisJob:
-    """What to make. what: people, clips or streets; count of them; scene: a preset's name; sensors: names or files of
-    tables, None: the scene's; hard in [0, 1]; motion: a file of captured clips whose poses make up a share `captured`
-    of all (None: half), subjects: which of them; body: the user's SMPL file instead of the shipped body; set: changes
-    of the scene, see `SceneConfig.changed`; per_shard: persons, clips or streets a file, None: as `PER_SHARD`."""
+    """The settings of a dataset. what: people, clips or streets; count: their number; scene: a preset's name; sensors:
+    names or files of tables, None: the scene's; hard: difficulty in [0, 1]; motion: a file of captured clips whose
+    poses make up a share `captured` of all (None: half); subjects: which of the clips, None: all; body: the user's SMPL
+    file instead of the shipped body; set: changes of the scene, see `SceneConfig.changed`; per_shard: persons, clips or
+    streets per file, None: as `PER_SHARD`."""
 
     what: str
     count: int
@@ -89,16 +90,16 @@ class SynthesisJob:
 
     @property
     def shard_size(self) -> int:
-        """Persons, clips or streets a file."""
+        """Number of persons, clips or streets per file."""
         return PER_SHARD[self.what] if self.per_shard is None else self.per_shard
 
     @property
     def share(self) -> float:
-        """Of the poses, how many are captured."""
+        """Share of captured poses."""
         return 0.0 if self.motion is None else _CAPTURED if self.captured is None else self.captured
 
     def generator(self) -> "Generator":
-        """What makes the people. Raises InputError where motion cannot be read, MissingExtra without numba."""
+        """The generator of the people. Raises InputError if motion cannot be read, MissingExtra without numba."""
         from lidarpose.synth.bodies import CLIP_HZ, PoseBank, smpl_rig
         from lidarpose.synth.generator import Generator
 
@@ -114,7 +115,7 @@ class SynthesisJob:
         return Generator(scene=scene, bank=bank, captured=self.share, rig=rig)
 
     def card(self) -> DatasetCard:
-        """The dataset's card: all that decides its content."""
+        """The dataset's card: all settings that determine its content."""
         sensors = self.sensors or scene_config(self.scene).changed(self.set).sensors
         scene_changes = [change for change in self.set if not change.startswith("sensors=")]
         settings: dict[str, Any] = {
@@ -124,7 +125,7 @@ class SynthesisJob:
         }
         if self.what != "streets":
             settings |= {"scene": self.scene, "hard": self.hard} | ({"set": scene_changes} if scene_changes else {})
-        # files by content, so that another file of the same name is noticed and the same one elsewhere is not
+        # files are identified by content, so that another file of the same name is detected and a moved file is not
         tables = [name for name in dict.fromkeys(sensors) if name not in SENSORS]
         if tables:
             settings["tables"] = [content_digest(name, expected="a sensor's table")[:16] for name in tables]
@@ -140,17 +141,18 @@ class SynthesisJob:
 def write_dataset(
     job: SynthesisJob, folder: str | Path, *, workers: int = 1, progress: Callable[[int, int], None] | None = None
 ) -> int:
-    """Makes what is missing of a dataset; returns how many persons, clips or streets were made now.
+    """Makes the missing shards of a dataset; returns the number of persons, clips or streets that this call made.
 
-    workers: processes; progress(done, total) is called at the start and as they are done. Raises InputError where the
-    folder holds another dataset or something else, or cannot be written, MissingExtra without numba or pyarrow.
+    workers: number of processes; progress(done, total) is called at the start and after each one is done. Raises
+    InputError if the folder holds another dataset or other files, or cannot be written, MissingExtra without numba or
+    pyarrow.
     """
     check_int("--workers", workers, least=1)
     folder, card = Path(folder), job.card()
     missing_shards = open_folder(folder, card, _ROWS.get(job.what))
     remaining = sum(card.size(shard) for shard in missing_shards)
     done_count = card.count - remaining
-    # before anything is written, so that motion that cannot be read leaves no folder
+    # before anything is written, so that an unreadable motion file leaves no folder behind
     maker = Maker(job=job, card=card, folder=folder, generator=job.generator()) if missing_shards else None
     with lock_dataset(folder):
         has_card = (folder / CARD).is_file()
@@ -164,7 +166,7 @@ def write_dataset(
                 if progress is not None:
                     progress(done_count, card.count)
         except InputError:
-            # the card of settings that made nothing would keep others from following
+            # if nothing was made, the card would prevent another try with other settings
             if not has_card and not any(folder.glob("*.parquet")):
                 (folder / CARD).unlink()
             raise
@@ -173,8 +175,8 @@ def write_dataset(
 
 @dataclass(frozen=True, kw_only=True)
 class Maker:
-    """Makes the shards of a job and writes them: called with a shard's number, yields counts of persons, clips or
-    streets as they are done. Written when the last one was yielded. May be pickled."""
+    """Makes and writes the shards of a job: called with a shard's number, yields counts of persons, clips or streets as
+    they are done. The shard is written before the last count is yielded. May be pickled."""
 
     job: SynthesisJob
     card: DatasetCard
@@ -210,7 +212,7 @@ class Maker:
 
         seed, sensors = self.job.seed, self.generator.config.sensors
         scene = street(seed, index, sensor=sensors[index % len(sensors)], frames=STREET_FRAMES)
-        # all of a street have a box, whose id is their track
+        # every sample of a street has a box, whose id is its track
         people = [
             person_row(sample, index=index, frame=frame, track=int(cast("Any", sample.box).id))
             for frame, sample in samples(scene, np.random.default_rng([seed, RandomStream.STREET_BOXES, index]))

@@ -1,4 +1,4 @@
-"""What a sensor returns of a person's scene: its triangles, the cast, and the sensor's noise."""
+"""Simulated scans of a person's scene: its triangles, the ray cast, and the sensor's noise."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -23,28 +23,28 @@ from lidarpose.synth.place import Place
 from lidarpose.synth.props import Prop
 from lidarpose.synth.scene import SceneConfig
 
-# makers' range limits hold for targets that reflect about 80 percent; clothes at 20 percent are seen half as far
+# manufacturers' range limits are for targets that reflect about 80 percent; clothes at 20 percent have half that range
 REACH = 0.5
-# what a label's box adds to the body's extent, m
+# margin that a label's box adds to the body's size, m
 _BOX_ROOM = 0.1
 # full divergence of beams, rad: 3 to 6 cm at 20 m
 _DIVERGENCE = (0.0015, 0.003)
-# ranges of the released code are too long by up to this, m
+# maximum error of the released code's ranges, which are always too long, m
 _DAPT_NOISE = 0.02
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScanConditions:
-    """A sensor's noise, as strong in all frames of a clip; what it adds to each ring is drawn anew in every frame.
+    """Parameters of a sensor's noise, the same in all frames of a clip; each ring's error is redrawn in every frame.
 
     Args:
-        sigma: of a range, m.
-        bias: standard deviation of an error that a ring's points share, m.
-        intensity_dropout: in [0, 1], how much is lost that grazes or is far.
+        sigma: standard deviation of a range, m.
+        bias: standard deviation of an error that all points of a ring share, m.
+        intensity_dropout: in [0, 1], maximum loss probability of returns at grazing incidence or far away.
         divergence: of a beam, rad; 0: a line.
-        one_sided: range errors uniform in [0, one_sided) besides, as in the released code, m.
+        one_sided: additional range errors uniform in [0, one_sided), as in the released code, m.
         keep: share of patches that the laser-level mask keeps; 1: no mask.
-        phase: a pattern's first frame.
+        phase: index of a pattern's first frame.
     """
 
     sigma: float = 0.0
@@ -58,7 +58,7 @@ class ScanConditions:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """What stays while a person moves.
+    """Everything that is constant while a person moves.
 
     Args:
         config: the scene's configuration, at its difficulty.
@@ -66,8 +66,8 @@ class Scene:
         place: of the person, and the sensor's mount.
         conditions: the sensor's noise.
         background: meshes in the level frame at the sensor: ground, things, another person.
-        props: what the person wears and uses.
-        still: how many of `background` stand still: all but the other person, who is the last one.
+        props: things that the person wears and uses.
+        still: number of meshes of `background` that are static: all but the other person, which is the last mesh.
         acquisition: how the cloud is acquired.
         views: the scans that are added to the scene's own.
     """
@@ -84,12 +84,12 @@ class Scene:
 
     @property
     def body_place(self) -> Place:
-        """Where the body is."""
+        """The body's place, which is above the ground on props such as a bicycle."""
         return self.place.on_props(self.props)
 
     def meshes(self, bodies: Bodies, row: int, lag: float = 0.0) -> list[Mesh]:
-        """All triangles, level frame: body `row` first, which is that of the frame's middle, then its props, then the
-        background. lag: by how much of the way that it goes within a frame the body has moved on."""
+        """All triangles, level frame: body `row`, whose pose is that of the frame's middle, then its props, then the
+        background. lag: time by which the body has moved on, as a share of `FRAME_TIME`."""
         place = self.body_place
         states = [bodies.between(row, lag + time) for time in looks(self.sensor, self.place.feet)]
         body_vertices = [place.of_body(vertices) for vertices, _ in states]
@@ -101,15 +101,16 @@ class Scene:
         return meshes + self.background
 
     def seen_from(self, at: np.ndarray, **changes: Any) -> "Scene":
-        """The scene in a level frame at (3,) m of this one, its axes parallel; changes: of the sensor there."""
+        """The scene in a level frame with parallel axes whose origin is `at` (3,) m in this one; changes: other fields
+        that differ for the sensor there."""
         place = changes.pop("place", self.place)
         feet = self.place.feet - at
         place = replace(place, feet=feet, yaw=self.place.yaw, distance=float(np.hypot(feet[0], feet[1])))
         return replace(self, place=place, background=[mesh.moved(-at) for mesh in self.background], views=(), **changes)
 
     def scans(self, bodies: Bodies, row: int, frame: int) -> Iterator[tuple["Scene", list[Mesh], int, np.ndarray]]:
-        """The scans that make up the cloud of body `row`, the scene's own first: the scene as it is seen from there,
-        its meshes, the frame's number, and where (3,) m that is in the level frame."""
+        """The scans of which the cloud of body `row` consists, the scene's own first: the scene as seen from the scan's
+        sensor, its meshes, the frame's number, and the sensor's position (3,) m in the level frame."""
         yield self, self.meshes(bodies, row), frame, np.zeros(3)
         for view in self.views:
             meshes = view.scene.meshes(bodies, row - view.earlier, view.lag)
@@ -118,12 +119,12 @@ class Scene:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """A scan that is added to another.
+    """A scan that is added to a scene's own.
 
     Args:
-        scene: as it is seen from there, see `Scene.seen_from`.
-        at: (3,) m, the sensor in the other scan's level frame.
-        earlier: by how many frames.
+        scene: as seen from this scan's sensor, see `Scene.seen_from`.
+        at: (3,) m, the position of this scan's sensor in the level frame of the scene's own scan.
+        earlier: number of frames by which this scan is earlier.
         lag: see `Scene.meshes`.
     """
 
@@ -143,19 +144,20 @@ class SimulatedScan:
 
 
 def looks(device: Sensor | RayPattern, feet: np.ndarray) -> tuple[float, ...]:
-    """When a sensor looks at somebody at `feet` (3,) m, in `FRAME_TIME` from the middle: a rosette's frame begins and
-    ends, a stack's first and last rings pass. (0,): all at once."""
+    """Times at which a sensor scans a person at `feet` (3,) m, in units of `FRAME_TIME` relative to the frame's middle:
+    start and end of a rosette's frame; or when the first and the last ring of a laser stack pass. (0,): at one time."""
     if isinstance(device, RayPattern):
         half = device.duration / FRAME_TIME / 2
     else:
-        # frames begin behind the sensor: rings that lag into the next one have passed in this one, a turn before
+        # frames start behind the sensor: rings whose lag reaches into the next frame passed one turn earlier, in this
+        # frame
         is_ahead = np.arctan2(feet[1], feet[0]) / (2 * pi) + 0.5 + device.lag > 1
         half = (device.lag - (is_ahead and device.lag > 0)) * device.turn_time / FRAME_TIME / 2
     return (-half, half) if half else (0.0,)
 
 
 def label_box(vertices: np.ndarray, yaw: float, id: int) -> Box:
-    """The label of a body: the box around its vertices (V, 3) m along a heading of `yaw` rad, `_BOX_ROOM` added."""
+    """The label of a body: the box around its vertices (V, 3) m with heading `yaw` rad, enlarged by `_BOX_ROOM`."""
     aligned_vertices = vertices.astype(float) @ rotation_about("z", yaw)
     low, high = aligned_vertices.min(0), aligned_vertices.max(0)
     center = rotation_about("z", yaw) @ ((low + high) / 2)
@@ -163,7 +165,7 @@ def label_box(vertices: np.ndarray, yaw: float, id: int) -> Box:
 
 
 def draw_conditions(config: SceneConfig, sensor: Sensor | RayPattern, rng: np.random.Generator) -> ScanConditions:
-    """Conditions of a scene; of them the mask alone is as frequent as the scene is difficult."""
+    """Draws a sensor's conditions in a scene; only the probability of the mask scales with the difficulty."""
     noise = config.noise
     sigma, bias, dropout, wide_draw, divergence, mask_draw, keep, phase = rng.random(8).tolist()
     return ScanConditions(
@@ -184,13 +186,13 @@ def _between(ends: tuple[float, float], share: float) -> float:
 def simulate(
     scene: Scene, bodies: Bodies, row: int, rng: np.random.Generator, *, frame: int = 0, box: Box | None = None
 ) -> SimulatedScan:
-    """The cloud of body `row`: what the scene's sensor returns, and all that is added to it; `box` as in
+    """The cloud of body `row`: the scan of the scene's sensor and all scans added to it; `box` as in
     `simulate_scan`."""
     return _added_up(scene.scans(bodies, row, frame), rng, box)
 
 
 def simulate_still(scene: Scene, thing: Mesh, rng: np.random.Generator) -> SimulatedScan:
-    """The same of a thing that does not move."""
+    """The cloud of a thing that does not move, see `simulate`."""
     view_scans = ((view.scene, thing.moved(-view.at), -view.earlier, view.at) for view in scene.views)
     scans = [(scene, thing, 0, np.zeros(3)), *view_scans]
     return _added_up(
@@ -202,7 +204,7 @@ def simulate_still(scene: Scene, thing: Mesh, rng: np.random.Generator) -> Simul
 def _added_up(
     view_scans: Iterable[tuple[Scene, list[Mesh], int, np.ndarray]], rng: np.random.Generator, box: Box | None = None
 ) -> SimulatedScan:
-    """Scans as in `Scene.scans` in the frame of the first one."""
+    """Simulates scans as in `Scene.scans` and concatenates them in the frame of the first one."""
     scans: list[SimulatedScan] = []
     for view_scene, meshes, frame, position in view_scans:
         view_box = None if box is None else replace(box, center=box.center - position)
@@ -217,18 +219,18 @@ def _added_up(
 def simulate_scan(
     scene: Scene, meshes: list[Mesh], rng: np.random.Generator, *, frame: int = 0, box: Box | None = None
 ) -> SimulatedScan:
-    """What the scene's sensor returns.
+    """The scan of the scene's sensor.
 
     Args:
-        meshes: all triangles in the level frame; the window of beams is about the first one, the body, or about body
-            and ground where the scene says so.
-        frame: how many frames after a pattern's first one.
-        box: that the window of beams holds too, level frame.
+        meshes: all triangles in the level frame; the window of beams is around the first mesh, the body, or around
+            body and ground, see `SceneConfig.ground_window`.
+        frame: number of frames after a pattern's first one.
+        box: the window of beams covers it, too; level frame.
     """
     sensor = scene.sensor
     hits, mesh = _cast(scene, meshes, frame, box=box)
     points, returned = add_sensor_noise(hits, mesh, sensor, scene.conditions, rng)
-    # a union has parts
+    # the body has parts, so the union has, too
     ring, part = hits.ring[returned], cast("np.ndarray", mesh.part)[hits.face[returned]]
     if scene.config.noise.dapt_compat and isinstance(sensor, Sensor):
         seam_rows = np.flatnonzero((hits.column[returned] + hits.column0) % sensor.columns == 0)
@@ -237,13 +239,13 @@ def simulate_scan(
 
 
 def count_alone(scene: Scene, body: Mesh, frame: int) -> int:
-    """How many beams would meet a body with nothing else around."""
+    """Number of beams that would hit a body if nothing else were in the scene."""
     return len(_cast(scene, [body], frame)[0].face)
 
 
 def scan_background(scene: Scene, body: Mesh, frame: int) -> np.ndarray:
-    """Points (n, 3) float32 m in the level frame of what stands still about a body, what the body hides too: a map has
-    them without noise."""
+    """Points (n, 3) float32 m in the level frame of the static surroundings of a body, including those that the body
+    occludes; without noise, as in a map."""
     empty_body = replace(body, faces=body.faces[:0], part=None)
     hits, _ = _cast(scene, [empty_body, *scene.background[: scene.still]], frame, margin=MARGIN)
     return scene.place.to_level(hits.points)
@@ -252,14 +254,15 @@ def scan_background(scene: Scene, body: Mesh, frame: int) -> np.ndarray:
 def _cast(
     scene: Scene, meshes: list[Mesh], frame: int, *, margin: float = 0.0, box: Box | None = None
 ) -> tuple[Hits, Mesh]:
-    """The hits, and all meshes as one, in the sensor's frame. margin rad: beams beyond those of the scene; box: that
-    they hold too."""
+    """The hits, and the union of all meshes, in the sensor's frame. margin rad: added to the scene's margin of the
+    window of beams; box: the window covers it, too."""
     place, sensor = scene.place, scene.sensor
-    # the ground is the first thing of the background; what the window is about comes first
+    # the first mesh of the background is the ground; meshes that define the window are sorted to the front
     ground = scene.background[:1] if scene.config.ground_window else []
     window_mesh_ids = {id(mesh) for mesh in (meshes[0], *ground)}
     if box is not None:
-        # the window is wider than its meshes by `around`, across a corner too; nothing is seen below the feet
+        # the window extends `around` beyond its meshes, so the box is shrunk, its corners by `around`; nothing is
+        # visible below the feet
         size = np.maximum(box.size - np.sqrt(2) * scene.config.around, 0.0)
         top, bottom = box.center[2] + size[2] / 2, max(box.center[2] - size[2] / 2, place.feet[2])
         size[2] = max(top - bottom, 0.0)
@@ -297,7 +300,7 @@ def _cast(
 
 
 def _laser_level_mask(hits: Hits, sensor: Sensor | RayPattern, keep: float, rng: np.random.Generator) -> np.ndarray:
-    """(n,) bool: which hits the laser-level mask leaves."""
+    """(n,) bool: which hits the laser-level mask keeps."""
     if keep >= 1:
         return np.ones(len(hits.points), np.bool_)
     if isinstance(sensor, RayPattern):
@@ -314,11 +317,11 @@ def add_sensor_noise(
     *,
     ring_normals: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The returns of a cast that come back, with the errors of their ranges.
+    """The hits that the sensor does not lose, with range errors.
 
     Args:
-        hits: of a cast of `mesh`, in the sensor's frame.
-        ring_normals: standard normals, one a ring, where they are the same for several scans; None: drawn here.
+        hits: of a ray cast of `mesh`, in the sensor's frame.
+        ring_normals: standard normals, one per ring, if several scans share them; None: drawn here.
 
     Returns:
         Points (k, 3) float32 m and their indices (k,) among the hits.

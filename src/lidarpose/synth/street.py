@@ -1,8 +1,8 @@
-"""Whole street scenes: people who walk among houses, parked cars, trees and street furniture, seen in full turns.
+"""Whole street scenes: people walking among houses, parked cars, trees and street furniture, in full turns of a sensor.
 
-Layout, in the street's own frame: x along the street, y across it, z = 0 the road. A road between two pavements one
-kerb higher, house fronts, hedges or fences behind them, cars parked at the kerbs, furniture along them. The sensor
-stands on the road or a pavement; the street's frame is turned at random about it. Everything depends on (seed, index)
+Layout, in the street's own frame: x along the street, y across it, z = 0 the road. A road between two sidewalks one
+curb higher; house fronts, hedges or fences behind them; parked cars and street furniture along the curbs. The sensor
+stands on the road or a sidewalk; the street's frame is rotated about it at random. Everything depends on (seed, index)
 alone. Letters: P people, F frames, n points of a frame.
 """
 
@@ -27,17 +27,18 @@ from lidarpose.synth.place import Place
 from lidarpose.synth.scene import RandomStream
 from lidarpose.synth.simulate import ScanConditions, add_sensor_noise, label_box, looks
 
-# furniture stands so far behind the kerb, and half of the street's length that is built, m
+# distance of furniture from the curb, and half the length of the street, m
 _RAIL, _LENGTH = 0.45, 45.0
-# people start within these distances of the sensor, m, and keep apart from it and from each other by so much
+# people start at a distance along the street between the first two minus 1 m, and never come nearer to the sensor than
+# the first minus 1 m; the third is the minimum distance between people, m
 _NEAREST, _FARTHEST, _APART = 2.5, 28.0, 0.75
 _PLACE_TRIES = 200
-# what people do in streets, of `body.pose_prior.activities.KINDS`, and how often another is drawn for it
+# activities of people in streets, from `body.pose_prior.activities.KINDS`, and the maximum number of draws for one
 _STREET_KINDS = ("walk", "idle", "run", "push", "step")
 _KIND_TRIES = 12
-# share of weak returns that is lost, and the standard deviation of a ring's own range error, m
+# share of weak returns that is lost, and the standard deviation of the range error that a ring's points share, m
 _INTENSITY_DROPOUT, _RING_BIAS = 0.6, 0.008
-# that errors are drawn for, if the sensor has no more: so what is drawn after them does not depend on the sensor
+# minimum number of rings for which errors are drawn, so that later draws do not depend on the sensor
 _RINGS = 256
 # errors of a detector's box in `samples`: center m, size m, yaw rad
 _OFF, _GROWN, _TURNED = 0.06, (0.0, 0.2), 0.08
@@ -46,7 +47,7 @@ _OFF, _GROWN, _TURNED = 0.06, (0.0, 0.2), 0.08
 @dataclass(frozen=True, kw_only=True)
 class StreetFrame:
     """One turn of the sensor. points (n, 3) float32 m; ring (n,); person (n,) int16: index into `boxes`, -1 = none;
-    part (n,) uint8 as in `Sample`; boxes: of all P people, seen or not, their ids the track ids; joints (P, 26, 3)
+    part (n,) uint8 as in `Sample`; boxes: of all P people, visible or not, with track ids as ids; joints (P, 26, 3)
     float32 m, body26; boxes and joints are those of the frame's middle. All in the level frame at the sensor."""
 
     points: np.ndarray
@@ -69,7 +70,7 @@ class Street:
 def street(
     seed: int, index: int, *, sensor: str = "os1-128", people: tuple[int, int] = (3, 8), frames: int = 1
 ) -> Street:
-    """Street `index` of `seed` with `people` (least, most) in it, `frames` turns at 10 Hz. Raises InputError."""
+    """Street `index` of `seed` with `people` (minimum, maximum), `frames` turns at 10 Hz. Raises InputError."""
     seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
     frames = check_int("frames", frames, least=1)
     try:
@@ -88,14 +89,14 @@ def street(
     return Street(frames=turns, sensor=device.name, height=plan.height)
 
 
-# --- what stands still
+# --- static objects
 
 
 @dataclass(frozen=True, kw_only=True)
 class StreetPlan:
-    """Sizes in m, in the street's frame: the sensor stands on (0, sensor_y), the road reaches from -road to road, the
-    pavements on to +-front, `kerb` high; height of the sensor above the road; turn rad of the street about it; ahead:
-    people are on the x > 0 side, where a sensor that does not turn looks."""
+    """Sizes in m, in the street's frame: the sensor stands at (0, sensor_y), the road extends from -road to road, the
+    sidewalks from there to +-front, `kerb` high; height: of the sensor above the road; turn: rotation of the street
+    about it, rad; ahead: people start on the x > 0 side, where a sensor that does not rotate points."""
 
     road: float
     front: float
@@ -111,7 +112,7 @@ def _draw_plan(device: Sensor | RayPattern, rng: np.random.Generator) -> StreetP
     road = 2.8 + 1.7 * a
     front = road + 2.2 + 2.3 * b
     kerb = 0.08 + 0.08 * c
-    # on the road as a car, or on a pavement as a robot or a tripod
+    # on the road, like a car, or on a sidewalk, like a robot or a tripod
     on_road = d < 0.6
     sensor_y = (2 * e - 1) * (road - 2.0) if on_road else (road + front) / 2 * (1 if e < 0.5 else -1)
     height = device.height + 0.15 * (2 * g - 1) + (0 if on_road else kerb)
@@ -121,14 +122,14 @@ def _draw_plan(device: Sensor | RayPattern, rng: np.random.Generator) -> StreetP
 
 
 def _scenery(plan: StreetPlan, rng: np.random.Generator) -> list[Mesh]:
-    """All that stands still, in the street's frame moved so that the sensor is the origin."""
+    """All static objects, in the street's frame moved so that the sensor is the origin."""
     meshes = [_ground(plan)]
     for side in (-1, 1):
         meshes += _house_fronts(plan, side, rng)
         meshes += _kerb_row(plan, side, rng)
     shift = np.array([0, -plan.sensor_y, -plan.height])
     moved_meshes = [mesh.moved(shift) for mesh in meshes]
-    # the sensor is not in a car
+    # no object contains the sensor or is close to it
     clear_meshes = [m for m in moved_meshes[1:] if np.hypot(*m.vertices[:, :2].T).min() > 1.2 and not _around(m)]
     return moved_meshes[:1] + clear_meshes
 
@@ -139,7 +140,7 @@ def _around(mesh: Mesh) -> bool:
 
 
 def _ground(plan: StreetPlan) -> Mesh:
-    """The road, two risers, two pavements."""
+    """The road, two curb faces, two sidewalks."""
     strips = []
     for y0, z0, y1, z1 in (
         (-plan.road, 0.0, plan.road, 0.0),
@@ -154,7 +155,7 @@ def _ground(plan: StreetPlan) -> Mesh:
 
 
 def _house_fronts(plan: StreetPlan, side: int, rng: np.random.Generator) -> list[Mesh]:
-    """House fronts with doors and windows, hedges, fences and gaps, one after the other behind a pavement."""
+    """House fronts with doors and windows, hedges, fences and gaps, one after the other behind a sidewalk."""
     meshes, x = [], -_LENGTH
     while x < _LENGTH:
         a, b, c, d = rng.random(4).tolist()
@@ -169,7 +170,7 @@ def _house_fronts(plan: StreetPlan, side: int, rng: np.random.Generator) -> list
                 opening = (-0.25 * bay_width, 0.25 * bay_width, sill, top)
                 front = shapes.wall(bay_width, 3.5 + 3 * d, thick=0.3, opening=opening)
                 meshes.append(front.moved((x + (bay + 0.5) * bay_width, y, plan.kerb), pi / 2))
-            # rooms end somewhere
+            # the back walls of the rooms
             meshes.append(shapes.box((length, 0.1, 3.5)).moved((middle[0], y + side * (1.5 + 3 * d), plan.kerb)))
         elif c < 0.75:
             for k in range(int(length)):
@@ -183,7 +184,7 @@ def _house_fronts(plan: StreetPlan, side: int, rng: np.random.Generator) -> list
 
 
 def _kerb_row(plan: StreetPlan, side: int, rng: np.random.Generator) -> list[Mesh]:
-    """Parked cars at the kerb and furniture on the pavement beside it."""
+    """Parked cars at the curb and furniture on the sidewalk beside it."""
     meshes, x = [], -_LENGTH + 4 * rng.random()
     has_parked_cars = rng.random() < 0.8
     while has_parked_cars and x < _LENGTH - 6:
@@ -219,21 +220,21 @@ def _kerb_row(plan: StreetPlan, side: int, rng: np.random.Generator) -> list[Mes
     return meshes
 
 
-# --- the people: the frames of each, and where they start
+# --- the people: each one's frames and start
 
 Walker = tuple[Bodies, Place]
 
 
 def _path(walker: Walker) -> np.ndarray:
-    """(F, 2) m: where the pelvis is."""
+    """(F, 2) m: x, y of the pelvis."""
     bodies, place = walker
     return place.of_body(bodies.joints[:, 0])[:, :2]
 
 
 def _draw_walkers(plan: StreetPlan, count: int, frames: int, rng: np.random.Generator) -> list[Walker]:
-    """People on the pavements and on the road, apart from each other at all times; fewer where there is no room.
+    """People on the sidewalks and the road, apart from each other in all frames; fewer than `count` if space is short.
 
-    Who walks too far to stay on one surface in any of the first half of the tries may leave it in the others.
+    In the first half of the tries, a person must stay on one surface; in the second half, they may leave it.
     """
     walkers: list[Walker] = []
     paths: list[np.ndarray] = []
@@ -253,7 +254,7 @@ def _draw_walkers(plan: StreetPlan, count: int, frames: int, rng: np.random.Gene
 
 
 def _draw_pedestrian(frames: int, rng: np.random.Generator) -> Bodies:
-    """Somebody who does what people do in streets: nobody sits without a seat."""
+    """A person with an activity of `_STREET_KINDS`: sitting, for example, would need a seat."""
     for _ in range(_KIND_TRIES):
         bodies = draw_moving_bodies(None, 0.0, 1, frames, rng)[0]
         if bodies.kinds[0] in _STREET_KINDS:
@@ -262,21 +263,21 @@ def _draw_pedestrian(frames: int, rng: np.random.Generator) -> Bodies:
 
 
 def _draw_start(plan: StreetPlan, bodies: Bodies, rng: np.random.Generator) -> tuple[Place, bool]:
-    """Where somebody starts, and whether they stay on one surface and out of the rows at the kerbs."""
+    """Where a person starts, and whether they stay on one surface and clear of the cars and furniture at the curbs."""
     surface_draw, distance_draw, lateral_share, direction_draw, yaw_draw = rng.random(5)
     turn = rotation_about("z", plan.turn)
     x = (1 if distance_draw < 0.5 or plan.ahead else -1) * (
         _NEAREST - 1 + (_FARTHEST - _NEAREST) * abs(2 * distance_draw - 1) ** 1.5
     )
     if surface_draw < 0.8:
-        # along a pavement, between the furniture and the fronts
+        # along a sidewalk, between the furniture and the fronts
         side = 1 if surface_draw < 0.4 else -1
         low, high = plan.road + _RAIL + 0.5, plan.front - 0.3
         y, z = side * (low + lateral_share * (high - low)), plan.kerb
         yaw = (0.0 if direction_draw < 0.5 else pi) + 0.3 * (yaw_draw - 0.5)
         bounds = sorted((side * low, side * high))
     else:
-        # across the road, beyond the parked cars
+        # across the road, between the parked cars
         bounds, z = [-(plan.road - 2.2), plan.road - 2.2], 0.0
         y = bounds[0] + lateral_share * (bounds[1] - bounds[0])
         yaw = (pi / 2 if direction_draw < 0.5 else -pi / 2) + 1.2 * (yaw_draw - 0.5)
@@ -287,7 +288,7 @@ def _draw_start(plan: StreetPlan, bodies: Bodies, rng: np.random.Generator) -> t
 
 
 def _label(walker: Walker, frame: int, track: int) -> Box:
-    """The box around somebody, along their heading."""
+    """The box around a person, aligned with their heading."""
     bodies, place = walker
     return label_box(place.of_body(bodies.vertices[frame]), place.yaw + bodies.heading[frame], track)
 
@@ -335,7 +336,7 @@ def _scan_turn(
 
 
 def samples(scene: Street, rng: np.random.Generator, *, least: int = 15) -> list[tuple[int, Sample]]:
-    """(frame, sample) of all people of whom `least` points or more are seen, cropped by boxes with a detector's errors.
+    """(frame, sample) of all people with at least `least` points in the crop; its box has a detector's errors.
 
     The box's id is the track id; frame_id is "frame/track".
     """

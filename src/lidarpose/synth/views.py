@@ -1,4 +1,4 @@
-"""The scans that are added to a scene's own: of other sensors around the person, or of earlier frames."""
+"""The scans that are added to a scene's own: from other sensors around the person, or from earlier frames."""
 
 from dataclasses import replace
 
@@ -12,16 +12,16 @@ from lidarpose.synth.place import draw_place
 from lidarpose.synth.scene import SceneConfig
 from lidarpose.synth.simulate import Scene, View, draw_conditions
 
-# sensors that are merged stand so far off equal angles around the person, rad
+# maximum deviation of merged sensors from equal angles around the person, rad
 _OFF_ANGLE = 0.4
-# a sensor that drives does not come nearer than this to the person, m
+# if a person behind the sensor is nearer than this to its x axis, the sensor moves along -x instead of +x, m
 _BESIDE_LANE = 1.5
 
 
 def with_views(
     scene: Scene, placing: SceneConfig, height: float, reach: float, nearer: float, rng: np.random.Generator
 ) -> Scene:
-    """The scene with the scans that its acquisition adds. Arguments: as of `draw_place`."""
+    """The scene with the scans that its acquisition adds. Arguments: as in `draw_place`."""
     if len(scene.acquisition.sensors) > 1:
         return replace(scene, views=_merged_views(scene, placing, height, reach, nearer, rng))
     return replace(scene, views=_earlier_views(scene)) if scene.acquisition.frames > 1 else scene
@@ -30,19 +30,19 @@ def with_views(
 def _merged_views(
     scene: Scene, place_config: SceneConfig, height: float, reach: float, nearer: float, rng: np.random.Generator
 ) -> tuple[View, ...]:
-    """The other sensors around a person, each turned, mounted and disturbed on its own, up to a tenth of a second
-    before or after the first one, some at twice its rate. Arguments: as of `draw_place`."""
+    """The other sensors around a person, each with its own rotation, mount and noise, up to a tenth of a second before
+    or after the first one, some at twice their normal rate. Arguments: as in `draw_place`."""
     names, feet, views = scene.acquisition.sensors, scene.place.feet, []
     for k, name in enumerate(names[1:], 1):
         device = sensor(name)
         sensor_place = draw_place(place_config, device, height, reach, nearer, rng, scene.acquisition.inverted)
         angle, lag = rng.uniform(-1, 1, 2).tolist()
-        # from there the person is seen in this direction of the first sensor's frame
+        # direction from this sensor to the person in the first sensor's frame
         heading = np.arctan2(feet[1], feet[0]) + 2 * np.pi * k / len(names) + _OFF_ANGLE * angle
         turn = rotation_about("z", heading - np.arctan2(sensor_place.feet[1], sensor_place.feet[0]))
         position = feet - turn @ sensor_place.feet
         rate, lags = scene.config.double_rate, [lag]
-        # a table of an odd number of columns has no half
+        # an odd number of columns cannot be halved
         if isinstance(device, Sensor) and device.columns % 2 == 0 and rate > 0 and rng.random() < rate:
             device = replace(device, azimuth_step=2 * device.azimuth_step, turn_time=device.turn_time / 2)
             lags.append(lag - 0.5 if lag > 0 else lag + 0.5)
@@ -58,9 +58,9 @@ def _merged_views(
 
 
 def _earlier_views(scene: Scene) -> tuple[View, ...]:
-    """The frames before the last, seen from where the sensor was."""
+    """The frames before the last, each from the position of the sensor at that time."""
     feet, views = scene.place.feet, []
-    # it does not drive through the person
+    # along +x, it could have driven through a person behind it
     forward = -1 if feet[0] < 0 and abs(feet[1]) < _BESIDE_LANE else 1
     for earlier in range(1, scene.acquisition.frames):
         position = np.array([-forward * scene.acquisition.speed * earlier / CLIP_HZ, 0, 0])

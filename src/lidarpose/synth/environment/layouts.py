@@ -1,7 +1,7 @@
 """Where detection scenes take place: streets, open places, paths, rooms, corridors and car parks.
 
-A layout is drawn in its own frame, whose z = 0 is flat ground: its named meshes, the free areas where people and things
-may stand, and where the sensor is. Rooms of `LEFT_OUT` shapes are kept for judging.
+A layout is drawn in its own frame, whose z = 0 is flat ground. It consists of named meshes, the free areas where people
+and things may stand, and the sensor's position. The layouts of `LEFT_OUT` are held out from training.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from lidarpose.synth.environment.mesh import Mesh, grid, shape
 from lidarpose.synth.environment.things import car, draw_thing, facade
 
 Item = tuple[str, Mesh]
-# half of what is built outdoors, m
+# half the length of rows of buildings, cars and plants outdoors, m
 _REACH = 45.0
 
 
@@ -26,14 +26,15 @@ class Layout:
 
     Args:
         items: kinds (names of `things.KINDS`) and meshes; ground is one of them.
-        areas: (x from, x to, y from, y to, z) of free ground, m.
-        sensor: x, y m and the ground's z there.
-        ahead: where a sensor that does not turn may look, rad.
-        indoors: things of rooms stand about, nothing is sloped.
-        ceiling: m; inf outdoors.
-        by_car: the sensor may be a car's.
-        things: how many more stand about, relative to others.
-        road: |y| m up to which the ground of a street is at z = 0 and its areas beyond at theirs; None: elsewhere.
+        areas: (x min, x max, y min, y max, z) of free ground, m.
+        sensor: x, y and the ground's z there, m.
+        ahead: directions in which a sensor that does not rotate may point, rad.
+        indoors: True: indoor things are drawn, and the ground has no slope.
+        ceiling: height, m; inf outdoors.
+        by_car: whether the sensor may be on a car.
+        things: factor on the number of things that are added.
+        road: for streets, the ground is at z = 0 for |y| up to this, m, and at the z of the first area beyond it; None
+            for other places.
     """
 
     items: list[Item]
@@ -51,7 +52,7 @@ _XS = np.concatenate([np.linspace(-70, -42, 5), np.arange(-38, 39, 2.5), np.lins
 
 
 def _field(rng: np.random.Generator, rough: float) -> Mesh:
-    """Open ground that is uneven by `rough` m."""
+    """Open ground whose height has a standard deviation of `rough` m."""
     return grid(_XS, _XS, rng.normal(0, rough, (len(_XS), len(_XS))) if rough else 0.0)
 
 
@@ -59,7 +60,7 @@ def _field(rng: np.random.Generator, rough: float) -> Mesh:
 
 
 def street(rng: np.random.Generator) -> Layout:
-    """A road between two pavements one kerb higher, fronts behind them, cars parked at the kerbs."""
+    """A road between two sidewalks one curb higher, with fronts behind them and cars parked at the curbs."""
     road = rng.uniform(2.6, 5.5) if rng.random() < 0.6 else rng.uniform(5, 11)
     kerb = rng.choice([0.0, rng.uniform(0.06, 0.16)], p=[0.15, 0.85])
     front = road + rng.uniform(1.5, 5.0) * rng.choice([1.0, 1.8])
@@ -79,7 +80,7 @@ def street(rng: np.random.Generator) -> Layout:
 
 
 def _fronts(side: int, front: float, z: float, rng: np.random.Generator) -> list[Item]:
-    """Houses, garden walls, hedges, fences and gaps behind a pavement."""
+    """Houses, garden walls, hedges, fences and gaps behind a sidewalk."""
     items: list[Item] = []
     x, yaw = -_REACH, -side * pi / 2
     while x < _REACH:
@@ -101,7 +102,7 @@ def _fronts(side: int, front: float, z: float, rng: np.random.Generator) -> list
 
 
 def _parked(side: int, road: float, rng: np.random.Generator) -> list[Item]:
-    """Cars along the kerb or across it; with gaps that people and corners show through."""
+    """Cars parked parallel or perpendicular to the curb, with gaps in which people and house corners are visible."""
     items: list[Item] = []
     is_across, car_share = rng.random() < 0.2, rng.choice([0.0, 0.35, 0.75], p=[0.25, 0.45, 0.3])
     x = -_REACH + 5 * rng.random()
@@ -118,7 +119,7 @@ def _parked(side: int, road: float, rng: np.random.Generator) -> list[Item]:
 
 
 def square(rng: np.random.Generator) -> Layout:
-    """An open place, some houses and cars at its edges."""
+    """An open place with some houses, cars and trees."""
     items: list[Item] = [("ground", _field(rng, rng.choice([0.0, 0.02])))]
     for turn in np.flatnonzero(rng.random(4) < 0.45) * (pi / 2):
         distance, y = rng.uniform(9, 38), -_REACH
@@ -126,7 +127,7 @@ def square(rng: np.random.Generator) -> Layout:
             length = rng.uniform(5, 15)
             if rng.random() < 0.8:
                 for name, mesh in facade(length, rng.uniform(2.8, 10), rng):
-                    # faces the middle
+                    # faces the middle of the square
                     items.append(
                         (name, mesh.moved((0, 0, 0), pi).moved((distance, y + length / 2, 0)).moved((0, 0, 0), turn))
                     )
@@ -198,7 +199,7 @@ def _walls(width: float, length: float, height: float, rng: np.random.Generator,
 
 
 def _against_walls(width: float, length: float, rng: np.random.Generator) -> list[Item]:
-    """Shelves, cupboards, tables and doors along the walls, tables with chairs within."""
+    """Shelves, cupboards, tables, doors and chairs along the walls, and tables with chairs in the room."""
     items: list[Item] = []
     count = int(rng.integers(2, int(5 + (width + length) / 3)))
     for name in map(str, rng.choice(["shelf", "cupboard", "table", "door", "chair"], count)):
@@ -223,12 +224,12 @@ def _against_walls(width: float, length: float, rng: np.random.Generator) -> lis
 
 
 def room(rng: np.random.Generator) -> Layout:
-    """An office, a class or a living room."""
+    """An office, a classroom or a living room."""
     return _room(rng.uniform(3.5, 12), rng.uniform(4, 18), rng)
 
 
 def small_room(rng: np.random.Generator) -> Layout:
-    """A bedroom, a kitchen, an office for one."""
+    """A bedroom, a kitchen or a one-person office."""
     return replace(_room(rng.uniform(2.5, 4.5), rng.uniform(3, 6), rng), things=0.5)
 
 
@@ -249,7 +250,7 @@ def _indoors(
     ahead: float,
     **fields: Any,
 ) -> Layout:
-    """A room of size (width, length, height) about the origin, free but for a margin at its walls."""
+    """A room of size (width, length, height) centered on the origin, free except for a margin at its walls."""
     width, length, height = size
     area = (margin[0] - width / 2, width / 2 - margin[0], margin[1] - length / 2, length / 2 - margin[1], 0.0)
     room = Layout(items=items, areas=[area], sensor=(*sensor, 0), ahead=(ahead,), indoors=True, ceiling=height)
@@ -279,7 +280,7 @@ def car_park(rng: np.random.Generator) -> Layout:
 
 
 def corridor(rng: np.random.Generator) -> Layout:
-    """A long corridor with niches, doors and glass; left out of training."""
+    """A long corridor with niches, doors and glass; held out from training."""
     width, length, height = rng.uniform(1.7, 4.0), rng.uniform(14, 38), rng.uniform(2.3, 3.2)
     items: list[Item] = [("ground", grid(np.array([-9.0, 9.0]), np.array([-length, length])))]
     items.append(("ceiling", grid(np.array([-9.0, 9.0]), np.array([-length, length]), height)))
@@ -299,10 +300,10 @@ def corridor(rng: np.random.Generator) -> Layout:
 
 
 def hall(rng: np.random.Generator) -> Layout:
-    """A hall or a shop: an angled room with half-high partitions, rows of shelves, counters; left out of training."""
+    """A hall or a shop: an L-shaped room with half-height partitions and rows of shelves; held out from training."""
     width, length, height = rng.uniform(9, 26), rng.uniform(12, 36), rng.uniform(3.0, 7.0)
     items = _walls(width, length, height, rng)
-    # a block takes a corner off
+    # a block cuts off a corner
     block = rng.uniform(0.2, 0.45, 2) * [width, length]
     items.append(("wall", shapes.box((*block, height)).moved(((width - block[0]) / 2, (length - block[1]) / 2, 0))))
     for _ in range(rng.integers(1, 7)):

@@ -1,8 +1,8 @@
-"""Triangle meshes for scenes: primitives, their union, and what stands about in streets and rooms.
+"""Triangle meshes for scenes: primitives, their union, and objects of streets and rooms.
 
-Things look as a LiDAR sees them: few triangles, right outlines. All stand on the origin, their front along +x, their
-length along y where they have one; sizes in meters. What is called with an rng is random in shape, all else is a
-function of its sizes. A mesh of a kind is built once with unit size and then scaled: every person draws some.
+Objects have few triangles, but correct outlines, which is what a LiDAR sees. All stand on the origin, with their front
+along +x and their length, if any, along y; sizes in meters. Functions with an rng return random shapes, all others
+depend only on sizes. A shipped mesh is loaded once at unit size and then scaled, since every person draws some.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,8 +23,8 @@ class Mesh:
     Args:
         vertices: (V, 3) float32 m.
         faces: (F, 3) int32.
-        part: (F,) uint8 of the body that a face belongs to, 0: not the person; None: all 0.
-        later: (V, 3) m, the vertices when the sensor last looks at them; None: they stand still.
+        part: (F,) uint8, body part that a face belongs to, 0: not the person; None: all 0.
+        later: (V, 3) m, the vertices at the end of the sensor's frame; None: they do not move.
     """
 
     vertices: np.ndarray
@@ -33,28 +33,28 @@ class Mesh:
     later: np.ndarray | None = None
 
     def moved(self, translation: Vector, yaw: float = 0.0) -> "Mesh":
-        """Turned by `yaw` rad about z, then moved by `translation` (3,) m."""
+        """The mesh rotated by `yaw` rad about z, then translated by `translation` (3,) m."""
         c, s = cos(yaw), sin(yaw)
         R, t = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], np.float32), np.asarray(translation, np.float32)
         return self.mapped(lambda vertices: (vertices @ R if yaw else vertices) + t)
 
     def scaled(self, size: Vector) -> "Mesh":
-        """Stretched along x, y and z."""
+        """The mesh scaled along x, y and z."""
         return self.mapped(lambda vertices: vertices * np.asarray(size, np.float32))
 
     def placed(self, rows: Sequence, origin: Sequence) -> "Mesh":
-        """In another frame: rows (3, 3) say where x, y and z go, then `origin` (3,) m is added."""
+        """The mesh in another frame: rows (3, 3) are the images of x, y and z, then `origin` (3,) m is added."""
         R, t = np.array(rows, np.float32), np.array(origin, np.float32)
         return self.mapped(lambda vertices: vertices @ R + t)
 
     def mapped(self, function: Callable[[np.ndarray], np.ndarray]) -> "Mesh":
-        """With all vertices (V, 3) m, those of the frame's end too, where a function puts them."""
+        """The mesh with a function applied to its vertices (V, 3) m, and to those of `later`."""
         later = None if self.later is None else function(self.later)
         return Mesh(function(self.vertices), self.faces, self.part, later)
 
 
 def union(meshes: list[Mesh]) -> Mesh:
-    """All meshes as one; their faces stand one mesh after the other."""
+    """All meshes as one, vertices and faces concatenated in order."""
     faces, start, part, later = [], 0, None, None
     for mesh in meshes:
         faces.append(mesh.faces + np.int32(start) if start else mesh.faces)
@@ -77,14 +77,14 @@ _BOX_FACES = np.array(
 
 
 def quad(half: float, slope: Vector) -> Mesh:
-    """A square of half width `half` m about the origin, its height slope (2,) times x and y."""
+    """A square of half width `half` m around the origin, with z = slope (2,) times (x, y)."""
     x, y = half * float(slope[0]), half * float(slope[1])
     corners = [[-half, -half, -x - y], [half, -half, x - y], [half, half, x + y], [-half, half, y - x]]
     return Mesh(np.array(corners, np.float32), QUAD_FACES)
 
 
 def grid(xs: np.ndarray, ys: np.ndarray, z: np.ndarray | float = 0.0) -> Mesh:
-    """A grid of quads at z (X, Y) or one height, m."""
+    """A grid of quads at heights z (X, Y) or at one height, m."""
     count = (len(xs), len(ys))
     vertices = np.stack([*np.meshgrid(xs, ys, indexing="ij"), np.broadcast_to(z, count)], -1).reshape(-1, 3)
     number = np.arange(len(vertices)).reshape(count)
@@ -110,7 +110,7 @@ _PIECES = {"box": _BOX_FACES, "quad": QUAD_FACES, "triangle": np.array([[0, 1, 2
 
 @lru_cache(maxsize=512)
 def repeated(count: int, corners: int, piece: str) -> np.ndarray:
-    """Faces of `count` like pieces (box, quad or triangle), each with vertices of its own; read-only."""
+    """Faces of `count` equal pieces (box, quad or triangle), each with its own `corners` vertices; read-only."""
     starts = np.arange(count, dtype=np.int32)[:, None, None] * np.int32(corners)
     faces = (_PIECES[piece] + starts).reshape(-1, 3)
     faces.setflags(write=False)
@@ -121,15 +121,15 @@ def repeated(count: int, corners: int, piece: str) -> np.ndarray:
 
 
 def shape(name: str, x: float = 1.0, y: float = 1.0, z: float = 1.0) -> Mesh:
-    """A fixed mesh of `tools/make_meshes.py`, stretched. Of unit size are "car" and "van" (heading along +x), "table",
-    "wheeled bin", "traffic cone" (high as 1) and "bonnet"; "pole" has a radius and a height of 1; "bench" and "bench
-    without back" are 1 along y."""
+    """A fixed mesh of `tools/make_meshes.py`, scaled. "car" and "van" (heading along +x), "table", "wheeled bin",
+    "traffic cone" (height 1) and "bonnet" have unit size; "pole" has radius 1 and height 1; "bench" and "bench without
+    back" have length 1 along y."""
     return shipped_meshes()[name].scaled((x, y, z))
 
 
 @cache
 def shipped_meshes() -> dict[str, Mesh]:
-    """All of them by name, read once; read-only."""
+    """All shipped meshes by name, loaded once; read-only."""
     with resources.files("lidarpose.synth").joinpath("assets/meshes.npz").open("rb") as file:
         arrays = dict(np.load(file, allow_pickle=False))
     names = [key.removesuffix("/faces") for key in arrays if key.endswith("/faces")]
@@ -140,11 +140,11 @@ def shipped_meshes() -> dict[str, Mesh]:
     return meshes
 
 
-# --- meshes of a few sizes each
+# --- meshes built from a few sizes each
 
 
 def wall(length: float, height: float, *, thick: float = 0.2, opening: tuple | None = None) -> Mesh:
-    """A wall along y. opening: (from, to, sill, top) of a window or a door, the first two in y, all in meters."""
+    """A wall along y. opening: (y min, y max, z of the sill, z of the top) of a window or a door, m."""
     if opening is None:
         return box(np.array([thick, length, height]))
     left, right, sill, top = opening
@@ -169,7 +169,7 @@ def sign(height: float, wide: float) -> Mesh:
 
 
 def rail_fence(length: float, height: float, rails: int) -> Mesh:
-    """Posts 1.5 m apart or less along y, and `rails` bars between them: beams pass between."""
+    """Posts at most 1.5 m apart along y, and `rails` horizontal bars; beams pass between them."""
     post_count = max(2, int(np.ceil(length / 1.5)) + 1)
     post_y = np.linspace(-length / 2, length / 2, post_count)
     middle, size = np.zeros((post_count + rails, 3)), np.empty((post_count + rails, 3))
@@ -181,7 +181,7 @@ def rail_fence(length: float, height: float, rails: int) -> Mesh:
 
 
 def lattice_fence(length: float, height: float, pitch: float, slat: float) -> Mesh:
-    """Upright slats `slat` m wide every `pitch` m along y, and two thin rails: what stands behind shows through."""
+    """Upright slats `slat` m wide every `pitch` m along y, and two thin rails; beams pass between them."""
     count = max(2, int(length / pitch))
     y = (np.arange(count) - (count - 1) / 2) * pitch
     vertices = np.zeros((count + 2, 4, 3), np.float32)
@@ -196,20 +196,20 @@ def lattice_fence(length: float, height: float, pitch: float, slat: float) -> Me
     return Mesh(vertices.reshape(-1, 3), repeated(count + 2, 4, "quad"))
 
 
-# leaves of a cloud of foliage, drawn once: unit balls of triangles
+# numbers of precomputed unit balls of leaf triangles, and of leaves in each
 _LEAF_BALLS = 8
 _LEAVES = 120
 
 
 def foliage(size: Vector, leaves: int, leaf: float, rng: np.random.Generator) -> Mesh:
     """A bush or a hedge: `leaves` (at most 120) triangles of about `leaf` m in an ellipsoid of size (3,) m that
-    stands on the origin; some beams pass."""
+    stands on the origin; some beams pass through."""
     pick, turn, flip = rng.random(3).tolist()
     center, leaf_shape = _leaf_balls()[int(pick * _LEAF_BALLS)]
     c, s = np.cos(2 * np.pi * turn), np.sin(2 * np.pi * turn)
     rotation = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1 if flip < 0.5 else -1]], np.float32)
     half = np.asarray(size, np.float32) / 2
-    # a leaf may not stick out of the ellipsoid by more than itself, nor into the ground
+    # a leaf sticks out of the ellipsoid by no more than its own size, and not below the ground
     vertices = ((center[:leaves] @ rotation) * half)[:, None] + leaf_shape[:leaves] * np.float32(leaf)
     vertices[..., 2] = np.maximum(vertices[..., 2] + half[2], 0)
     return Mesh(vertices.reshape(-1, 3), repeated(min(leaves, _LEAVES), 3, "triangle"))
@@ -217,7 +217,7 @@ def foliage(size: Vector, leaves: int, leaf: float, rng: np.random.Generator) ->
 
 @lru_cache
 def _leaf_balls() -> list[tuple[np.ndarray, np.ndarray]]:
-    """Centers (120, 3) in the unit ball, denser at the rim as leaves are, and shapes (120, 3, 3) of about 1 m."""
+    """Centers (120, 3) in the unit ball, denser near its surface like leaves, and shapes (120, 3, 3) of about 1 m."""
     balls = []
     for number in range(_LEAF_BALLS):
         rng = np.random.default_rng([number, 120])
@@ -229,7 +229,7 @@ def _leaf_balls() -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def grass(radius: float, height: float, blades: int, rng: np.random.Generator) -> Mesh:
-    """`blades` upright thin triangles on a disc of `radius` m, up to `height` m high."""
+    """`blades` thin upright triangles on a disk of `radius` m, up to `height` m high."""
     angle, distance, height_draw, lean_draw, width_draw = rng.random((5, blades))
     distance = radius * np.sqrt(distance)
     angle = angle * (2 * np.pi)

@@ -1,6 +1,6 @@
-"""Where things and people stand about a sensor: free places in a layout, things scattered over it, waves of its ground.
+"""Where things and people stand around a sensor: free places in a layout, scattered things, the ground's relief.
 
-All is in the layout's frame, moved so that the sensor's ground is x = y = 0. k places, M footprints of what stands.
+Coordinates are the layout's, moved so that the sensor is above x = y = 0. Legend: k places, M footprints of objects.
 """
 
 from dataclasses import dataclass
@@ -16,26 +16,26 @@ from lidarpose.synth.environment.layouts import Item, Layout
 from lidarpose.synth.environment.mesh import Mesh, shape, union
 from lidarpose.synth.environment.things import THINGS, draw_thing
 
-# people and things stand within these distances, m
+# range of people's and things' distance from the sensor, m
 _NEAREST, _FARTHEST = 1.5, 40.0
-# half of a standing person's width, and the height of what of a person is to be seen, m
+# half the width of a standing person, and the height of the point that decides whether a person is visible, m
 HALF_WIDTH, _CHEST = 0.24, 1.1
-# share of the things beside people among those that are added last, a quarter of all
+# probability of a place beside a person, for the quarter of the things that is added after the people
 _BESIDE = 0.8
-# how much more often left-out things are drawn for judging
+# factor on the weights of held-out things in the family "heldout"
 _LEFT_OUT_WEIGHT = 3.0
 
 
 def pick(rng: np.random.Generator, weights: dict[str, float]) -> str:
-    """One of the names, as often as its weight says."""
+    """One of the names, drawn with probability proportional to its weight."""
     shares = np.cumsum(list(weights.values()))
     return list(weights)[int(np.searchsorted(shares, rng.random() * shares[-1], side="right"))]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mount:
-    """height m above the ground; R_sensor_level (3, 3); turn rad of the layout about the sensor; view: the middle of a
-    narrow field of view in the layout, rad, and half its width."""
+    """height m above the ground; R_sensor_level (3, 3); turn: rotation of the layout about the sensor, rad; view: the
+    middle azimuth of the field of view in the layout and its half width, rad."""
 
     height: float
     R_sensor_level: np.ndarray
@@ -44,9 +44,9 @@ class Mount:
 
 
 class Site:
-    """A layout about the sensor: its meshes, and where there is room.
+    """A layout around the sensor: its meshes, and where there is free space.
 
-    items: kinds and meshes, the sensor's ground at x = y = 0; low: (M, 5), what each takes of the ground, and its top.
+    items: kinds and meshes, with the sensor above x = y = 0; low: (M, 5), footprints, see `_footprint`.
     """
 
     def __init__(self, layout: Layout, device: Sensor | RayPattern, mount: Mount):
@@ -65,7 +65,7 @@ class Site:
         self.low = rows[np.isfinite(rows[:, 0])]
 
     def add(self, name: str, mesh: Mesh) -> None:
-        """Puts a mesh of a kind of `things.KINDS` where it is."""
+        """Adds a mesh, a kind of `things.KINDS`, at its own position."""
         self.items.append((name, mesh))
         row = _footprint(mesh)
         if np.isfinite(row[0]):
@@ -81,12 +81,12 @@ class Site:
         return float(self.areas[np.argmax(is_inside), 4])
 
     def is_free(self, place: np.ndarray, room: float) -> bool:
-        """Whether nothing stands within `room` m of a place (2,) m, nor the sensor."""
+        """Whether neither an object nor the sensor is within `room` m of a place (2,) m."""
         return bool(np.hypot(*place) > max(room, 0.3) and (_gap(self.low, place) > room).all())
 
     def is_hidden(self, places: np.ndarray) -> np.ndarray:
-        """(k,) bool: whether something stands between the sensor and the chest of a person at places (k, 2) m, or the
-        chest is above or below all beams."""
+        """(k,) bool: whether the chest of a person at places (k, 2) m is occluded by an object, or above or below all
+        beams."""
         chest_z = np.full((len(places), 1), _CHEST - self.mount.height)
         chest = np.hstack([places, chest_z]) @ rotation_about("z", self.mount.turn).T @ self.mount.R_sensor_level.T
         elevation = np.arctan2(chest[:, 2], np.hypot(*chest[:, :2].T))
@@ -99,8 +99,8 @@ class Site:
         return is_outside | np.any((enter < leave) & (enter > 0) & (enter < 0.97) & (self.low[:, 4] > beam), axis=1)
 
     def spot(self, distance: float, room: float, rng: np.random.Generator, *, seen: bool = False) -> np.ndarray:
-        """Some free place (2,) m in the areas about so far from the sensor, in view where the view is narrow; where
-        a person is `seen` if there is such a place."""
+        """A random place (2,) m, preferably free, in the areas, in the field of view and about `distance` m from the
+        sensor; with `seen`, preferably one where a person is visible."""
         middle, half_width = self.mount.view
         u = rng.random((48, 3))
         angle = middle + half_width * 0.95 * (2 * u[:24, 0] - 1)
@@ -120,7 +120,7 @@ class Site:
         return places[np.argmin(cost)]
 
     def beside(self, rng: np.random.Generator, gap: float) -> np.ndarray:
-        """A place (2,) m so near to something that stands there."""
+        """A place (2,) m at distance `gap` m from an object."""
         footprints = self.low[np.hypot(*((self.low[:, :2] + self.low[:, 2:4]) / 2).T) < self.reach]
         if not len(footprints):
             return self.spot(rng.uniform(_NEAREST, self.reach), HALF_WIDTH, rng)
@@ -132,7 +132,8 @@ class Site:
 
 
 def _footprint(mesh: Mesh) -> np.ndarray:
-    """(5,): least x, y, greatest x, y of what is below 1.9 m, inf where nothing is, and the top's z."""
+    """(5,) m: minimum x, y and maximum x, y of the vertices below 1.9 m, and the z of the top; inf without such
+    vertices."""
     low_points = mesh.vertices[mesh.vertices[:, 2] < 1.9, :2]
     if not len(low_points):
         return np.full(5, np.inf)
@@ -140,14 +141,14 @@ def _footprint(mesh: Mesh) -> np.ndarray:
 
 
 def _gap(footprints: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Distance of places (..., 2) from footprints (M, 5): (..., M) m, 0 within."""
+    """Distance of places (..., 2) from footprints (M, 5): (..., M) m, 0 inside."""
     places = places[..., None, :]
     offsets = np.maximum(np.maximum(footprints[:, :2] - places, places - footprints[:, 2:4]), 0)
     return np.hypot(offsets[..., 0], offsets[..., 1])
 
 
 def draw_habits(indoors: bool, family: str, rng: np.random.Generator) -> dict[str, float]:
-    """How often things stand in a scene: each scene has habits of its own."""
+    """Weights of the kinds of things in a scene, randomized for each scene."""
     weights = {}
     for name, row in THINGS.items():
         weights[name] = (row.indoors if indoors else row.outdoors) * (family != "train" or not row.left_out)
@@ -157,7 +158,7 @@ def draw_habits(indoors: bool, family: str, rng: np.random.Generator) -> dict[st
 
 
 def scatter(site: Site, weights: dict[str, float], count: int, feet: np.ndarray, rng: np.random.Generator) -> None:
-    """Adds `count` things that are taken for people; where there are people at feet (k, 2) m most stand beside them."""
+    """Adds `count` things that resemble people; if there are people at feet (k, 2) m, most things stand beside them."""
     ceiling = site.layout.ceiling
     for _ in range(count):
         name = pick(rng, weights)
@@ -185,7 +186,7 @@ def scatter(site: Site, weights: dict[str, float], count: int, feet: np.ndarray,
 
 
 def add_screens(site: Site, feet: np.ndarray, rng: np.random.Generator) -> None:
-    """Plates and leaves close before the sensor, in a quarter of the scenes; none in people at feet (k, 2) m."""
+    """Plates and leaves close to the sensor, in a quarter of the scenes; they keep clear of people at feet (k, 2) m."""
     for _ in range(rng.integers(1, 7) if rng.random() < 0.25 else 0):
         distance, angle, u = rng.uniform(0.6, 3.0), rng.uniform(-pi, pi), rng.random(3).tolist()
         width, bottom = (0.03 + 0.5 * u[0] ** 2) * distance, max(0.0, site.mount.height - u[1] * distance)
@@ -198,16 +199,16 @@ def add_screens(site: Site, feet: np.ndarray, rng: np.random.Generator) -> None:
 
 
 def add_own_vehicle(site: Site, rng: np.random.Generator) -> None:
-    """What carries the sensor, where the sensor sees it."""
+    """In 40 percent of the scenes, adds the vehicle or stand that carries the sensor."""
     if rng.random() < 0.4:
         own_mesh = _own_vehicle(site.mount.height, site.layout.by_car, rng)
         site.items.append(("own vehicle", own_mesh.moved((0, 0, site.layout.sensor[2]))))
-        # nobody stands in it, and it hides nothing that is higher than it
+        # people cannot stand inside it; its top is set to 0 so that it does not occlude anything in `is_hidden`
         site.low = np.concatenate([site.low, [[*_footprint(own_mesh)[:4], 0]]])
 
 
 def _own_vehicle(height: float, by_car: bool, rng: np.random.Generator) -> Mesh:
-    """A car below its roof sensor, a robot's deck, or the mast or tripod that carries the sensor."""
+    """A car below its roof sensor, a robot's deck, or the tripod that carries the sensor."""
     u = rng.random(4)
     if by_car and height > 1.4:
         roof = height - 0.1 - 0.25 * u[0]
@@ -234,7 +235,7 @@ class Relief:
 
     @classmethod
     def draw(cls, indoors: bool, rng: np.random.Generator) -> "Relief":
-        """Flat indoors, else slopes of a few percent and waves of 14 to 70 m."""
+        """Flat indoors, else slopes of a few percent and wavelengths of 14 to 70 m."""
         if indoors:
             return cls(np.zeros(2), np.zeros((0, 4)))
         slope = rng.normal(0, 0.035 if rng.random() < 0.6 else 0.0, 2).clip(-0.12, 0.12)
@@ -246,7 +247,7 @@ class Relief:
         return cls(slope, np.array(waves).reshape(-1, 4))
 
     def at(self, places: np.ndarray) -> np.ndarray:
-        """Height m of the ground at places (2 or 3, ...) m, 0 below the sensor."""
+        """Height of the ground, m, at places (2 or 3, ...) m; 0 below the sensor."""
         x, y = places[0], places[1]
         z = self.slope[0] * x + self.slope[1] * y
         for a, b, phase, amplitude in self.waves:

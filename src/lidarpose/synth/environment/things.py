@@ -1,7 +1,8 @@
-"""Things that stand where people are and are none: what a detector of people takes for one.
+"""Things that stand where people stand, and that a detector may mistake for people (false positives).
 
-Each stands on the origin, its front along +x, its length along y; sizes in meters. `THINGS` names them, says how often
-they stand outdoors and indoors, and which of them are kept for judging. Builders take uniforms (8,) and a generator.
+Each stands on the origin, with its front along +x and its length along y; sizes in meters. `THINGS` has their names,
+their weights outdoors and indoors, and which of them are held out from training. Builders take uniform numbers (8,) and
+a random generator.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,8 +21,7 @@ Builder = Callable[[Uniforms, np.random.Generator], Mesh]
 
 @dataclass(frozen=True)
 class Thing:
-    """A kind of thing: its builder, how often it stands outdoors and indoors beside the others, and whether training
-    never sees it."""
+    """A kind of thing: its builder, its weights outdoors and indoors, and whether it is held out from training."""
 
     build: Builder
     outdoors: float = 0.0
@@ -42,7 +42,7 @@ def _post(radius: float, height: float, *position: float) -> Mesh:
 
 
 def _union(*parts: Mesh | bool) -> Mesh:
-    """Those of the parts that are there."""
+    """The union of the parts that are meshes; others are False."""
     return union([part for part in parts if isinstance(part, Mesh)])
 
 
@@ -52,12 +52,12 @@ def _union(*parts: Mesh | bool) -> Mesh:
 def facade(
     length: float, height: float, rng: np.random.Generator, *, bars: float = 0.2, niches: float = 0.25
 ) -> list[tuple[str, Mesh]]:
-    """A house front along y, its face at x = 0, with a depth: windows set back, some with bars, niches and doorways,
-    pilasters, drainpipes, ledges; behind glass a room."""
+    """A house front along y with its face at x = 0 and relief: recessed windows, some with bars, niches and doorways,
+    pilasters, drainpipes, ledges; open windows show a room behind."""
     centers, sizes, rods = [], [], []
 
     def block(y: float, width: float, low: float, high: float, front_x: float, depth: float) -> None:
-        """From x = front_x backwards."""
+        """A box that extends backward from x = front_x."""
         centers.append((front_x - depth / 2, y, low))
         sizes.append((depth, width, high - low))
 
@@ -98,7 +98,7 @@ def facade(
         y += bay_width
     if rng.random() < 0.4:
         block(0, length, height * 0.6, height * 0.6 + 0.2, 0.15, 0.2)
-    # rooms end somewhere
+    # the back wall of the rooms
     block(0, length, 0, height, -1.5 - 3 * rng.random(), 0.1)
     front = shapes.boxes(np.array(centers), np.array(sizes))
     return [("facade", front)] + [("window bars" if len(rod.faces) > 30 else "pole", rod) for rod in rods]
@@ -121,7 +121,7 @@ def _bars(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 
 def _wall_end(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """A short wall seen on its end, or a corner of two."""
+    """A short wall seen from its end, or a corner of two walls."""
     height, length = 1.2 + 1.8 * u[0], 0.5 + 2.5 * u[1]
     wall = _box((length, 0.15 + 0.3 * u[2], height), -length / 2)
     if u[3] < 0.4:
@@ -132,7 +132,7 @@ def _wall_end(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 
 def _cabinet(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """Of a street's power or telephone: a plinth, a body, a roof."""
+    """A street cabinet for power or telephone: a plinth, a body, a roof."""
     depth, width, height = 0.25 + 0.3 * u[0], 0.4 + 0.9 * u[1] ** 2, 0.9 + 0.9 * u[2]
     return _union(
         _box((depth, width, 0.15)),
@@ -143,7 +143,7 @@ def _cabinet(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 
 def _pillar(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """Round or square, up to a ceiling or with a base and a cap."""
+    """A round or rectangular pillar, some with a base."""
     half, height = 0.1 + 0.22 * u[0], 1.6 + 2.4 * u[1]
     mesh = _post(half, height) if u[2] < 0.5 else _box((2 * half, 2 * half * (0.6 + 0.8 * u[5]), height))
     return _union(mesh, u[3] < 0.4 and _box((2.6 * half, 2.6 * half, 0.15 + 0.6 * u[4] ** 2)))
@@ -151,7 +151,7 @@ def _pillar(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 # --- plants
 
-# part of a mesh's faces that are leaves, which beams enter a little
+# `Mesh.part` of leaves, which beams penetrate a little
 LEAVES = 1
 
 
@@ -160,7 +160,7 @@ def _leaves(mesh: Mesh) -> Mesh:
 
 
 def crown(size: tuple[float, float, float], rng: np.random.Generator, *, dense: float = 1.0) -> Mesh:
-    """An irregular crown of leaves, standing on the origin: several balls."""
+    """An irregular crown of leaves that stands on the origin: one or several balls."""
     count = 1 + int(2.5 * rng.random() + (max(size) > 2))
     balls = []
     for _ in range(count):
@@ -170,19 +170,19 @@ def crown(size: tuple[float, float, float], rng: np.random.Generator, *, dense: 
         ball = shapes.foliage(share * size, int(min(120, 70 + 50 * dense)), leaf, rng)
         balls.append(_leaves(ball).moved(offset * size))
         if rng.random() < 0.6 * dense:
-            # no beam passes the middle
+            # a dense core that no beam passes
             half = 0.3 * share * size
             balls.append(shape("ball", *half).moved(offset * size + [0, 0, share[2] * size[2] / 2]))
     return union(balls)
 
 
 def _clipped(size: tuple[float, float, float], rng: np.random.Generator) -> Mesh:
-    """A clipped hedge: a box whose sides are leaves, with a dense inside."""
+    """A clipped hedge: a box with sides of leaves and a dense core."""
     depth, length, height = size
     leaf = 0.1
     count = int(min(260, 22 * (2 * length * height + 2 * depth * height + depth * length)))
     positions = rng.random((count, 3)) * [depth, length, height] - [depth / 2, length / 2, 0]
-    # to the nearest of a side that is drawn by its area
+    # projected onto a side, which is drawn with probability proportional to its area
     area = np.array([length * height, length * height, depth * height, depth * height, depth * length])
     side = rng.choice(5, count, p=area / area.sum())
     for number, (axis, value) in enumerate(
@@ -223,7 +223,7 @@ def _bush(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 
 def _tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """A trunk and a crown above heads."""
+    """A trunk and a crown above head height."""
     trunk_height, width = 2.0 + 1.2 * u[0], 2.0 + 3.0 * u[1]
     radius = 0.08 + 0.25 * u[2] ** 2
     top = _at(crown((width, width, 2 + 2.5 * u[3]), rng), z=trunk_height)
@@ -233,14 +233,14 @@ def _tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 
 def _young_tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """A thin trunk and a small crown that begins low."""
+    """A thin trunk and a small crown that starts low."""
     trunk_height, width, height = 0.7 + 1.3 * u[0], 0.4 + 1.0 * u[1], 1.0 + 1.8 * u[3]
     top = _at(crown((width, width, height), rng, dense=0.3), z=trunk_height)
     return union([_post(0.012 + 0.035 * u[2], trunk_height + height * 0.6), top])
 
 
 def _low_crown(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """A trunk with a crown down to knees or hips: thuja, spruce, an old shrub."""
+    """A trunk with a crown down to knee or hip height: thuja, spruce, an old shrub."""
     trunk_height, width, height = 0.1 + 1.0 * u[0], 0.6 + 2.2 * u[1], 1.6 + 3.0 * u[2]
     return union(
         [
@@ -265,7 +265,7 @@ def _staked_tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
     return _union(*parts, u[0] < 0.3 and _post(0.08 + 0.06 * u[1], 0.9 + 0.5 * u[2]))
 
 
-# --- street furniture and what stands about
+# --- street furniture and other objects
 
 
 def _bollard(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -278,7 +278,7 @@ def _pole(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A lamp post, a flagpole, a post with a box on it."""
     radius, height = 0.025 + 0.1 * u[0] ** 2, 1.5 + 6 * u[1]
     foot = u[2] < 0.3 and _post(1.7 * radius, 0.8 + 0.5 * u[3])
-    # a box, a bin or a parking meter at the height of a chest
+    # a box, a bin or a parking meter at chest height
     box = u[4] < 0.35 and _box((0.2 + 0.2 * u[5], 0.25 + 0.2 * u[6], 0.3 + 0.5 * u[7]), 0.1, 0, 0.6 + 0.7 * u[3])
     return _union(_post(radius, height), foot, box)
 
@@ -308,7 +308,7 @@ def _bench(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 
 def _chair(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """Alone, stacked, or an office's with a high back."""
+    """A single chair, a stack, or an office chair with a high back."""
     chair = shape("chair", 0.9 + 0.3 * u[0], 0.42 + 0.15 * u[1], 0.43 + 0.06 * u[2])
     if u[3] < 0.15:
         return union([_at(chair, z=0.09 * k) for k in range(2 + int(4 * u[4]))])
@@ -336,7 +336,7 @@ def _cart(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 
 def _bicycle(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """Parked, one or a few side by side."""
+    """One parked bicycle, or a few side by side."""
     size = 0.9 + 0.2 * u[0]
     bicycle = union([shape("bicycle"), _box((0.04, 0.56, 0.035), 0.52, 0, 1.02)]).scaled((size,) * 3)
     bicycle = _union(bicycle, u[1] < 0.3 and _box((0.3, 0.35, 0.25), -0.4 if u[2] < 0.5 else 0.7, 0, 0.75))
@@ -345,7 +345,7 @@ def _bicycle(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 
 def moped() -> Mesh:
-    """A scooter that faces +x, its seat's middle above the origin at 0.75 m, the foot board at 0.28 m."""
+    """A scooter facing +x, with the middle of its seat 0.75 m above the origin and its foot board at 0.28 m."""
     return _union(
         _at(shape("ball", 0.23, 0.06, 0.23), 0.85, 0, 0.23),
         _at(shape("ball", 0.23, 0.07, 0.23), -0.35, 0, 0.23),
@@ -397,7 +397,7 @@ def _fence(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 
 def car(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """A car, an estate or a van, heading along +x."""
+    """A car, a van or a truck, heading along +x."""
     if u[0] < 0.75:
         return shape("car", 3.6 + 1.3 * u[1], 1.65 + 0.25 * u[2], 1.38 + 0.35 * u[3])
     if u[0] < 0.95:
@@ -406,7 +406,7 @@ def car(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 
 def _car_corner(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """A car's corner beside what hides the rest: only a strip of it is seen. Never a lorry's."""
+    """The corner of a car or a van between occluders that hide the rest, so that only a strip is visible."""
     vehicle, occluder = car(0.9 * u, rng), _box((0.15, 2.0 + 2 * u[4], 1.6 + 0.8 * u[5]))
     gap = 0.25 + 0.5 * u[6]
     low, high = vehicle.vertices.min(0), vehicle.vertices.max(0)
@@ -419,7 +419,7 @@ def _car_corner(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 
 def _shelf(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """Uprights, boards and what lies on them."""
+    """A shelf: uprights, boards and the things on them."""
     depth, length, height = 0.3 + 0.3 * u[0], 0.7 + 1.8 * u[1], 1.2 + 1.2 * u[2]
     levels = 3 + int(3 * u[3])
     centers = [(0, side * length / 2, 0) for side in (-1, 1)]
@@ -445,7 +445,7 @@ def _cupboard(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 
 def _door(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """A door leaf that stands open, with a piece of its frame."""
+    """An open door leaf with a piece of its frame."""
     leaf = _box((0.04, 0.85, 2.0), 0, 0.42).moved((0, 0, 0), 1.5 * u[0])
     return union([leaf, _box((0.12, 0.08, 2.1), 0, -0.05)])
 
@@ -473,7 +473,7 @@ def _floor_lamp(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 
 def _fragment(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """A piece as large as a person or smaller, of no particular thing: a plate, a clump, a corner, some posts."""
+    """A person-sized or smaller piece of no particular thing: a plate, foliage, a corner, some posts or boxes."""
     height, width = 0.5 + 1.4 * u[0], 0.15 + 0.6 * u[1]
     if u[2] < 0.3:
         piece = _box((0.05, width, height))
@@ -490,7 +490,7 @@ def _fragment(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 
 def _floating(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """What hangs, or stands on legs too thin to be seen: a sign, a lamp, a banner, a branch, a machine."""
+    """A thing that hangs, or stands on legs too thin to be scanned: a sign, a lamp, a banner, a branch, a machine."""
     z, height, width = 0.35 + 1.1 * u[0], 0.3 + 0.9 * u[1], 0.2 + 0.7 * u[2]
     if u[3] < 0.5:
         return _box((0.04 + 0.3 * u[4] ** 2, width, height), 0, 0, z)
@@ -498,7 +498,7 @@ def _floating(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 
 def _mannequin(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """As tall and as wide as a person, of a few rough parts: a column, a wrapped pile, a dummy without limbs."""
+    """A thing as tall and wide as a person, of a few rough parts: a column, a wrapped pile, a dummy without limbs."""
     height, width = 1.3 + 0.6 * u[0], 0.3 + 0.3 * u[1]
     if u[2] < 0.4:
         edges, parts = [0.0, *np.sort(rng.uniform(0.1, 0.9, 2)) * height, height], []
@@ -547,7 +547,7 @@ THINGS: dict[str, Thing] = {
     "floating piece": Thing(_floating, 0.5, 0.3),
     "mannequin": Thing(_mannequin, 0.2, 0.0, left_out=True),
 }
-# what else points may lie on
+# other objects that points may lie on
 STRUCTURES = ("ground", "facade", "wall", "ceiling", "belongings", "own vehicle", "screen")
 KINDS = (*THINGS, *STRUCTURES)
 

@@ -1,6 +1,6 @@
-"""What a sensor outdoors sees beyond the free space about it: roads with vehicles, what stands along them, houses.
+"""Outdoor surroundings beyond the free space around the sensor: roads with vehicles, roadside objects, houses.
 
-Drawn for training alone, and only of kinds of `things.THINGS` that training may see.
+Used in training alone, and only with kinds of `things.THINGS` that are not held out from training.
 """
 
 from functools import cache, partial
@@ -13,28 +13,29 @@ from lidarpose.synth.environment.mesh import Mesh, shape, union
 from lidarpose.synth.environment.site import Site
 from lidarpose.synth.environment.things import draw_thing, facade
 
-# half of what is built, how near to the sensor vehicles come, and the gap between vehicles and what stands there, m
+# half the length of roads and rows of houses, minimum distance of vehicles from the sensor, and minimum gap between an
+# added object and those already there, m
 _REACH, _NEAREST, _GAP = 42.0, 3.5, 0.4
-# triangles of the unit car whose middle lies above the first height are windows, but for those all above the second
+# triangles of the unit car whose middle is above the first height are windows, except those entirely above the second
 _SILL, _ROOF = 0.7, 0.85
 
 
 @cache
 def _is_window() -> np.ndarray:
-    """(F,) bool, of the mesh "car"."""
+    """(F,) bool: which faces of the mesh "car" are windows."""
     unit = shape("car")
     heights = unit.vertices[unit.faces][..., 2]
     return (heights.mean(1) > _SILL) & (heights.min(1) < _ROOF)
 
 
 def with_windows(car_mesh: Mesh, rng: np.random.Generator) -> Mesh:
-    """A mesh "car" anywhere, at any yaw: beams pass all of its windows, some or none, to the dashboard, the wheel, the
-    seats and to who sits on them. Any other mesh as it is."""
+    """A mesh "car", at any position and yaw, with all, some or none of its window faces removed, and with a dashboard,
+    a steering wheel, seats and perhaps occupants inside. Any other mesh is returned unchanged."""
     is_window, unit = _is_window(), shape("car")
     if len(car_mesh.faces) != len(is_window):
         return car_mesh
     is_open = is_window & (rng.random(len(is_window)) < rng.choice([0.0, 0.5, 1.0]))
-    # x, y, z of the unit car go to these rows, its origin to the last one
+    # images of the unit car's x, y and z axes; the last row is that of its origin
     rows = np.linalg.lstsq(np.column_stack([unit.vertices, np.ones(len(unit.vertices))]), car_mesh.vertices)[0]
     length, width, height = np.linalg.norm(rows[:3], axis=1)
     side = rng.choice([-0.22, 0.22]) * width
@@ -52,7 +53,7 @@ def with_windows(car_mesh: Mesh, rng: np.random.Generator) -> Mesh:
 
 
 def _post(rng: np.random.Generator) -> Mesh:
-    """A post or a mast with plates, boxes and balls: signs, bins, meters, flowers, a traffic light."""
+    """A post or a mast with plates, boxes and balls on it: signs, bins, meters, flowers, a traffic light."""
     u = rng.random(3)
     radius, height = 0.03 + 0.09 * u[0] ** 2, 1.4 + 3.5 * u[1]
     parts = [shape("pole", radius, radius, height)]
@@ -74,7 +75,7 @@ def _clump(rng: np.random.Generator) -> Mesh:
 
 
 def _corner(rng: np.random.Generator) -> Mesh:
-    """A house's corner or a yard's: two walls, one with ledges or piers that stand out from it."""
+    """A corner of a house or a yard: two walls, one of them possibly with piers that project from it."""
     u, (length, other_length) = rng.random(4), rng.uniform(0.8, 6.0, 2)
     height, thickness = 1.0 + 3.5 * u[0], 0.2 + 0.3 * u[1]
     centers = [(0, length / 2, 0), (-other_length / 2, 0, 0)]
@@ -85,7 +86,7 @@ def _corner(rng: np.random.Generator) -> Mesh:
     return shapes.boxes(np.array(centers), np.array(sizes))
 
 
-# what stands along roads: names of `things.KINDS`, how often, and builders
+# roadside objects: names of `things.KINDS`, probabilities, and builders
 _ROADSIDE = (
     ("pole", 0.5, _post),
     ("bush", 0.15, _clump),
@@ -95,7 +96,7 @@ _ROADSIDE = (
 
 
 def _put(site: Site, name: str, mesh: Mesh, position: tuple[float, float], nearest: float) -> None:
-    """Adds a mesh there where nothing stands within `_GAP`, nor the sensor within `nearest` m."""
+    """Adds a mesh at a position unless an object is within `_GAP` m of it, or the sensor within `nearest` m."""
     mesh = mesh.moved((*position, site.level(np.array(position))))
     low, high = mesh.vertices[:, :2].min(0) - _GAP, mesh.vertices[:, :2].max(0) + _GAP
     is_overlapping = np.all((low < site.low[:, 2:4]) & (site.low[:, :2] < high), axis=1)
@@ -104,7 +105,7 @@ def _put(site: Site, name: str, mesh: Mesh, position: tuple[float, float], neare
 
 
 def _add_road(site: Site, offset: float, turn: int, rng: np.random.Generator) -> None:
-    """Vehicles one after the other on a line along x, or y if `turn` is odd, `offset` m beside the sensor."""
+    """Vehicles in a row along x, or y if `turn` is odd, `offset` m to the side of the sensor."""
     position, mean_gap = -_REACH + 12 * rng.random(), rng.choice([2.0, 8.0, 25.0])
     heading = pi * rng.integers(2) + turn * pi / 2
     while position < _REACH:
@@ -114,7 +115,7 @@ def _add_road(site: Site, offset: float, turn: int, rng: np.random.Generator) ->
 
 
 def _add_houses(site: Site, turn: int, rng: np.random.Generator) -> None:
-    """A row of fronts that faces the sensor from one of four sides."""
+    """A row of house fronts that face the sensor, on one of four sides."""
     distance, position = rng.uniform(14, _REACH), -_REACH
     while position < _REACH:
         length = rng.uniform(6, 16)
@@ -126,7 +127,7 @@ def _add_houses(site: Site, turn: int, rng: np.random.Generator) -> None:
 
 
 def add_surroundings(site: Site, place: str, rng: np.random.Generator) -> None:
-    """Roads, what stands along them, and houses about a place outdoors, a name of `layouts.LAYOUTS`."""
+    """Adds roads, roadside objects and houses around an outdoor place, a name of `layouts.LAYOUTS`."""
     turn = int(rng.integers(4))
     if place == "street":
         low, high = site.areas[-1, 2:4]

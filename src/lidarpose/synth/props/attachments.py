@@ -1,7 +1,8 @@
-"""What people carry, wear, push, sit on and ride: meshes attached to a body's joints, drawn to suit its pose.
+"""Things that people carry, wear, push, sit on and ride: meshes attached to a body's joints, drawn to suit its pose.
 
-A prop knows where its mesh is for a pose: it is asked again for the next pose, so what is carried moves along. Bodies
-stand on z = 0; frames are the body's own: rows say where the prop's x, y and z go, then its origin.
+A prop computes its vertices from the joints of a pose, so it moves with the body from pose to pose. Bodies stand on
+z = 0. A `Frame` places a prop in the body's own frame: three rows, the images of the prop's x, y and z axes, and its
+origin.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -18,7 +19,7 @@ from lidarpose.synth.props.garments import JOINT, Point, Points, distance, girth
 
 PELVIS = JOINT["pelvis"]
 HANDS = (JOINT["left_hand"], JOINT["right_hand"])
-# from a hand's joint to its elbow's
+# offset from a hand's joint index to its elbow's
 _ELBOW = JOINT["left_elbow"] - JOINT["left_hand"]
 _HEAD_PART = np.uint8(1 + JOINT["head"])
 Frame = Callable[[Points], tuple[Sequence, Sequence]]
@@ -30,10 +31,10 @@ class Prop:
 
     Args:
         name: as in `_CARRIED` and `_RIDES`, or "skirt" or "hat".
-        mesh: in the prop's own frame; for clothes and bicycles, as it was when drawn.
-        where: joints, 26 lists of x, y, z -> the vertices (V, 3) m there.
-        face_part: (F,) uint8 = 1 + SMPL joint for clothes; None for things, which are not the person.
-        lift: how far the body stands above the ground for it, as a cyclist does, m.
+        mesh: in the prop's own frame; for clothes and bicycles, its shape in the pose for which it was drawn.
+        where: joints, 26 lists of x, y, z -> the vertices (V, 3) m for that pose.
+        face_part: (F,) uint8 = 1 + SMPL joint for clothes; None for things, which are not part of the person.
+        lift: height of the body's lowest point above the ground with this prop, as for a cyclist, m.
     """
 
     name: str
@@ -53,8 +54,8 @@ def rigid_prop(name: str, mesh: Mesh, frame: Frame, **more: Any) -> Prop:
 
 
 def draw_props(rng: np.random.Generator, *, kind: str, joints: np.ndarray) -> list[Prop]:
-    """What somebody has with them: usually nothing; cyclists ride, many sit on chairs, about one in three who stand or
-    walk carries something that their arms can carry.
+    """Draws a person's props. Usually there are none; cyclists have a bicycle, many sitting people a chair, and about
+    one in three standing or walking people carries something that suits the pose of the arms.
 
     Args:
         kind: the activity, a name of `body.pose_prior.activities.KINDS`.
@@ -83,7 +84,7 @@ def draw_props(rng: np.random.Generator, *, kind: str, joints: np.ndarray) -> li
 
 
 def upright(points: Points, size: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> list:
-    """Rows: ahead, left, up, each as long as `size`."""
+    """Rows of a frame: forward, left and up, with the lengths `size`."""
     x, y = heading(points)
     a, b, c = size
     return [[a * x, a * y, 0.0], [-b * y, b * x, 0.0], [0.0, 0.0, c]]
@@ -105,23 +106,23 @@ def rod_rows(start: tuple, end: tuple, radius: float) -> tuple[list, list]:
 
 
 def _ahead_of_pelvis(points: Points, point: Point) -> float:
-    """How far a point is ahead of the pelvis, m."""
+    """Distance by which a point is ahead of the pelvis, m."""
     x, y = heading(points)
     return (point[0] - points[PELVIS][0]) * x + (point[1] - points[PELVIS][1]) * y
 
 
-# --- what is carried: each a frame from the pose, the hand that carries, and uniforms
+# --- carried things: each a frame from the pose, the carrying hand, and uniform numbers
 
 
 def _bag(points: Points, hand: int, u: list[float]) -> Frame:
-    """A shopping bag or a briefcase, straight down from a hanging hand."""
+    """A shopping bag or a briefcase, straight below a hanging hand."""
     height = min(0.3 + 0.3 * u[3], points[hand][2] - 0.05)
     size = (0.22 + 0.22 * u[4], 0.07 + 0.13 * u[5], height)
     return lambda p: (upright(p, size), [*p[hand][:2], max(p[hand][2] - 0.01, height + 0.01)])
 
 
 def _shoulder_bag(points: Points, hand: int, u: list[float]) -> Frame:
-    """At a hip, below the hanging hand's side."""
+    """At the left or right hip."""
     sign = 1.0 if u[2] < 0.5 else -1.0
     depth, height = 0.08 + 0.07 * u[3], 0.2 + 0.15 * u[4]
     size, back_offset = (0.25 + 0.15 * u[5], depth, height), -0.05
@@ -139,12 +140,12 @@ def _shoulder_bag(points: Points, hand: int, u: list[float]) -> Frame:
     return frame
 
 
-# the spine's joints lean this much from the line of the back, rad; how far below the neck a rucksack ends, m
+# angle between the line of the spine's joints and the back, rad; distance of a rucksack's top below the neck, m
 _SPINE_LEAN, _BELOW_NECK = 0.18, 0.02
 
 
 def _rucksack(points: Points, hand: int, u: list[float]) -> Frame:
-    """On the back, from below the neck."""
+    """On the back, with its top just below the neck."""
     size = (0.13 + 0.17 * u[2], 0.26 + 0.1 * u[3], 0.36 + 0.22 * u[4])
     c, s = cos(_SPINE_LEAN), sin(_SPINE_LEAN)
 
@@ -157,7 +158,7 @@ def _rucksack(points: Points, hand: int, u: list[float]) -> Frame:
         lateral /= max(float(np.sqrt(lateral @ lateral)), 1e-6)
         (a0, a1, a2), (u0, u1, u2) = lateral.tolist(), up.tolist()
         forward = np.array([a1 * u2 - a2 * u1, a2 * u0 - a0 * u2, a0 * u1 - a1 * u0])
-        # the back is upright where the spine's joints lean forward
+        # the line of the spine's joints leans forward of the back, which is upright
         up, forward = up * c - forward * s, forward * c + up * s
         back_distance = girth(p, "back") + 0.01
         origin = np.array(spine) - back_distance * forward + (distance(neck, spine) - _BELOW_NECK - size[2]) * up
@@ -171,7 +172,7 @@ def _phone(points: Points, hand: int, u: list[float]) -> Frame:
 
 
 def _ball(points: Points, hand: int, u: list[float]) -> Frame:
-    """Held: beyond the hand along the forearm, not in the ground."""
+    """Held in a hand: beyond the hand along the forearm, and not below the ground."""
     hand, radius = HANDS[u[2] < 0.5], 0.1 + 0.03 * u[3]
 
     def frame(p: Points):
@@ -184,14 +185,14 @@ def _ball(points: Points, hand: int, u: list[float]) -> Frame:
 
 
 def _parcel(points: Points, hand: int, u: list[float]) -> Frame:
-    """A box between the hands or on them, before the body."""
+    """A box between the hands or on them, in front of the body."""
     hand_distance = distance(points[HANDS[0]], points[HANDS[1]])
     depth, height = 0.2 + 0.2 * u[2], 0.15 + 0.25 * u[3]
     size, is_under = (depth, max(hand_distance - 0.04, 0.25), height), hand_distance < 0.29
 
     def frame(p: Points):
         (x, y), hands_middle = heading(p), middle(p[HANDS[0]], p[HANDS[1]])
-        # behind its back is the belly
+        # its back must not be inside the belly
         push = max(0.0, girth(p, "hip_front") + 0.04 + depth / 2 - _ahead_of_pelvis(p, hands_middle))
         bottom = hands_middle[2] + 0.02 if is_under else hands_middle[2] - 0.4 * height
         return upright(p, size), [hands_middle[0] + push * x, hands_middle[1] + push * y, bottom]
@@ -213,7 +214,7 @@ def _stick(points: Points, hand: int, u: list[float]) -> Frame:
 
 
 def _umbrella(points: Points, hand: int, u: list[float]) -> Frame:
-    """Open, its shaft through a raised hand, leaning to above the head."""
+    """Open, held by the shaft in a raised hand, leaning so that it is above the head."""
     width, handle_length = 0.9 + 0.3 * u[3], 0.12
 
     def frame(p: Points):
@@ -225,7 +226,7 @@ def _umbrella(points: Points, hand: int, u: list[float]) -> Frame:
         ]
         shaft_length = distance(top, hand_point)
         start = tuple(a - handle_length * ((t - a) / shaft_length) for t, a in zip(top, hand_point, strict=True))
-        # the canopy is as wide as it is, however long the shaft
+        # the width of the canopy does not depend on the length of the shaft
         (x, y, z), origin = rod_rows(start, tuple(top), 1.0)
         return [[width * a for a in x], [width * a for a in y], z], origin
 
@@ -233,7 +234,7 @@ def _umbrella(points: Points, hand: int, u: list[float]) -> Frame:
 
 
 def _suitcase(points: Points, hand: int, u: list[float]) -> Frame:
-    """On wheels behind a hand that pulls it, or upright beside who stands."""
+    """On wheels behind the hand that pulls it, or upright beside a standing person."""
     drag_offset, width = 0.05 + 0.4 * u[3], 0.8 + 0.35 * u[4]
 
     def frame(p: Points):
@@ -251,8 +252,8 @@ def _suitcase(points: Points, hand: int, u: list[float]) -> Frame:
 
 @dataclass(frozen=True)
 class _Carried:
-    """A mesh, how often it is carried beside the others where the hands it needs and the activity suit, how it is
-    attached; for other activities, `otherwise`."""
+    """A mesh; its weight among the carried things if the hands (see `_free_hands`) and the activity suit it, or
+    `otherwise` for other activities; and how it is attached. Empty `kinds`: all activities."""
 
     mesh: str
     share: float
@@ -276,7 +277,7 @@ _CARRIED = {
 
 
 def _draw_carried(points: Points, u: list[float], kind: str) -> list[Prop]:
-    """One of the things that the arms can carry; a few carry two."""
+    """One of the things that suit the pose of the arms; a few people carry a rucksack, too."""
     hands = _free_hands(points)
     shares = {
         name: (row.share if not row.kinds or kind in row.kinds else row.otherwise) if hands[row.hands] else 0.0
@@ -297,8 +298,8 @@ def _carried_prop(name: str, points: Points, hands: list[int], u: list[float]) -
 
 
 def _free_hands(points: Points) -> dict[str, list[int]]:
-    """Hands (joint indices) that hang, that are raised above their elbows, and that could lean on something; both, if
-    they hold something ahead of the body."""
+    """Hands (joint indices) by use: any hand, those that hang, those raised above their elbows, those that could lean
+    on something, and both if they can hold something in front of the body."""
     pelvis = points[PELVIS][2]
     left, right = (points[hand] for hand in HANDS)
     ahead_distance = {hand: _ahead_of_pelvis(points, points[hand]) for hand in HANDS}
@@ -313,11 +314,11 @@ def _free_hands(points: Points) -> dict[str, list[int]]:
     }
 
 
-# --- what people push and sit on
+# --- things that people push and sit on
 
 
 def _pushed(name: str, points: Points, u: list[float]) -> Prop | None:
-    """Its handle is at the hands that are ahead, at their height."""
+    """Its handle is at the hands that are in front of the body, at their height; None if there are none."""
     hands = [hand for hand in HANDS if _ahead_of_pelvis(points, points[hand]) > 0.15]
     if not hands:
         return None
@@ -325,7 +326,7 @@ def _pushed(name: str, points: Points, u: list[float]) -> Prop | None:
     def frame(p: Points):
         handle = middle(p[hands[0]], p[hands[-1]])
         if len(hands) == 1:
-            # the middle of the handle is before the middle of the body
+            # the middle of the handle is in front of the middle of the body
             x, y = heading(p)
             lateral_offset = (p[PELVIS][1] - handle[1]) * x - (p[PELVIS][0] - handle[0]) * y
             handle = [handle[0] - lateral_offset * y, handle[1] + lateral_offset * x, handle[2]]
@@ -334,8 +335,8 @@ def _pushed(name: str, points: Points, u: list[float]) -> Prop | None:
     return rigid_prop(name, shape(name), frame)
 
 
-# what one sits on is so far below the middle of the hips: a share of the thigh's radius, and m. Fitted to the drawn
-# bodies that sit: 1.3 cm are left
+# distance of a seat below the middle of the hips: a share of the thigh's radius, plus a constant, m. Fitted to the
+# drawn bodies that sit; the residual is 1.3 cm
 _THIGH_SHARE, _BELOW_HIPS = 0.75, 0.034
 
 
@@ -353,7 +354,7 @@ def _under_hips(size: tuple[float, float, float], z: float) -> Frame:
 
 
 def _seat(points: Points, u: list[float]) -> Prop | None:
-    """A chair, a stool or a bench from the ground to the thighs; nothing for who sits on the ground."""
+    """A chair, a stool or a bench, from the ground to the thighs; None for a person who sits on the ground."""
     height = _seat_height(points)
     if height < 0.2:
         return None
@@ -361,7 +362,7 @@ def _seat(points: Points, u: list[float]) -> Prop | None:
     return rigid_prop("chair", shape("chair" if u[3] < 0.65 else "seat"), _under_hips((1.0, width, height), 0.0))
 
 
-# a wheelchair's foot rests are this high, m, and its seat is at 0.5 of the mesh's
+# height of a wheelchair's foot rests, m, and of the mesh's seat, m
 _FOOT_REST, _WHEELCHAIR_SEAT = 0.08, 0.5
 
 
@@ -369,7 +370,7 @@ def _wheelchair(points: Points, u: list[float]) -> Prop | None:
     height = _seat_height(points) + _FOOT_REST
     if not 0.4 < height < 0.6:
         return None
-    # the foot rest is where the feet are
+    # the foot rest is placed under the feet
     (x, y), hips = heading(points), _hips(points)
     foot = middle(points[JOINT["left_foot"]], points[JOINT["right_foot"]])
     foot_distance = min(max((foot[0] - hips[0]) * x + (foot[1] - hips[1]) * y, 0.25), 0.75)
@@ -379,12 +380,12 @@ def _wheelchair(points: Points, u: list[float]) -> Prop | None:
     return rigid_prop("wheelchair", union([shape("wheelchair"), foot_rest]), frame, lift=_FOOT_REST)
 
 
-# the seat of `things.moped` and its foot board, m
+# heights of the seat and the foot board of `things.moped`, m
 _MOPED_SEAT, _FOOT_BOARD = 0.75, 0.28
 
 
 def _moped(points: Points, u: list[float]) -> Prop | None:
-    """A scooter under who sits: seat under the hips, the foot board under the feet."""
+    """A scooter under a sitting person: its seat under the hips, its foot board under the feet."""
     height = _seat_height(points) + _FOOT_BOARD
     if not 0.6 < height < 0.95:
         return None
@@ -394,19 +395,19 @@ def _moped(points: Points, u: list[float]) -> Prop | None:
 
 # --- bicycles
 
-# of the mesh, on the ground, the saddle above the origin: where (x, z) its parts are, m
+# positions (x, z) of parts of the mesh, m; the mesh stands on the ground, with its saddle above the origin
 _SADDLE, CRANK, REAR_AXLE, FRONT_AXLE, NECK = (0.0, 0.97), (0.17, 0.28), (-0.29, 0.34), (0.77, 0.34), (0.6, 0.84)
-# a pedal at its lowest is this high above the ground, the saddle this far below the middle of the hips, m
+# lowest height of a pedal above the ground, and distance of the saddle below the middle of the hips, m
 _PEDAL, _BELOW_SADDLE = 0.1, 0.05
-# radius of the bars and cranks, of a bicycle of full size, m
+# radius of the bars and cranks of a full-size bicycle, m
 _TUBE = 0.016
 
 
 def _bicycle(points: Points, u: list[float]) -> Prop:
-    """As large as the rider needs: saddle under the hips, pedals under the feet, bars at the hands."""
+    """A bicycle scaled to the rider: saddle under the hips, pedals under the feet, bars at the hands."""
     size = min(max((_hips(points)[2] - _BELOW_SADDLE + _PEDAL) / _SADDLE[1], 0.45), 1.15)
     hands = [_in_bicycle(points, points[hand], size) for hand in HANDS]
-    # hands that are where bars can be; else straight ones
+    # hands that are where handlebars can be; without any, the handlebars are at a default position
     grips = [h for h in hands if 0.25 < h[0] < 0.9 and 0.75 < h[2] < 1.4]
     bar_x, bar_z = (
         (sum(h[0] for h in grips) / len(grips), sum(h[2] for h in grips) / len(grips)) if grips else (0.52, 1.05)
@@ -415,7 +416,7 @@ def _bicycle(points: Points, u: list[float]) -> Prop:
     frame_mesh = union([shape("bicycle"), bars, _rod((NECK[0], 0.0, NECK[1]), (bar_x, 0.0, bar_z))])
 
     def mesh(p: Points) -> Mesh:
-        """In the bicycle's frame, the pedals where the feet are."""
+        """The mesh in the bicycle's frame, with the pedals under the feet."""
         return union(
             [frame_mesh, *_pedals([_in_bicycle(p, p[JOINT[f"{side}_foot"]], size) for side in ("left", "right")])]
         )
@@ -425,14 +426,15 @@ def _bicycle(points: Points, u: list[float]) -> Prop:
 
 
 def _in_bicycle(points: Points, point: Point, size: float) -> tuple[float, float, float]:
-    """A point in the frame of the bicycle that is under these joints."""
+    """A point in the frame of the bicycle for these joints."""
     hips, (x, y) = _hips(points), heading(points)
     dx, dy = point[0] - hips[0], point[1] - hips[1]
     return ((dx * x + dy * y) / size, (dy * x - dx * y) / size, (point[2] + _PEDAL) / size)
 
 
 def _pedals(feet: list[tuple[float, float, float]]) -> Iterator[Mesh]:
-    """Left and right pedal and their cranks, on a circle about the axle, as near to the feet as it comes."""
+    """Left and right pedals and their cranks, at the points of a circle about the crank axle that are nearest to the
+    feet."""
     ax, az = CRANK
     for side, (px, _, pz) in zip((0.1, -0.1), feet, strict=True):
         dx, dz = px - ax, pz - 0.03 - az
@@ -446,30 +448,31 @@ def _rod(start: tuple, end: tuple) -> Mesh:
     return shape("rod").placed(*rod_rows(start, end, _TUBE))
 
 
-# what people sit on by name, for who wants a certain one: joints as lists and uniforms (12,) -> a prop, or None where
-# the pose does not suit it
+# things to sit on by name, for callers that want a certain one: joints as lists and uniform numbers (12,) -> a prop, or
+# None if the pose does not suit it
 MOUNTS: dict[str, Callable[[Points, list[float]], Prop | None]] = {
     "bicycle": _bicycle,
     "moped": _moped,
     "wheelchair": _wheelchair,
     "chair": _seat,
 }
-# by activity: (cumulative share, what they use)
+# by activity: (cumulative share, prop)
 _RIDES: dict[str, tuple[tuple[float, Callable[[Points, list[float]], Prop | None]], ...]] = {
     "cycle": ((1.0, _bicycle),),
     "push": ((0.5, partial(_pushed, "pram")), (0.95, partial(_pushed, "trolley"))),
     "sit": ((0.12, _wheelchair), (0.85, _seat)),
 }
-# activities whose poses make no sense without what is ridden, pushed or sat on
+# activities whose poses make no sense without the thing that is ridden, pushed or sat on
 POSED_WITH_A_PROP = frozenset(_RIDES)
-# how often somebody of an activity carries something
+# share of people who carry something, by activity
 _CARRIES = {
     **dict.fromkeys(("walk", "idle"), 0.36),
     **{"step": 0.3, "captured": 0.15, "run": 0.12, "sport": 0.2, "lie": 0.0, "fall": 0.05},
     **{"stoop": 0.3, "throw": 0.2, "kick": 0.1, "lie_down": 0.0, "lie_side": 0.0, "lie_front": 0.0, "all_fours": 0.0},
 }
 _OTHERS_CARRY = 0.12
-# skirts, dresses and long coats of those on their feet; hats; helmets of cyclists
+# shares of people with a skirt, dress or long coat (in activities of `_ON_FEET`), with a hat, and of cyclists with a
+# helmet
 _DRESSED, _HATS, _HELMETS = 0.15, 0.12, 0.5
 _HATLESS = ("lie", "fall", "lie_down", "lie_side", "lie_front")
 _ON_FEET = ("walk", "idle", "step", "push")

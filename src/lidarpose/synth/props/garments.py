@@ -1,7 +1,7 @@
 """Clothes that stand away from the body: skirts, dresses and long coats that bridge the legs, hats and helmets.
 
-An offset along the skin's normals (`body.rig.clothing`) cannot bridge; these are meshes of their own, whose faces
-count as the part of the body they hang on.
+An offset along the skin's normals (`body.rig.clothing`) cannot bridge the legs, so these are separate meshes. Their
+faces have the part of the body that they hang on.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ JOINT = {name: i for i, name in enumerate(BODY26.joints)}
 Point = Sequence[float]
 Points = list[Point]
 # Girths of the shipped body's skin from lengths between its joints, m: weights of `_LENGTHS`, then a constant. Fitted
-# to 1,500 people of `body.rig.sample_people`; what is left is 3 mm of the back, 4 of the width, 7 and 5 of the rest.
+# to 1,500 people of `body.rig.sample_people`; residuals: back 3 mm, hip_side 4 mm, hip_front 7 mm, hip_back 5 mm.
 _LENGTHS = (
     ("left_hip", "right_hip"), ("spine3", "left_collar"), ("head", "nose"), ("left_knee", "left_ankle"),
     ("left_shoulder", "left_elbow"), ("pelvis", "left_hip"),
@@ -31,8 +31,8 @@ _GIRTHS = {
 
 
 def girth(points: Points, name: str) -> float:
-    """A girth of the body, m: `back` from spine3 to the skin behind it, `hip_side`, `hip_front` and `hip_back` from
-    the middle of the hips. points: the joints, 26 of BODY26."""
+    """A girth of the body, m: `back` from spine3 to the skin behind it; `hip_side`, `hip_front` and `hip_back` from the
+    middle of the hips to the skin. points: the 26 joints of BODY26."""
     *weights, constant = _GIRTHS[name]
     for (a, b), weight in zip(_LENGTHS, weights, strict=True):
         if weight:
@@ -49,7 +49,7 @@ def middle(a: Point, b: Point) -> Point:
 
 
 def heading(points: Points) -> tuple[float, float]:
-    """Unit x, y of where the hips face."""
+    """Horizontal unit vector x, y in the direction that the hips face."""
     left, right = points[JOINT["left_hip"]], points[JOINT["right_hip"]]
     x, y = left[1] - right[1], right[0] - left[0]
     length = max(hypot(x, y), 1e-6)
@@ -60,9 +60,9 @@ def heading(points: Points) -> tuple[float, float]:
 
 _SIDES = 14
 _TURN = 2 * pi * np.arange(_SIDES) / _SIDES
-# rings of a skirt: at the waist, around the hips, half way down, the hem
+# rings of a skirt: at the waist, around the hips, halfway down, at the hem
 _RINGS = 4
-# cloth stands this far off the skin, m
+# distance of cloth from the skin, m
 _EASE = 0.015
 # a leg's radius at the knee and below it, as a share of the thigh's
 _KNEE, _CALF = 0.58, 0.6
@@ -80,7 +80,7 @@ def _skirt_faces() -> np.ndarray:
 
 @lru_cache
 def _skirt_parts(below_knee: tuple[bool, ...]) -> np.ndarray:
-    """1 + SMPL joint of each face: the pelvis above the hips, then the thigh or, below the knee, the shank."""
+    """1 + SMPL joint of each face: above the hips the pelvis, below them the thigh or, below the knee, the shank."""
     face_angle = _TURN[np.arange(_SIDES)] + pi / _SIDES
     is_left = np.sin(face_angle) > 0
     rows = []
@@ -94,16 +94,16 @@ def _skirt_parts(below_knee: tuple[bool, ...]) -> np.ndarray:
 
 
 def skirt(points: Points, u: list[float]) -> tuple[Callable[[Points], np.ndarray], Mesh, np.ndarray]:
-    """A skirt, a dress or a long coat: (how its vertices are found for a pose, its mesh, parts of its faces).
+    """A skirt, a dress or a long coat: (function from a pose to its vertices, its mesh, parts of its faces).
 
-    u: four uniforms, its length, flare, ease and whether it is a coat.
+    u: four uniform numbers, for its length, flare, ease and whether it is a coat.
     """
-    # length in thighs, then shanks: 1 is the knee, 2 the ankle
+    # length in units of the thigh, then of the shank: 1 is the knee, 2 the ankle
     hem = 0.35 + 1.35 * u[0] if u[3] < 0.6 else 0.5 + 0.7 * u[0]
     flare = 0.02 + 0.16 * u[1] ** 2 if u[3] < 0.6 else 0.01 + 0.05 * u[1]
     ease = _EASE + (0.02 * u[2] if u[3] < 0.6 else 0.01 + 0.025 * u[2])
     half_hem = hem / 2
-    # which rows of faces begin and end below the knee, by their middles
+    # a row of faces is below the knee if its middle is
     parts = _skirt_parts((False, half_hem / 2 > 1, (half_hem + hem) / 2 > 1))
 
     def vertices(points: Points) -> np.ndarray:
@@ -125,7 +125,7 @@ def skirt(points: Points, u: list[float]) -> tuple[Callable[[Points], np.ndarray
             rings.append((tuple(middle(*legs)), half_distance, max(radius, 0.6 * depth * (1 - 0.3 * level))))
         centers, halves, radii = (np.array(part) for part in zip(*rings, strict=True))
         directions = np.stack([x * np.cos(_TURN) - y * np.sin(_TURN), y * np.cos(_TURN) + x * np.sin(_TURN)], 1)
-        # the hull of two circles: each vertex goes with the leg on its side
+        # the hull of two circles: each vertex follows the leg on its side
         lengths = np.maximum(np.hypot(halves[:, 0], halves[:, 1]), 1e-6)
         side_weight = np.clip(2.5 * (halves[:, :2] / lengths[:, None]) @ directions.T, -1, 1)
         cloth = centers[:, None] + side_weight[..., None] * halves[:, None]
@@ -136,12 +136,12 @@ def skirt(points: Points, u: list[float]) -> tuple[Callable[[Points], np.ndarray
     return vertices, Mesh(vertices(points), _skirt_faces()), parts
 
 
-# folds towards the hem
+# factor on the radius of each ring's vertices: folds that deepen toward the hem
 _FOLDS = 1 + np.array([0.0, 0.0, 0.03, 0.06])[:, None] * np.where(np.arange(_SIDES) % 2, 1, -1)
 
 
 def _leg(points: Points, side: str, level: float) -> tuple[float, float, float]:
-    """The point `level` thighs, then shanks, down a leg."""
+    """The point at `level` down a leg: 0 the hip, 1 the knee, 2 the ankle."""
     hip, knee, ankle = (points[JOINT[f"{side}_{name}"]] for name in ("hip", "knee", "ankle"))
     a, b, t = (hip, knee, level) if level < 1 else (knee, ankle, level - 1)
     return (a[0] + t * (b[0] - a[0]), a[1] + t * (b[1] - a[1]), a[2] + t * (b[2] - a[2]))
@@ -149,19 +149,19 @@ def _leg(points: Points, side: str, level: float) -> tuple[float, float, float]:
 
 # --- hats
 
-# the skull about the middle of the head, as multiples of the distance from there to the nose: half its length, half
-# its width, how high the crown is, and how far ahead its middle is
+# the skull relative to the middle of the head, as multiples of the distance from there to the nose: half its length,
+# half its width, the height of the crown, and the forward offset of its middle
 _SKULL = (0.89, 0.75, 1.08, 0.05)
 
 
 def hat_frame(points: Points, edge: float) -> tuple[list[list[float]], Point]:
-    """Rows and origin that put the mesh "hat" or "cap" on the head: the edge `edge` of the way from the ears to the
-    crown."""
+    """Rows and origin that put the mesh "hat" or "cap" on the head. edge: height of its rim, as a share of the way from
+    the middle of the head to the crown."""
     nose, center, base = (points[JOINT[name]] for name in ("nose", "head_center", "head"))
     nose_axis = [a - b for a, b in zip(nose, center, strict=True)]
     up = [a - b for a, b in zip(center, base, strict=True)]
     size = max(distance(nose, center), 1e-6)
-    # the nose's line is 10 degrees below the level of the head; up is made square to it
+    # the direction to the nose is 10 degrees below the head's horizontal; up is made perpendicular to it
     nose_axis = [a / size for a in nose_axis]
     projection = sum(a * b for a, b in zip(nose_axis, up, strict=True))
     up = [a - projection * b for a, b in zip(up, nose_axis, strict=True)]
@@ -182,5 +182,5 @@ def hat_frame(points: Points, edge: float) -> tuple[list[list[float]], Point]:
     return rows, origin
 
 
-# hair and the hat's own thickness, m
+# thickness of hair and hat, m
 _HAIR = 0.02
