@@ -1,4 +1,4 @@
-"""What the frames of a recording before say of where people are, and are not, in a scan.
+"""Positions in a scan where people are expected, or were rejected, according to earlier frames of a recording.
 
 Legend: D detections, K people who need no verification, M tracks, R places.
 """
