@@ -2,9 +2,9 @@
 
     import lidarpose
     pose = lidarpose.load().predict(points)                       # one person, (n, 3) meters, z up
-    people = lidarpose.predict("sweep.pcd")                       # everybody in a sweep
+    people = lidarpose.predict("sweep.pcd")                       # all people in a sweep
 
-Names are loaded when first used: importing the package costs no torch and no numba, and predicting needs neither.
+Names are imported on first use: importing the package imports neither torch nor numba, and prediction needs neither.
 """
 
 from importlib import import_module
@@ -16,7 +16,7 @@ from lidarpose._version import __version__
 from lidarpose.errors import missing_extra
 
 if TYPE_CHECKING:
-    # what the names below are, for editors and type checkers
+    # the names below, for editors and type checkers
     from lidarpose import evaluation as evaluation
     from lidarpose import metrics as metrics
     from lidarpose.body.pose_prior.sampling import sample_poses as sample_poses
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from lidarpose.skeleton import SKELETONS as SKELETONS
     from lidarpose.skeleton import Skeleton as Skeleton
 
-# public name -> where it lives
+# public name -> module that defines it
 _HOMES = {
     "load": "lidarpose.inference.predictor",
     "Predictor": "lidarpose.inference.predictor",
@@ -80,10 +80,11 @@ _HOMES = {
 
 _renamed.install()
 
-# modules of their own, for `lidarpose.metrics.mpjpe`
+# public modules, used as in `lidarpose.metrics.mpjpe`
 _MODULES = ("metrics", "evaluation")
 
-# names that a base install lacks, and the module that they need: help() and `import *` ask for every name of `__all__`
+# names that need a module beyond the base install, left out of `__all__` without it: help() and `import *` access every
+# name in `__all__`
 _NEEDS = {"export": "torch", "import_dapt": "torch", "cast_rays": "numba"}
 
 __all__ = ["__version__", *(name for name in _HOMES if name not in _NEEDS or find_spec(_NEEDS[name]))]

@@ -1,4 +1,4 @@
-"""Module paths of 0.2 that README and docs named, kept importable until 1.0 under their new places."""
+"""Module paths that the README and docs of 0.2 mentioned, kept importable until 1.0 as aliases of the new paths."""
 
 import importlib
 import sys
@@ -43,7 +43,7 @@ RENAMED = {
 
 
 class RenamedModules(MetaPathFinder, Loader):
-    """Imports a module by its old path: the module object is that of the new path."""
+    """Imports a module by its old path; the result is the module object of the new path."""
 
     def find_spec(self, fullname: str, path=None, target=None) -> ModuleSpec | None:
         old_path = fullname.removeprefix("lidarpose.")
@@ -53,7 +53,7 @@ class RenamedModules(MetaPathFinder, Loader):
         new_path = "lidarpose." + RENAMED[spec.name.removeprefix("lidarpose.")]
         warnings.warn(f"{spec.name} is now {new_path}", DeprecationWarning, stacklevel=2)
         module = importlib.import_module(new_path)
-        # importlib sets the spec of what it gets here to the old one
+        # importlib replaces the spec of the returned module: keep the original for `exec_module`
         spec.loader_state = module.__spec__
         return module
 

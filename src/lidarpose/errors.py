@@ -1,4 +1,4 @@
-"""Errors that a user can act on: one line that says what was expected, what came, and what to do."""
+"""Errors that a user can act on: the message states in one line what was expected, what was given, and what to do."""
 
 import difflib
 from collections.abc import Iterable, Sequence
@@ -8,21 +8,21 @@ from typing import Any
 
 
 class LidarPoseError(Exception):
-    """Base of every error that is the input's fault. The command line prints it as one line and exits with 2."""
+    """Base class of all errors caused by the input. The command line prints the message and exits with status 2."""
 
 
 class InputError(LidarPoseError, ValueError):
-    """A file, an array or an argument is not what was expected."""
+    """A file, an array or an argument is invalid."""
 
 
 class MissingExtra(LidarPoseError, ImportError):
-    """An optional dependency is not installed; the message names the pip command."""
+    """An optional dependency is not installed; the message contains the pip command."""
 
     def __init__(self, what: str, extra: str):
         super().__init__(f"{what} needs an optional dependency: in the clone, pip install '.[{extra}]'")
 
 
-# what a base install lacks, and the extra that brings it
+# optional module -> extra that installs it
 _EXTRA_OF = {
     "torch": "train",
     "accelerate": "train",
@@ -39,16 +39,16 @@ _EXTRA_OF = {
 
 
 def missing_extra(error: ModuleNotFoundError, what: str, extra: str | None = None) -> ImportError:
-    """The error to raise for a module that was not found: `MissingExtra` where an extra brings it, else `error`.
+    """The error to raise for a missing module: `MissingExtra` if an extra installs it, else `error`.
 
-    extra: the one to name where several bring the module.
+    extra: the extra to name if several install the module.
     """
     known_extra = _EXTRA_OF.get((error.name or "").partition(".")[0])
     return error if known_extra is None else MissingExtra(what, extra or known_extra)
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> InputError:
-    """The error for a name that is not in a closed list, with the nearest names first."""
+    """The error for a name that is not in a closed list; suggests similar names."""
     known = list(known)
     matches = difflib.get_close_matches(str(name), known, n=2, cutoff=0.5)
     hint = f"did you mean {' or '.join(matches)}? " if matches else ""
@@ -56,7 +56,8 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> InputError:
 
 
 def check_int(name: str, value: Any, *, least: int, most: int | None = None, hint: str = "") -> int:
-    """A whole number, numpy's too, as Python's. Raises InputError for anything else, and outside least to most."""
+    """Converts a whole number (numpy's included) to int. Raises InputError for other types and values outside `least`
+    to `most`."""
     if isinstance(value, Integral) and not isinstance(value, bool):
         number = int(value)
         if number >= least and (most is None or number <= most):
@@ -66,7 +67,7 @@ def check_int(name: str, value: Any, *, least: int, most: int | None = None, hin
 
 
 def check_finite(name: str, value: Any) -> None:
-    """Raises InputError unless `value` is a finite number, Python's or numpy's."""
+    """Raises InputError unless `value` is a finite number of Python or numpy."""
     try:
         is_finite = isfinite(value)
     except (TypeError, ValueError, OverflowError):
@@ -76,12 +77,12 @@ def check_finite(name: str, value: Any) -> None:
 
 
 def check_name(kind: str, name: object, known: Iterable[str]) -> None:
-    """Raises `unknown_name` unless `name` is one of a closed list of names; what is no text is none of them."""
+    """Raises `unknown_name` unless `name` is a string in the closed list `known`."""
     if not isinstance(name, str) or name not in known:
         raise unknown_name(kind, name, known)
 
 
-# ---- words of messages
+# ---- text of messages
 
 
 def first_names(names: Sequence[str], most: int = 3) -> str:
@@ -91,5 +92,5 @@ def first_names(names: Sequence[str], most: int = 3) -> str:
 
 
 def counted(number: int, one: str, many: str | None = None) -> str:
-    """ "1 frame", "1,200 frames"; many: the plural where it is not one more s."""
+    """ "1 frame", "1,200 frames"; many: the plural if it is not formed with "s"."""
     return f"{number:,} {one if number == 1 else many or one + 's'}"

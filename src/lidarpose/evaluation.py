@@ -1,7 +1,7 @@
-"""Scoring a network on datasets: what `lidarpose evaluate` and `lidarpose table` call.
+"""Evaluation of networks on datasets, as done by `lidarpose evaluate` and `lidarpose table`.
 
     from lidarpose import evaluation
-    result = evaluation.evaluate("small", "bench")            # or a Predictor, and a folder of prepare or synth
+    result = evaluation.evaluate("small", "bench")            # or a Predictor, and a folder from prepare or synth
     result.line("mpjpe").value, result.line("mpjpe", "joints", "wrists").low
     evaluation.write(evaluation.run("small", ["bench"]), "evaluation/small")
     print(evaluation.table(["evaluation/small"]))
@@ -16,7 +16,7 @@ from lidarpose.eval.robustness import Stability
 from lidarpose.eval.run import Run, check_folder, evaluate, new_folder, run, write
 from lidarpose.eval.scores import MetricRow, Result, Scores, Setting, published, read_scores, scores_path, table
 
-# names until 0.2
+# aliases with the names used until 0.2
 Judged, Line = Predictions, MetricRow
 
 __all__ = [

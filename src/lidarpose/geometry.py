@@ -30,7 +30,8 @@ def rotation_vector(matrix: np.ndarray) -> np.ndarray:
     sine = np.linalg.norm(skew, axis=-1, keepdims=True) / 2
     angle = np.arctan2(sine, (np.trace(m, axis1=-2, axis2=-1)[..., None] - 1) / 2)
     axis = unit(skew)
-    # half a turn has no skew part: R = 2 a a^T - 1, of which the column with the largest diagonal is along the axis
+    # a rotation by 180 degrees has no skew part: R = 2 a a^T - 1, so the columns of R + 1 are along the axis; take the
+    # one with the largest diagonal entry
     is_half_turn = (sine < 1e-3) & (angle > 1)
     if is_half_turn.any():
         square = (m + np.swapaxes(m, -1, -2)) / 2 + np.eye(3)
@@ -59,24 +60,24 @@ def rotation_about(axis: str, angle: np.ndarray | float) -> np.ndarray:
 
 
 def rotation_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The smallest rotation that turns direction a onto direction b. a, b (..., 3), any length > 0. (..., 3, 3)."""
+    """The smallest rotation from direction a to direction b. a, b (..., 3), any length > 0. Returns (..., 3, 3)."""
     a, b = unit(a), unit(b)
     c = (a * b).sum(-1)
     axis = np.cross(a, b)
     s = np.linalg.norm(axis, axis=-1)
-    # opposite directions: any axis across a will do
+    # opposite directions: any axis perpendicular to a is valid
     perpendicular = np.cross(a, np.where(np.abs(a[..., :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0]))
     axis = np.where((s < 1e-9)[..., None], unit(perpendicular), axis / np.maximum(s, 1e-12)[..., None])
     return axis_angle_to_matrix(axis * np.arctan2(s, c)[..., None])
 
 
 def transform_points(T: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """points (..., 3) m moved by a rigid transform T (4, 4)."""
+    """points (..., 3) m transformed by a rigid transform T (4, 4)."""
     return points @ T[:3, :3].T + T[:3, 3]
 
 
 def rigid_transform(R: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """T (4, 4) of a rotation R (3, 3) and a translation t (3,) m."""
+    """The transform T (4, 4) of a rotation R (3, 3) and a translation t (3,) m."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, t
     return T
@@ -88,13 +89,13 @@ def inverse_transform(T: np.ndarray) -> np.ndarray:
 
 
 def is_rotation(R: np.ndarray) -> bool:
-    """Whether finite numbers R (3, 3) are a rotation to 1 %, as calibrations and poses of others are."""
-    # entries first: products of far larger ones overflow
+    """Whether a finite matrix R (3, 3) is a rotation to 1 %, the accuracy of external calibrations and poses."""
+    # check the entries first: products of very large ones overflow
     return bool(np.abs(R).max() < 1.01 and np.abs(R @ R.T - np.eye(3)).max() < 0.01 and np.linalg.det(R) > 0)
 
 
 def quaternion_to_matrix(quaternion: np.ndarray) -> np.ndarray:
-    """(3, 3) of a quaternion (4,) w, x, y, z of any length > 0."""
+    """The rotation matrix (3, 3) of a quaternion (4,) w, x, y, z of any length > 0."""
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
     return np.array(
         [
@@ -127,9 +128,9 @@ def from_spherical(distance: np.ndarray, azimuth: np.ndarray, elevation: np.ndar
     return np.stack([x, y, z], -1)
 
 
-# rows are the level frame's x, y, z in coordinates of an input whose up axis is the key: right-handed, forward kept
-# where the convention has a usual one (y up: z towards the viewer, as in graphics; x up: z forward; -y up: z forward
-# and x to the right, as in cameras; -z up: x forward, as in aircraft)
+# up axis of an input -> R_level_input, whose rows are x, y, z of the level frame in coordinates of the input.
+# Right-handed; forward is kept if the convention has a usual one (y up: z towards the viewer, as in graphics; x up: z
+# forward; -y up: z forward and x to the right, as in cameras; -z up: x forward, as in aircraft)
 UP_AXES = {
     "z": np.eye(3),
     "y": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
@@ -141,10 +142,14 @@ UP_AXES = {
 
 
 def rotation_from_up(up: str | Sequence[float]) -> np.ndarray:
-    """R_level_input (3, 3): turns coordinates of an input in which `up` is up into the level frame's (z up).
+    """The rotation R_level_input (3, 3) from an input with the given up axis to the level frame (z up).
 
-    up: an axis, "z", "y" or "x", with a minus where it points down, or a direction of any length > 0 in the input's
-    coordinates, three numbers or "x,y,z", which is turned up by the smallest rotation. Raises InputError.
+    Args:
+        up: an axis, "z", "y" or "x", with a minus sign if it points down; or a direction of any length > 0 in the
+            coordinates of the input, three numbers or "x,y,z", which the smallest possible rotation aligns with z.
+
+    Raises:
+        InputError: not an axis or a direction.
     """
     if isinstance(up, str) and up in UP_AXES:
         return UP_AXES[up]
@@ -155,20 +160,20 @@ def rotation_from_up(up: str | Sequence[float]) -> np.ndarray:
 
 
 def up_text(up: str | Sequence[float]) -> str:
-    """An up axis or direction as text, which `rotation_from_up` reads."""
+    """An up axis or direction as text that `rotation_from_up` reads."""
     return up if isinstance(up, str) else ",".join(repr(float(value)) for value in up)
 
 
 def upright_axis(up: str | Sequence[float]) -> str:
-    """The axis, a key of `UP_AXES`, that is nearest to what is up, as of `rotation_from_up`."""
+    """The axis, a key of `UP_AXES`, that is nearest to the up direction; see `rotation_from_up`."""
     direction = rotation_from_up(up)[2]
     axis = int(np.abs(direction).argmax())
     return "-" * bool(direction[axis] < 0) + "xyz"[axis]
 
 
 def rotation_of_boxes(up: str | Sequence[float]) -> np.ndarray:
-    """R_boxes_input (3, 3): turns an input into the frame in which its boxes stand along z. They stand along the axis
-    that is nearest to what is up, as of `rotation_from_up`."""
+    """The rotation R_boxes_input (3, 3) from an input to the frame in which its boxes are upright along z. In the input
+    they are upright along the axis nearest to the up direction; see `rotation_from_up`."""
     return UP_AXES[upright_axis(up)]
 
 
@@ -182,11 +187,11 @@ def vector_of(given: Any) -> np.ndarray | None:
 
 
 def distance_to_segments(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """points (n, 3), segments from starts (S, 3) to ends (S, 3), S >= 1 -> (n,): to the nearest segment."""
+    """points (n, 3), segments from starts (S, 3) to ends (S, 3), S >= 1 -> (n,): distance to the nearest segment."""
     direction = ends - starts
     square_length = np.maximum((direction**2).sum(1), 1e-12)
     nearest = np.full(len(points), np.inf)
-    # one after the other: points may be many
+    # one segment at a time to save memory: there may be many points
     for start, along, square in zip(starts, direction, square_length, strict=True):
         offset = points - start
         share = np.clip(offset @ along / square, 0, 1)
@@ -194,15 +199,15 @@ def distance_to_segments(points: np.ndarray, starts: np.ndarray, ends: np.ndarra
     return np.sqrt(nearest)
 
 
-# width of a strip, m; strips are numbered by 16 bits, which sort in linear time: the last one holds the rest
+# width of a strip, m; strip numbers have 16 bits, which sort in linear time, and the last strip holds all other points
 _STRIP, _LAST_STRIP = 2.5, 65_535
 
 
 def rows_near(centers: np.ndarray, points: np.ndarray, reach: float | np.ndarray) -> list[np.ndarray]:
-    """Of each of centers (K, 2+) m the rows (k,) of points (n, 3) m within `reach` m of it, or reach (K,), in x and in
-    y, ascending.
+    """For each of centers (K, 2+) m, the rows (k,) of points (n, 3) m within `reach` m in x and in y, ascending.
 
-    Points are sorted into strips along x first, so that nobody has to look at all of millions of them.
+    reach: one number, or (K,) one per center. Points are first sorted into strips along x, so that not every center has
+    to be compared with millions of points.
     """
     x, y = points[:, 0], points[:, 1]
     start = x.min() if len(x) else 0.0
@@ -220,9 +225,10 @@ def rows_near(centers: np.ndarray, points: np.ndarray, reach: float | np.ndarray
 
 
 def similarity_align(source: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """`source` moved onto `target` by the best rotation, translation and scale (Umeyama 1991).
+    """Aligns `source` to `target` with the best rotation, translation and scale (Umeyama 1991).
 
-    source, target (..., J, 3) m. Returns (..., J, 3), the least-squares similarity of each set; reflections excluded.
+    source, target (..., J, 3) m. Returns (..., J, 3): `source` after the least-squares similarity transform of each
+    set, without reflections.
     """
     source, target = np.asarray(source, float), np.asarray(target, float)
     source_mean, target_mean = source.mean(-2, keepdims=True), target.mean(-2, keepdims=True)

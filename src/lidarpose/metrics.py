@@ -1,4 +1,4 @@
-"""Metrics of 3D human pose on plain arrays, of anyone's predictions.
+"""Metrics of 3D human pose on plain arrays, for predictions of any method.
 
     from lidarpose import metrics
     metrics.mpjpe(pred, true, visible)          # (n, J, 3), (n, J, 3) m, (n, J) -> mm
@@ -7,7 +7,7 @@
     metrics.by_group(table, "human15")["wrists"]
     metrics.interval(table, np.random.default_rng(0), clusters=sequence)
 
-Meters in; millimeters or percent out. docs/evaluate.md defines every metric.
+Inputs are in meters, results in millimeters or percent. docs/evaluate.md defines every metric.
 """
 
 from lidarpose.eval.metrics.aggregate import (

@@ -1,4 +1,4 @@
-"""Progress of long work on stderr: a bar on a terminal, elsewhere a line every ten seconds."""
+"""Progress of long tasks on stderr: a bar on a terminal, otherwise a line every ten seconds."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import threading
 import time
 from types import TracebackType
 
-# seconds between two movements of the bar, between two lines where stderr is no terminal, and where nothing changes
+# seconds between updates of the bar, between lines if stderr is not a terminal, and between lines without progress
 BAR_EVERY, LINE_EVERY, SAME_EVERY = 1.0, 10.0, 60.0
 _quiet = False
 
 
 def set_quiet(quiet: bool) -> None:
-    """Whether progress is shown nowhere, for the whole process."""
+    """Disables or enables all progress output of this process."""
     global _quiet
     _quiet = quiet
 
@@ -23,15 +23,15 @@ def is_quiet() -> bool:
 
 
 class Progress:
-    """Shows how far work is, from `with` to its end; a thread moves it while nothing is updated.
+    """Shows the progress of a task inside a `with` block. A thread refreshes it between updates.
 
     Args:
-        total: how much there is to do, None if unknown.
-        unit: what is counted, in the plural.
-        done: what was there before, which is not this run's speed; None: the first update says it, and the time
-            before it does not count.
-        label: a name before the bar.
-        shown: False shows nothing, as in all but one of several processes.
+        total: amount of work, None if unknown.
+        unit: name of the counted items, in the plural.
+        done: amount that was already done, which does not count for the speed. None takes it from the first update,
+            and the time before that does not count either.
+        label: a name shown before the bar.
+        shown: whether anything is shown; False for all but one of several processes.
     """
 
     def __init__(self, total: int | None, *, unit: str, done: int | None = None, label: str = "", shown: bool = True):
@@ -66,7 +66,7 @@ class Progress:
             self._bar.close()
 
     def update(self, done: int, note: str = "") -> None:
-        """done: in all so far; note: a few words behind it, as a loss."""
+        """Reports progress. done: total amount done so far; note: a short text shown behind it, such as the loss."""
         self.done, self._note = done, note or self._note
         if self._first is None:
             self._first, self._started = done, time.monotonic()
@@ -77,7 +77,7 @@ class Progress:
             self._bar.update(done - self._bar.n)
 
     def line(self) -> str:
-        """The progress in words."""
+        """The progress as a line of text."""
         total = "" if self.total is None else f" of {self.total:,}"
         seconds = time.monotonic() - self._started
         rate = (self.done - (self._first or 0)) / max(seconds, 1e-9)

@@ -1,7 +1,7 @@
-"""What packages hand on: a person's points (`Sample`), a skeleton in space (`Pose`), a detector's `Box`.
+"""Data types shared by all packages: a person's points (`Sample`), joint positions (`Pose`), a bounding box (`Box`).
 
-All are frozen, keyword-only and validated when built, and equal to nothing but themselves, since they hold arrays.
-Lengths in meters, angles in radians, z up.
+All are frozen, keyword-only and validated on construction. They compare by identity, since they hold arrays. Lengths
+are in meters, angles in radians, z is up.
 """
 
 from dataclasses import dataclass, field, replace
@@ -14,48 +14,57 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_from_up, up_text
 from lidarpose.skeleton import SMPL24, Skeleton, as_skeleton
 
-# no coordinate on Earth is larger, m; arithmetic on what is would overflow
+# maximum absolute coordinate, m: none on Earth is larger, and arithmetic on larger ones could overflow
 FARTHEST = 1e9
-# a joint nearer to the truth than this is a hit, m: what confidence is the probability of
+# maximum error of a correct joint, m; confidence is the probability of an error below it
 CONFIDENCE_RADIUS = 0.1
-# fewer points than this say nothing about a pose
+# minimum number of points for a pose
 MIN_POINTS = 5
-# points of a second person from which on a crop is said to show two
+# minimum number of points of a second person for a crop to count as showing two people
 FEWEST_OF_SECOND = 15
-# frames of a clip. Source: LiDARCap; NE, whose layers hold as many
+# frames per clip. Source: LiDARCap; NE, whose layers have this size
 CLIP_FRAMES = 16
-# what a pose may say of each joint
+# optional values of a pose per joint
 PER_JOINT = ("confidence", "spread", "visible", "in_range")
-# and once a person
+# optional values of a pose per person
 PER_PERSON = ("person", "second_person")
-# tables of results have a row for each joint of each person, who has a number in the column "person"
+# columns of result tables, which have one row per joint of each person; the column "person" numbers people, so the
+# value `person` has another name here
 JOINT_COLUMNS = ("joint", "x", "y", "z", *PER_JOINT, "person_probability", "second_person", "score", "mounted")
-# the label of a joint: not labeled (its position is NaN), labeled though hidden or uncertain, labeled and seen
+# joint labels: not labeled (position NaN), labeled but hidden or uncertain, labeled and visible
 UNLABELED, HIDDEN, SEEN = 0, 1, 2
 
 
 def within_reach(points: np.ndarray) -> np.ndarray:
-    """points (..., 3) m -> (...) bool: where arithmetic can work with them, neither NaN nor beyond `FARTHEST`."""
+    """points (..., 3) m -> (...) bool: whether a point is usable, neither NaN nor beyond `FARTHEST`."""
     return (np.abs(points) < FARTHEST).all(-1)
 
 
 def clip_windows(run: np.ndarray, *, following: int = 0) -> np.ndarray:
-    """A run's rows (n,) as clips (c, `CLIP_FRAMES`) that do not overlap, each with so many rows that follow; what lies
-    behind the last row is filled with it. Source: LiDARCap."""
+    """Splits the rows (n,) of a run into clips (c, `CLIP_FRAMES` + following). The first `CLIP_FRAMES` columns do not
+    overlap; `following` further rows follow each clip. Rows beyond the end repeat the last row. Source: LiDARCap."""
     rows = np.arange(0, len(run), CLIP_FRAMES)[:, None] + np.arange(CLIP_FRAMES + following)
     return run[np.minimum(rows, len(run) - 1)]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pose:
-    """Joints in space, of one person or of many.
+    """3D joint positions of one or many people, with optional uncertainties.
 
-    joints (..., J, 3) m; confidence (..., J) in [0, 1], the probability that the joint is within 10 cm;
-    spread (..., J) m, the expected distance between the joint and the truth; visible (..., J) in [0, 1], the
-    probability that a point of the body lies within 18 cm of the joint; in_range (..., J) bool, False where the joint
-    may lie farther out than it says, since it was found at the end of what the network can tell; person, second_person
-    (...) in [0, 1], the probabilities that the cloud shows a person, and a second one besides; frame names the frame of
-    the joints. The skeleton may be given by its name.
+    Args:
+        joints: (..., J, 3) m, joint positions.
+        skeleton: a `Skeleton`, or its name.
+        confidence: (..., J) in [0, 1], probability that the joint is within 10 cm of the ground truth.
+        spread: (..., J) m, expected distance between the joint and the ground truth.
+        visible: (..., J) in [0, 1], probability that a point of the body lies within 18 cm of the joint.
+        in_range: (..., J) bool, False if the joint lies at the end of the network's output range and may be farther out
+            than predicted.
+        person: (...) in [0, 1], probability that the cloud shows a person.
+        second_person: (...) in [0, 1], probability that the cloud shows a second person as well.
+        frame: name of the coordinate frame of the joints.
+
+    Raises:
+        InputError: arrays of the wrong shape or type, or an unknown skeleton.
     """
 
     joints: np.ndarray
@@ -88,7 +97,14 @@ class Pose:
             raise InputError(f"Pose.in_range must be true or false for each joint, got {self.in_range.dtype}")
 
     def to(self, skeleton: Skeleton | str) -> "Pose":
-        """The same pose with the joints of another skeleton, or of that of a name, picked by their names."""
+        """Converts the pose to another skeleton by selecting joints by name.
+
+        Args:
+            skeleton: a `Skeleton`, or its name.
+
+        Raises:
+            InputError: an unknown skeleton, or a skeleton with a joint that this pose lacks.
+        """
         skeleton = as_skeleton(skeleton)
         indices = self.skeleton.map_to(skeleton)
         values = {name: getattr(self, name) for name in PER_JOINT}
@@ -99,10 +115,10 @@ class Pose:
 
 
 def facing(pose: Pose | None) -> np.ndarray | None:
-    """Where a person looks, on the ground: (3,) of length 1 with z = 0.
+    """The horizontal heading of a person: (3,) of length 1 with z = 0.
 
-    Taken from the left-right axis of hips and shoulders, by name. None without a pose, or where the axis is unknown
-    or stands upright, as of somebody who lies on the side.
+    Computed from the left-right axis of hips and shoulders, by name. None without a pose, or if this axis is unknown or
+    vertical, as for a person lying on the side.
     """
     if pose is None:
         return None
@@ -120,17 +136,26 @@ def facing(pose: Pose | None) -> np.ndarray | None:
 
 
 def facing_yaw(pose: Pose | None) -> float:
-    """The angle about z, rad, of where a person looks, 0 where `facing` knows none."""
+    """The yaw of a person's heading, rad about z; 0 if `facing` is None."""
     forward = facing(pose)
     return 0.0 if forward is None else float(np.arctan2(forward[1], forward[0]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Box:
-    """A person's box: center (3,) m, size (length, width, height) m, yaw rad about z. It may only crop.
+    """The 3D bounding box of a person, upright along the up axis. It only crops points; networks do not read it.
 
-    score: the probability that it is a person, None where nobody says; mounted: whether the person rides, or sits in a
-    wheelchair, None where nobody says; up: what is up in the scan, see `rotation_from_up`, None for z.
+    Args:
+        center: (3,) m.
+        size: (length, width, height) m.
+        yaw: rotation about the up axis, rad.
+        id: text or a whole number, None if the box has none.
+        score: probability that the box contains a person, None if unknown.
+        mounted: whether the person rides or sits in a wheelchair, None if unknown.
+        up: up axis or direction of the scan, see `rotation_from_up`. None means z.
+
+    Raises:
+        InputError: a value of the wrong type or outside its range.
     """
 
     center: np.ndarray
@@ -161,7 +186,7 @@ class Box:
         if self.score is not None:
             if not isinstance(self.score, Real) or not 0 <= self.score <= 1:
                 raise InputError(f"Box.score must be a probability from 0 to 1, got {self.score!r}")
-            # numpy's numbers are none for JSON
+            # JSON cannot encode numpy numbers
             object.__setattr__(self, "score", float(self.score))
         if self.mounted is not None:
             if not isinstance(self.mounted, bool | np.bool_):
@@ -172,12 +197,23 @@ class Box:
             object.__setattr__(self, "up", up_text(self.up))
 
     def to_dict(self) -> dict[str, Any]:
-        """center, size and yaw, and up where it is not z, as JSON holds them."""
+        """center, size and yaw, and up if it is not z, as JSON values."""
         place = {"center": self.center.tolist(), "size": self.size.tolist(), "yaw": float(self.yaw)}
         return place if self.up in (None, "z") else place | {"up": self.up}
 
     def contains(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
-        """points (n, 3+) m -> (n,) bool: inside the box grown by `margin` m on each side. Raises InputError."""
+        """Whether points lie inside the box.
+
+        Args:
+            points: (n, 3+) m, in the frame of the box, with z up.
+            margin: distance, m, by which the box is enlarged on each side.
+
+        Returns:
+            (n,) bool.
+
+        Raises:
+            InputError: points of another shape or type.
+        """
         try:
             array = np.asarray(points, float)
         except (TypeError, ValueError):
@@ -191,7 +227,8 @@ class Box:
 
 
 def box_id(given: object) -> str | int | None:
-    """A box's id as JSON can hold it. Raises InputError for what is neither text nor a whole number, numpy's too."""
+    """A box id as JSON can encode it: text, int or None. Raises InputError for other types than text and whole numbers
+    (numpy's included)."""
     if isinstance(given, Integral) and not isinstance(given, bool):
         return int(given)
     if given is None or isinstance(given, str):
@@ -201,17 +238,18 @@ def box_id(given: object) -> str | int | None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sample:
-    """One person as a LiDAR saw it.
+    """One person as recorded by a LiDAR.
 
-    points (n, 3) float32 m in the sensor's frame, n = 0 is legal; center (3,) m, the origin of the person's own
-    frame, which has the sensor's axes; part (n,) uint8, 0 = background, 1 + j = the bone of SMPL-24's joint j;
-    ring (n,) int, the beam; pose in the sensor's frame; source tells where the sample came from; second_person_points:
-    how many points are somebody else's, None where that is not known.
+    points (n, 3) float32 m in the sensor frame, n = 0 is legal; center (3,) m, the origin of the person's own frame,
+    which has the axes of the sensor frame; part (n,) uint8, 0 = background, 1 + j = the bone of SMPL-24's joint j;
+    ring (n,) int, the beam; pose in the sensor frame; box of the person; source: where the sample comes from;
+    frame_id: name of its frame; second_person_points: number of points on other people, None if unknown.
 
-    What networks of clips need besides: rotations (24, 3) rad, axis-angles of SMPL's joints, each relative to its
-    parent, the pelvis' from SMPL's rest frame (y up, facing +z) to the sensor's; translation (3,) m, SMPL's trans as a
-    point of the sensor's frame, of synthesized bodies the pelvis; background (b, 3) float32 m, what stands still in the
-    person's window of azimuth and elevation, +-1 degree; neighbors (k, 3) float32 m, the frame's other points in it.
+    Additional values for networks that read clips: rotations (24, 3) rad, axis-angles of SMPL's joints, each relative
+    to its parent, the pelvis' from SMPL's rest frame (y up, facing +z) to the sensor frame; translation (3,) m, SMPL's
+    trans as a point in the sensor frame, for synthesized bodies the pelvis; background (b, 3) float32 m, the static
+    points in the person's window of azimuth and elevation, extended by 1 degree on each side; neighbors (k, 3) float32
+    m, the other points of the frame in this window.
     """
 
     points: np.ndarray
@@ -230,8 +268,8 @@ class Sample:
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """Of a synthetic sample that is not one scan of an upright sensor around one person, what it is instead, as its
-        source says after scene and sensor: merged, accumulated, integrated, inverted, sparse, crowded."""
+        """How a synthetic sample deviates from a single scan of one person by an upright sensor, as listed in `source`
+        after scene and sensor: merged, accumulated, integrated, inverted, sparse, crowded."""
         words = self.source.split("/")
         return tuple(words[3].split("+")) if words[0] == "synth" and len(words) > 3 else ()
 
@@ -255,12 +293,13 @@ class Sample:
 
 @dataclass(frozen=True, kw_only=True)
 class PersonInfo:
-    """What is known of a synthetic person besides the sample; NaN, "" and False where nothing was measured.
+    """Measurements of a synthetic person besides the sample; NaN, "" and False if not measured.
 
-    sensor: name; kind: what the person does, a name of `body.pose_prior.activities.KINDS`; distance m; visible: returns
-    of body and clothes, as a share (at most 1) of those that the body alone has without any loss: what range or slant
-    lost counts as hidden too; height_seen: share of the body's height between its lowest and highest return; clutter:
-    share of the points that are neither body nor ground; upright: stands or walks.
+    sensor: name; kind: activity, a name of `body.pose_prior.activities.KINDS`; distance: horizontal, from the sensor,
+    m; visible: number of returns from body and clothes, as a fraction (at most 1) of the returns from the body alone
+    without any loss, so that returns lost to range or slant count as hidden too; height_seen: fraction of the body
+    height between its lowest and highest return; clutter: fraction of points that are neither body nor ground; upright:
+    whether the person stands or walks.
     """
 
     sensor: str = ""
@@ -273,24 +312,25 @@ class PersonInfo:
 
     @property
     def plain(self) -> bool:
-        """Upright, whole and uncluttered, most of the height seen."""
+        """Whether the person is upright, fully visible and uncluttered, with most of the height seen."""
         return bool(is_plain(self.upright, self.visible, self.clutter) and self.height_seen > 0.85)
 
 
 def is_plain(upright, visible, clutter):
-    """Bools for arrays (N,) or one person's, as in `PersonInfo`: upright, whole, uncluttered. NaN is not plain."""
+    """Whether people are upright, fully visible and uncluttered, for arrays (N,) or single values of `PersonInfo`.
+    False for NaN."""
     return upright & (visible > 0.8) & (clutter < 0.05)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LabeledSample(Sample):
-    """A sample of a dataset: what its reader yields, a shard stores, fine-tuning learns from and evaluation scores.
+    """A labeled sample of a dataset, as used by readers, shards, fine-tuning and evaluation.
 
-    Of `Sample` the pose is required: joints (J, 3) m of the dataset's own skeleton, NaN where a joint is not labeled.
+    pose is required: joints (J, 3) m in the dataset's own skeleton, NaN for joints that are not labeled;
     joint_labels (J,) uint8: `UNLABELED`, `HIDDEN` or `SEEN`; sequence, frame, track: where it comes from; time: seconds
-    since the sequence's beginning, NaN if unknown; centers: other origins that published protocols use, (3,) m by
-    name ("trans", "box", "joints_box"); sensor_known: whether the origin of the frame is the sensor; split: "train",
-    "val", "test" or None; info: of a synthetic person, None of a real one.
+    since the start of the sequence, NaN if unknown; centers: other origins used by published protocols, (3,) m by name
+    ("trans", "box", "joints_box"); sensor_known: whether the origin of the frame is the sensor; split: "train", "val",
+    "test" or None; info: measurements of a synthetic person, None for a real one.
     """
 
     pose: Pose
@@ -313,7 +353,7 @@ class LabeledSample(Sample):
 
     @property
     def joints(self) -> np.ndarray:
-        """(J, 3) m, those of the pose."""
+        """(J, 3) m: joint positions of the pose."""
         return self.pose.joints
 
     @property
@@ -322,20 +362,21 @@ class LabeledSample(Sample):
 
     @property
     def distance(self) -> float:
-        """Of the person from the sensor, m; NaN where it is not known."""
+        """Distance of the person from the sensor, m; NaN if unknown."""
         if self.info is not None:
             return self.info.distance
-        # as precise as shards store it, so that a score is the same from memory and from a file
+        # rounded as in shards, so that scores are the same from memory and from a file
         return float(np.float32(np.linalg.norm(self.center))) if self.sensor_known else np.nan
 
     @property
     def sample(self) -> "LabeledSample":
-        """The sample itself: what readers yielded until 0.2 held it beside its labels."""
+        """The sample itself. Until version 0.2, readers yielded objects with a separate `sample`."""
         return self
 
 
 def _as_arrays(self: Pose | Sample, *names: str) -> None:
-    """What was given as lists becomes arrays; arrays stay what they are. Raises InputError for what is no numbers."""
+    """Converts the named fields to arrays, unless they already are. Raises InputError for values that are not
+    numbers."""
     for name in names:
         value = getattr(self, name)
         if value is None or isinstance(value, np.ndarray):
@@ -349,26 +390,26 @@ def _as_arrays(self: Pose | Sample, *names: str) -> None:
         object.__setattr__(self, name, array)
 
 
-# edge of the cells in which a cloud's density is evened out before its center is taken, meters
+# edge length, m, of the cells that even out a cloud's density before its center is computed
 CENTER_CELL = 0.1
 
 
 def center_of(points: np.ndarray) -> np.ndarray:
     """points (n, 3) m, n >= 1 -> (3,) m: the median of the occupied 10 cm cells on each axis.
 
-    The origin of a person's own frame where nothing better is known. Cells make it independent of the density, the
-    median of a few stray points. No box, no root joint: nothing that a user's file does not hold.
+    The default origin of a person's own frame. Cells make it independent of the point density, and the median makes it
+    robust against a few stray points. It needs neither a box nor a root joint, which a user's file may not contain.
     """
     cells = np.floor(np.asarray(points, float) / CENTER_CELL).astype(np.int64)
     low = cells.min(0)
     x, y, z = (cells - low).T
     if max(x.max(), y.max(), z.max()) >= 1 << 20:
-        # strays kilometers away: one number a cell would overflow
+        # stray points kilometers away: packing a cell into one integer would overflow
         return (np.median(np.unique(cells, axis=0), axis=0) + 0.5) * CENTER_CELL
-    # one number a cell: far faster to make unique than rows
+    # one integer per cell: finding unique integers is far faster than finding unique rows
     number = np.sort(x << 40 | y << 20 | z)
     number = number[np.diff(number, prepend=-1) > 0]
     x, y, z = number >> 40, number >> 20 & 0xFFFFF, number & 0xFFFFF
-    # np.median's care for NaN and axes costs more than the medians
+    # np.median is slow here: its handling of NaN and axes costs more than the medians
     middle = [(v[(len(v) - 1) // 2] + v[len(v) // 2]) / 2 for v in (x, np.sort(y), np.sort(z))]
     return (np.array(middle) + low + 0.5) * CENTER_CELL

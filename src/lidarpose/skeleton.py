@@ -1,14 +1,14 @@
-"""Named joints: the one place that knows which number a joint has.
+"""Skeletons: named joints and their indices, which no other module defines.
 
-Every skeleton is a tree of named joints. Two skeletons that share a name share the joint's definition, so maps
-between them are made by name. `BODY26` is the superset that the network speaks: SMPL's 24 joints, nose and head center.
+Every skeleton is a tree of named joints. A joint name has the same definition in all skeletons, so joints are mapped
+between skeletons by name. `BODY26` is the superset that the network predicts: SMPL's 24 joints, nose and head center.
 
-Definitions (all points are carried rigidly by the bone whose name stands in brackets):
+Definitions (each point moves rigidly with the bone named in brackets):
     SMPL names      the joint centers of SMPL's kinematic tree: the pelvis lies about 9.5 cm above the middle of the
                     hips, the hips about 15 cm and the shoulders about 37 cm apart on a mean adult
     head            the joint at the base of the skull, as in SMPL [head]
     nose            the tip of the nose [head]
-    head_center     the middle of the head, half way between the ears [head]
+    head_center     the middle of the head, halfway between the ears [head]
 """
 
 from dataclasses import dataclass
@@ -24,8 +24,14 @@ from lidarpose.errors import InputError, check_name, unknown_name
 class Skeleton:
     """A tree of named joints.
 
-    `parents[j]` is the index of joint j's parent, -1 for the root; parents precede children. `extra_bones` are pairs
-    of indices that are drawn besides the tree's own bones.
+    Args:
+        name: name of the skeleton.
+        joints: names of the joints, unique.
+        parents: index of each joint's parent, -1 for the root, which is joint 0; parents precede children.
+        extra_bones: pairs of joint indices that are drawn in addition to the bones of the tree.
+
+    Raises:
+        InputError: joints, parents or bones that do not form a valid tree.
     """
 
     name: str
@@ -34,7 +40,7 @@ class Skeleton:
     extra_bones: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self):
-        # lists are as good as tuples
+        # accept lists instead of tuples
         try:
             object.__setattr__(self, "joints", tuple(self.joints))
             object.__setattr__(self, "parents", tuple(map(index, self.parents)))
@@ -66,7 +72,7 @@ class Skeleton:
         return len(self.joints)
 
     def index(self, joint: str) -> int:
-        """The index of a named joint."""
+        """The index of a joint by name. Raises InputError for an unknown joint."""
         try:
             return self.joints.index(joint)
         except ValueError:
@@ -74,22 +80,23 @@ class Skeleton:
 
     @cached_property
     def middle(self) -> tuple[int, ...]:
-        """The joints whose mean is the middle of a person: the pelvis, or both hips where there is none."""
+        """Indices of the joints whose mean is the middle of a person: the pelvis, or both hips if there is none."""
         names = ("pelvis",) if "pelvis" in self.joints else ("left_hip", "right_hip")
         return tuple(self.index(name) for name in names)
 
     @cached_property
     def bones(self) -> tuple[tuple[int, int], ...]:
-        """Pairs (parent, child) to draw, `extra_bones` last."""
+        """Pairs (parent, child) of joint indices to draw, followed by `extra_bones`."""
         return tuple((p, j) for j, p in enumerate(self.parents) if p >= 0) + self.extra_bones
 
     @cached_property
     def flip(self) -> tuple[int, ...]:
-        """`flip[j]` is the joint that j becomes in a mirror: left and right exchanged, by name."""
+        """`flip[j]` is the index of joint j's mirror image: left and right are swapped by name."""
         return tuple(self.index(_mirrored(name)) for name in self.joints)
 
     def map_to(self, other: "Skeleton") -> np.ndarray:
-        """(len(other),) int: for each joint of `other` its index here. Raises where a joint is missing."""
+        """(len(other),) int: for each joint of `other`, its index in this skeleton. Raises InputError if one is
+        missing."""
         missing_joints = [name for name in other.joints if name not in self.joints]
         if missing_joints:
             raise InputError(f"skeleton {self.name} has no {', '.join(missing_joints)}, which {other.name} needs")
@@ -104,7 +111,7 @@ def _mirrored(name: str) -> str:
 
 
 def _tree(name: str, edges: str, extra: str = "") -> Skeleton:
-    """A skeleton from words `joint<parent`, the root without `<`; `extra` are words `joint<joint`."""
+    """Builds a skeleton from words `joint<parent`, the root without `<`; `extra` has words `joint<joint`."""
     pairs = [word.partition("<") for word in edges.split()]
     joints = tuple(joint for joint, _, _ in pairs)
     parents = tuple(joints.index(parent) if parent else -1 for _, _, parent in pairs)
@@ -121,10 +128,10 @@ left_hand<left_wrist right_hand<right_wrist"""
 # SMPL's kinematic tree (Loper et al. 2015), joints in its published order
 SMPL24 = _tree("smpl24", _SMPL)
 
-# SMPL's tree and the two head points that Waymo labels: what the bundled networks predict
+# SMPL's tree and the two head points that Waymo labels; predicted by the bundled networks
 BODY26 = _tree("body26", _SMPL + " nose<head head_center<head")
 
-# the subset of SMPL's joints that the paper pre-trains on; the joints and order of HumanM3
+# the subset of SMPL's joints used for pre-training in the paper, with the joints and order of HumanM3
 HUMAN15 = _tree(
     "human15",
     """pelvis left_hip<pelvis right_hip<pelvis left_knee<left_hip right_knee<right_hip left_ankle<left_knee
@@ -141,8 +148,8 @@ WAYMO14 = _tree(
     extra="right_shoulder<left_shoulder right_hip<left_hip",
 )
 
-# ITOP's 15 joints in its order, without the torso, for which SMPL has no joint; hands and feet are SMPL's by name, some
-# centimeters from where ITOP's sensor and annotators put them
+# ITOP's 15 joints in its order, without the torso, for which SMPL has no joint. Hands and feet map to SMPL's by name,
+# although ITOP's are some centimeters away, due to its sensor and annotation
 ITOP14 = _tree(
     "itop14",
     """head_center neck<head_center right_shoulder<neck left_shoulder<neck right_elbow<right_shoulder
@@ -160,5 +167,5 @@ def skeleton(name: str) -> Skeleton:
 
 
 def as_skeleton(of: Skeleton | str) -> Skeleton:
-    """A skeleton, by name too. Raises InputError for anything else."""
+    """Converts a skeleton or its name to a skeleton. Raises InputError for anything else."""
     return of if isinstance(of, Skeleton) else skeleton(of)

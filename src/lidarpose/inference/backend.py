@@ -1,9 +1,9 @@
-"""What runs a network: from people's points to raw outputs as arrays. This file needs no torch.
+"""Backends, which run a network: from people's points to raw outputs as arrays. This file does not need torch.
 
 Legend: B people, J joints, W bins of a heatmap.
 
-A backend has a `name`, the network's `header`, `batch` (people a call) and `run(clouds, view)`. There are two: ONNX
-Runtime, here, and torch (`torch_backend`).
+A backend has a `name`, the network's `header`, `batch` (people per call) and `run(clouds, view)`. There are two: ONNX
+Runtime, in this file, and torch (`torch_backend`).
 """
 
 import os
@@ -32,21 +32,21 @@ from lidarpose.models.onnx import (
 from lidarpose.sample import CONFIDENCE_RADIUS, PER_PERSON, Pose
 from lidarpose.skeleton import Skeleton
 
-# people a call, and those of them that go through the network at once: what it makes of more does not stay in the
-# processor's cache
+# people per call, and people per run of the network: the activations of more do not fit in the processor's cache
 _BATCH, _PART = 64, 8
-# log of the largest reported spread, m: that of an untrained network is unbounded
+# log of the largest reported spread, m: the spread of an untrained network is unbounded
 _LARGEST_LOG_SPREAD = 5.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Raw:
-    """A network's outputs in the person's frame, joints in the order of its skeleton.
+    """Raw outputs of a network in the person's frame, joints in the order of its skeleton.
 
-    vote (B, J, 3) m: where the heatmaps' origin lies; heatmaps: logits (B, J, W) of x, y and z, None for a network
-    without; low, step (3,) m: where bin 0 of each axis lies about the vote and how far apart bins are. Of networks that
-    say so: confidence (B, J) logit of an error under `CONFIDENCE_RADIUS`, log_spread (B, J) log of the expected error
-    in m, visible (B, J) logit of being seen, person (B, 2) logits of a person and of a second one in the cloud.
+    vote (B, J, 3) m: origin of the heatmaps; heatmaps: logits (B, J, W) for x, y and z, None for networks without
+    heatmaps; low, step (3,) m: position of bin 0 relative to the vote and distance between bins, per axis. For networks
+    with these outputs, else None: confidence (B, J): logit of an error under `CONFIDENCE_RADIUS`; log_spread (B, J):
+    log of the expected error in m; visible (B, J): logit that the joint is visible; person (B, 2): logits that the
+    cloud shows a person, and a second person.
     """
 
     vote: np.ndarray
@@ -60,18 +60,18 @@ class Raw:
 
     @classmethod
     def from_joints(cls, joints: np.ndarray) -> "Raw":
-        """Of a network that answers with joints (B, J, 3) m alone."""
+        """The outputs of a network that only predicts joints (B, J, 3) m."""
         return cls(vote=joints, heatmaps=None, low=np.zeros(3), step=np.ones(3))
 
     @classmethod
     def from_pose(cls, outputs: dict[str, np.ndarray]) -> "Raw":
-        """From the outputs of a `PoseNet` by name."""
+        """The outputs of a `PoseNet`, given by name."""
         heatmap = outputs["heatmap"]
         bins = heatmap.shape[-1]
         return cls(
             vote=outputs["vote"],
             heatmaps=tuple(heatmap[:, :, axis] for axis in range(3)) if bins else None,
-            # bins are known by their middles
+            # the position of a bin is its middle
             low=np.full(3, (0.5 - bins / 2) * BIN),
             step=np.full(3, BIN),
             confidence=outputs["confidence"],
@@ -82,8 +82,12 @@ class Raw:
 
 
 class Backend(Protocol):
-    """clouds: B arrays (n, 3) m, each about its person's center, n = 0 is legal; view (B, 5): see `VoxelPyramid`.
-    Networks of clips have `frames`, and take `clip`, an `inputs.Clips` of the clouds, about the same centers."""
+    """Runs a network.
+
+    `run` takes clouds: B arrays (n, 3) m, each relative to its person's center, n = 0 is legal; view (B, 5): see
+    `VoxelPyramid`. Backends of networks that read clips also have the attribute `frames`, and their `run` takes `clip`,
+    an `inputs.Clips` of the clouds, relative to the same centers.
+    """
 
     name: str
     header: Header
@@ -93,9 +97,9 @@ class Backend(Protocol):
 
 
 class OnnxBackend:
-    """A file that `lidarpose export` wrote, run by ONNX Runtime on the CPU. threads: None for all usable ones.
+    """Runs a file written by `lidarpose export` with ONNX Runtime on the CPU. threads: None for all usable threads.
 
-    People are spread over the threads: a network this small is hardly faster with several for one person.
+    People are distributed over the threads: a network this small hardly gains from several threads per person.
     """
 
     name = "onnx"
@@ -106,16 +110,16 @@ class OnnxBackend:
         self.threads = thread_count(threads)
         self.session, self.header, self.source = open_onnx(path)
         self._config = cast(NetworkConfig, self.header.config)
-        # body parts are not used: outputs that are not requested are not computed
+        # body parts are not needed: ONNX Runtime does not compute outputs that are not requested
         self._outputs = [name for name in output_names(self._config) if name != "part"]
 
     def __reduce__(self) -> tuple:
-        # a session cannot go to another process, which opens the file anew
+        # a session cannot be pickled: another process opens the file again
         path, threads = self._opened
         return partial(OnnxBackend, path, threads=threads), ()
 
     def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
-        # batches are by size: the largest first, so that no thread is left with one at the end
+        # clouds are sorted by size: start with the largest, so that no thread has to finish a large one at the end
         parts = [(clouds[rows], view[rows]) for rows in person_parts(len(clouds), self.threads)[::-1]]
         values = map_in_threads(self._run, parts, self.threads)[::-1]
         arrays = values[0] if len(values) == 1 else map(np.concatenate, zip(*values, strict=True))
@@ -127,7 +131,7 @@ class OnnxBackend:
 
 
 def person_parts(count: int, threads: int) -> list[slice]:
-    """Rows of people who go through the network together, of so many: as many parts for each thread."""
+    """Splits `count` people into slices that are run through the network together, the same number for each thread."""
     part_count = max(min(-(-count // (_PART * threads)) * threads, count), 1)
     ends = np.linspace(0, count, part_count + 1).astype(int).tolist()
     return [slice(low, high) for low, high in pairwise(ends)]
@@ -135,14 +139,14 @@ def person_parts(count: int, threads: int) -> list[slice]:
 
 @cache
 def bundled_backend(name: str) -> OnnxBackend:
-    """The bundled network of a name, on all usable threads; opened once for all who run it."""
+    """The backend of a bundled network by name, on all usable threads; opened once and shared by all callers."""
     return OnnxBackend(weights_file(f"{name}.onnx"))
 
 
 def exported_beside(path: str | os.PathLike, *, threads: int | None = None) -> OnnxBackend:
     """The backend of the .onnx file beside a checkpoint.
 
-    Raises InputError where there is none, or it was made from other weights.
+    Raises InputError if there is none, or if it was exported from other weights.
     """
     path = Path(path)
     header = read_header(path)
@@ -159,15 +163,15 @@ def exported_beside(path: str | os.PathLike, *, threads: int | None = None) -> O
 
 
 def estimates(raw: Raw, decoder: Decoder, skeleton: Skeleton) -> Pose:
-    """The poses of B people about their centers from raw outputs; `decoder` reads the heatmaps.
+    """Decodes raw outputs into poses of B people relative to their centers; `decoder` reads the heatmaps.
 
-    Raises InputError where none is finite.
+    Raises InputError if no joint is finite.
     """
     joints, in_range = raw.vote.astype(float), None
     if raw.heatmaps is not None:
         axes = zip(raw.heatmaps, raw.low, raw.step, strict=True)
         joints = joints + np.stack([decoder(heatmap, low=low, step=step) for heatmap, low, step in axes], -1)
-        # a vote can be too far off on any axis
+        # the joint may lie beyond the heatmap on any axis
         in_range = ~np.any([out_of_range(heatmap) for heatmap in raw.heatmaps], axis=0)
     if joints.size and not np.isfinite(joints).any():
         raise InputError("the network answers with no numbers: its weights are damaged, get the file again")
@@ -188,10 +192,11 @@ def estimates(raw: Raw, decoder: Decoder, skeleton: Skeleton) -> Pose:
 
 
 def _from_heatmaps(raw: Raw, heatmaps: tuple[np.ndarray, ...], offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Confidence and spread (B, J) of a network without these outputs, from its heatmaps about `offset` (B, J, 3) m.
+    """Confidence and spread (B, J) for a network without these outputs, from its heatmaps around the joints at `offset`
+    (B, J, 3) m from the vote.
 
-    Confidence is the share of the heatmaps within `CONFIDENCE_RADIUS` of the joint, axes taken as independent; spread
-    the root of their mean square distance. Neither is calibrated.
+    Confidence is the probability mass of the heatmaps within `CONFIDENCE_RADIUS` of the joint, with independent axes.
+    Spread is the root mean square distance from the joint. Neither is calibrated.
     """
     share, mean_square = np.ones(offset.shape[:2]), np.zeros(offset.shape[:2])
     for axis, heatmap in enumerate(heatmaps):

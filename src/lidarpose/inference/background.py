@@ -1,4 +1,4 @@
-"""What stands still about a sensor that stays where it is, learned from a recording, so that it is not searched."""
+"""The static background around a stationary sensor, learned from a recording, in which no people are searched for."""
 
 import os
 import warnings
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 # edge of a voxel, m; a point fills the 2 x 2 x 2 voxels nearest to it, since noise moves it into a neighbor
 _VOXEL = 0.15
-# a voxel is static where this share of the scans fill it, in each part of the recording: whoever stood there for a
-# while and left is nothing static
+# a voxel is static if this fraction of the scans occupy it in each part of the recording, so that a person who stood
+# there for a while and left is not static
 _SHARE, _PARTS = 0.5, 3
-# more scans of a recording tell nothing new
+# number of scans that are read; more do not improve the result
 _MOST_SCANS = 60
-# voxels are numbered within so many of a middle, on each axis
+# number of voxels on each axis
 _SPAN = 1 << 20
 
 
@@ -36,21 +36,22 @@ def learn_background(
     topic: str | None = None,
     meta: str | os.PathLike | None = None,
 ) -> np.ndarray:
-    """The static points of a recording by a sensor that stays where it is, for `background` of `detect` and `predict`.
+    """Learns the static points around a stationary sensor from a recording, for `background` of `detect` and `predict`.
 
-    Damaged scans of a recording or folder are left out, with a warning.
+    Damaged scans of a recording or folder are skipped with a warning.
 
     Args:
-        scans: point files or arrays (n, 3) m, one or several in the order of time, or anything that `open_source`
-            takes; of more than 60 an even choice is read.
-        columns: values a row of .bin files, see `read_points`.
-        topic, meta: of recordings, as of `open_source`.
+        scans: one or several point files or arrays (n, 3) m in temporal order, or anything that `open_source` takes.
+            Of more than 60 scans, 60 evenly spaced ones are read.
+        columns: number of values per row of .bin files, see `read_points`.
+        topic, meta: options for recordings, see `open_source`.
 
     Returns:
-        (n, 3) m, in the scans' own frame, where most scans hold points; of one scan, where it does.
+        (n, 3) m, points in the frame of the scans, at the places where at least half of the scans in each third of the
+        recording have points; for a single scan, wherever it has points.
 
     Raises:
-        InputError: no scans, none that can be read, or a file among several that cannot.
+        InputError: no scans, no readable scan, or an unreadable file among those listed.
     """
     sources = _sources(scans, columns, topic, meta)
     grid: _Grid | None = None
@@ -62,7 +63,7 @@ def learn_background(
             try:
                 points = _points(sources[row], columns)
             except InputError as problem:
-                # what is given scan by scan has to be right
+                # scans that were listed one by one must all be readable
                 if not isinstance(sources[row], LazyFrame):
                     raise
                 problems.append(problem)
@@ -91,14 +92,14 @@ def learn_background(
 def read_background(
     source: Any, *, columns: int | None = None, topic: str | None = None, meta: str | os.PathLike | None = None
 ) -> np.ndarray:
-    """Static points (n, 3) m of a file or an array of them, or learned from a recording or several scans."""
+    """Static points (n, 3) m: read from a point file or array, or learned from a recording or several scans."""
     if hasattr(source, "shape") or isinstance(source, str | os.PathLike) and is_single_scan(source):
         return _points(source, columns)
     return learn_background(source, columns=columns, topic=topic, meta=meta)
 
 
 def is_static(points: np.ndarray, background: np.ndarray) -> np.ndarray:
-    """points (n, 3) m, static points (k, 3) m of one frame -> (n,) bool: which lie where something static does."""
+    """points (n, 3) m, background (k, 3) m in the same frame -> (n,) bool: whether a point lies on the background."""
     grid = _Grid(background)
     voxels, point_voxels = grid.voxels(grid.eighths(background)), _packed(grid.index(points) // 2)
     if not len(voxels):
@@ -107,34 +108,34 @@ def is_static(points: np.ndarray, background: np.ndarray) -> np.ndarray:
 
 
 class _Grid:
-    """Voxels about the middle of points (n, 3) m, by numbers: of a voxel, and of an eighth of one. What lies farther
-    out than numbers reach is at the border."""
+    """A voxel grid around the median of points (n, 3) m. Voxels, and their eighths, are identified by integers. Points
+    outside the grid are assigned to its border."""
 
     def __init__(self, points: np.ndarray):
         middle = np.median(points, axis=0) if len(points) else np.zeros(3)
         self.corner = (np.floor(middle / _VOXEL) - _SPAN // 2) * _VOXEL
 
     def index(self, points: np.ndarray) -> np.ndarray:
-        """points (n, 3) -> (n, 3) int64: of eighths; halves are voxels."""
+        """points (n, 3) -> (n, 3) int64: grid indices of eighths; divided by 2 they are those of voxels."""
         return np.floor((points - self.corner) / (_VOXEL / 2)).clip(0, 2 * _SPAN - 1).astype(np.int64)
 
     def eighths(self, points: np.ndarray) -> np.ndarray:
-        """Those that points (n, 3) fill, ascending."""
+        """The eighths occupied by points (n, 3), ascending."""
         return _ascending(_packed(self.index(points)))
 
     def voxels(self, eighths: np.ndarray) -> np.ndarray:
-        """Those of which a corner touches an eighth, ascending: 2 x 2 x 2 for each."""
+        """The voxels that touch any of the eighths, ascending: 2 x 2 x 2 per eighth."""
         low = (_unpacked(eighths) - 1) // 2
         neighbors = [_packed((low + np.array(offset)).clip(0, _SPAN - 1)) for offset in np.ndindex(2, 2, 2)]
         return _ascending(np.concatenate(neighbors))
 
     def middles(self, eighths: np.ndarray) -> np.ndarray:
-        """(n, 3) m."""
+        """(n, 3) m: the centers of eighths."""
         return (_unpacked(eighths) + 0.5) * (_VOXEL / 2) + self.corner
 
 
 def _ascending(numbers: np.ndarray) -> np.ndarray:
-    """Each once. np.unique counts whole numbers by a table of hashes, which takes ten times as long."""
+    """The unique numbers in ascending order. np.unique hashes integers, which takes ten times as long."""
     numbers = np.sort(numbers)
     return numbers[np.diff(numbers, prepend=numbers[:1] - 1) > 0]
 
@@ -149,8 +150,8 @@ def _unpacked(number: np.ndarray) -> np.ndarray:
 
 
 def _sources(scans: Any, columns: int | None, topic: str | None, meta: str | os.PathLike | None) -> list:
-    """An even choice of scans that `_points` reads."""
-    # one array is one scan, not as many as it has rows
+    """At most `_MOST_SCANS` evenly spaced scans, each readable by `_points`."""
+    # one array is one scan, not a list of rows
     is_array = getattr(scans, "ndim", None) == 2 or getattr(getattr(scans, "dtype", None), "names", None)
     sources = [scans] if is_array else listed(scans)
     if not sources:
@@ -158,7 +159,7 @@ def _sources(scans: Any, columns: int | None, topic: str | None, meta: str | os.
     if not any(isinstance(source, str | os.PathLike) and not is_single_scan(source) for source in sources):
         return [sources[row] for row in evenly_spaced(len(sources), _MOST_SCANS)]
     recording = open_source(sources, columns=columns, topic=topic, meta=meta).recording
-    # which makes a damaged frame of where it is cut off
+    # `ChainedRecording` turns a truncated end into a damaged frame
     recording = ChainedRecording(recording.name, [recording])
     count = sum(1 for _ in recording.lazy_frames()) if recording.count is None else recording.count
     rows = set(evenly_spaced(count, _MOST_SCANS).tolist())

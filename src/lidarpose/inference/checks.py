@@ -1,6 +1,6 @@
-"""What looks wrong about an input and its answers: independent checks, each a line for the user or None.
+"""Plausibility checks of inputs and results: independent functions, each returning a warning for the user or None.
 
-A check of boxes is a function of (`Scan`, `Poses` in the level frame), asked where there are boxes; to add one, write
+A check of boxes is a function of (`Scan`, `Poses` in the level frame), called for scans with boxes. To add one, write
 it and append it to `SCAN_CHECKS`.
 """
 
@@ -20,46 +20,48 @@ from lidarpose.sample import MIN_POINTS, Box, Pose
 if TYPE_CHECKING:
     from lidarpose.inference.scan import Scan
 
-# bounds of what a person measures in other units, taken for meters
+# bounds on the extent of a person given in other units but read as meters
 _LARGEST_IN_CENTIMETERS, _SMALLEST_IN_OTHER_UNITS, _LARGEST_IN_KILOMETERS = 500, 20, 0.02
-# a person with the ground around is at most so many times as wide as tall
+# maximum ratio of width to height of a crop of a person with the ground around
 _WIDEST = 4
-# no LiDAR sees a person from farther away, m
+# maximum distance at which a LiDAR sees a person, m
 FARTHEST_PERSON = 500.0
-# boxes so much less tall than wide have their sizes in another order
+# boxes with a lower ratio of height to width have their sizes in another order
 _TALL_TO_WIDE = 0.8
-# heights above a box's center, in its own height: the ground, and the chest and the top of a person who stands on the
-# center; at most this share of the points is elsewhere, and so few tell nothing
+# heights above a box's center, relative to the box height: the ground, and the chest and the top of a person who stands
+# at the center; maximum fraction of points outside these heights, and minimum number of points for the check
 _GROUND, _CHEST, _TOP = -0.1, 0.75, 1.1
 _ELSEWHERE, _FEWEST = 0.05, 20
-# a network that is shown something of another size or upside down predicts a person of human size all the same, but
-# expects larger errors, m: benchmarks/plausibility.py measures how often these bounds warn
+# for points of another size or upside down, a network still predicts a person of human size, but with a larger spread:
+# spreads, m, above which points are suspicious; benchmarks/plausibility.py measures how often these bounds warn
 _UNSURE, _UNSURE_OF_SIZE, _UNSURE_OF_GIANT = 0.08, 0.1, 0.05
-# of fewer points it is unsure anyway
+# with fewer points the pose is uncertain in any case
 _FEWEST_UPSIDE_DOWN = 20
-# nobody's points reach over so much height, m, percents of the highest and lowest points left out
+# extents in height, m, that exceed a person, and that clearly do; percentiles of height between which it is measured
 _TALLEST, _GIANT, _TRIMMED = 2.2, 3.0, (3, 97)
-# the spread of a pose upside down, as a share of that as given, from which on the input is upside down
+# maximum spread of the pose of the turned points, relative to the pose of the given points, at which the input counts
+# as upside down
 _CLEARLY_SURER = 0.6
-# a crop that is so far across is no crop of one person, m
+# a wider crop is not a crop of one person, m
 _WIDEST_CROP = 20.0
-# a crop shows nobody below, and two people above this probability
+# probability of a person below which a crop shows none; probability of a second person above which it shows two
 _NOBODY, _TWO = 0.05, 0.5
-# a half turn about x
+# rotation by 180 degrees about x, as a factor per axis
 UPSIDE_DOWN = np.array([1.0, -1.0, -1.0])
-# joints that every skeleton has
+# joints that all skeletons have
 _TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
-# points of a whole person, less than so far across, that lies spread at least so far along, m, and so many times as far
-# as upwards: so spread 97 of 100 synthetic people who were laid down, and none that stood
+# thresholds for lying people: the points are less than `_TIGHT` m across; their level standard deviation is at least
+# `_LONG` m and `_LONG_TO_TALL` times the vertical one. This holds for 97 of 100 synthetic people who were laid down,
+# and for none who stood
 _TIGHT, _LONG, _LONG_TO_TALL = 2.0, 0.25, 1.5
-# a sweep's extent leaves out the farthest percents, and so many points tell it; level, it is so long, m, and so many
-# times what it is upright
+# a sweep's extent: the percentiles between which it is measured and the number of points that suffice; minimum level
+# extent, m, and minimum ratio of level to vertical extent
 _MOST, _ENOUGH, _STREET, _FLATTER = (10, 90), 25_000, 10.0, 3.0
-# a scan that is so long and has so few points a square meter is in other units, and in millimeters from so far on; a
-# whole room is larger than the smallest, m
+# a scan that is longer than this, m, and has fewer points per square meter is in other units: in millimeters if longer
+# than the third value, m; the last value is the minimum size of a scan, m
 _LONGEST_SCAN, _SPARSEST, _LONG_IN_MILLIMETERS, _SMALLEST_SCAN = 500.0, 0.1, 10_000.0, 0.5
-# a sensor is not so far from the nearest point, m, along the ground and in space, as a drone's is; of the points so
-# near, m, some percents lie lower than it by more
+# maximum distance of a sensor from the nearest point, m, along the ground and, for drones, in space; of the points
+# within `_BELOW_SENSOR` m, the given percentile of height must be at least `_LEAST_HEIGHT` m below the sensor
 _FAR_OUT, _FAR_AWAY, _BELOW_SENSOR, _LOWEST, _LEAST_HEIGHT = 25.0, 60.0, 15.0, 5, 0.2
 
 
@@ -67,11 +69,11 @@ _FAR_OUT, _FAR_AWAY, _BELOW_SENSOR, _LOWEST, _LEAST_HEIGHT = 25.0, 60.0, 15.0, 5
 
 
 def unit_warning(size: np.ndarray, *, what: str) -> str | None:
-    """What is likely wrong where a person's extent `size` (3,), z up, is no person's in meters."""
+    """The extent `size` (3,) of a person, z up, is implausible in meters: suggests the likely unit."""
     height, largest = float(size[2]), float(size.max())
     if 0 < largest < _LARGEST_IN_KILOMETERS:
         return f"{what} is {largest:.2g} m in size: are the units kilometers? multiply all coordinates by 1000"
-    # a few returns may all lie at one height, and a whole street is large, but far wider than tall
+    # a few returns may all be at one height; a whole street is large, but far wider than tall
     if height < _SMALLEST_IN_OTHER_UNITS or height < largest / _WIDEST:
         return None
     unit, factor = ("millimeters", 1000) if height > _LARGEST_IN_CENTIMETERS else ("centimeters", 100)
@@ -79,11 +81,11 @@ def unit_warning(size: np.ndarray, *, what: str) -> str | None:
 
 
 def oversize_warning(points: np.ndarray, pose: Pose) -> str | None:
-    """A person's points are in other units than meters, or hold far more than a person.
+    """The points of a person are not in meters, or contain far more than a person.
 
     Args:
-        points: (n, 3) m, z up, of the whole crop.
-        pose: the person's.
+        points: (n, 3) m, z up, the whole crop.
+        pose: the pose of the person.
     """
     width = float(np.ptp(points[:, :2], axis=0).max())
     if width > _WIDEST_CROP:
@@ -102,9 +104,10 @@ def oversize_warning(points: np.ndarray, pose: Pose) -> str | None:
 
 
 def person_count_warning(pose: Pose, *, in_box: bool = False, is_scored: bool = False) -> str | None:
-    """The points show nobody, or more people than the one whose pose it is.
+    """The points do not show a person, or show a second one.
 
-    in_box: a box says who is meant; is_scored: and by its score whether somebody is there.
+    in_box: whether the crop comes from a box, which selects the person; is_scored: whether the box has a score, so that
+    the existence of the person is not questioned.
     """
     if not is_scored and pose.person is not None and pose.person < _NOBODY:
         return f"the points look unlike a person (person {float(pose.person):.2f}): perhaps nobody is there"
@@ -116,12 +119,12 @@ def person_count_warning(pose: Pose, *, in_box: bool = False, is_scored: bool = 
 
 
 def looks_unsure(pose: Pose, points: np.ndarray) -> bool:
-    """Whether it is worth looking at the person, of points (n, 3), upside down too."""
+    """Whether the pose of points (n, 3) is uncertain enough to try them upside down as well."""
     return len(points) >= _FEWEST_UPSIDE_DOWN and pose.spread is not None and bool(pose.spread.mean() > _UNSURE)
 
 
 def upside_down_warning(pose: Pose, turned: Pose | None) -> str | None:
-    """The pose is far less certain than the pose of the points turned upside down."""
+    """The pose has a far larger spread than `turned`, the pose of the same points upside down."""
     if turned is None or pose.spread is None or turned.spread is None:
         return None
     if turned.spread.mean() > _CLEARLY_SURER * pose.spread.mean():
@@ -130,9 +133,10 @@ def upside_down_warning(pose: Pose, turned: Pose | None) -> str | None:
 
 
 def is_lying(pose: Pose, points: np.ndarray) -> bool:
-    """The trunk of a pose, z up, is nearer to level than to upright, or its points (n, 3) m are.
+    """Whether the person lies: the trunk of the pose, z up, or the distribution of the points (n, 3) m is close to
+    horizontal.
 
-    A network that has seen few people lie draws a person standing in points that lie.
+    The points are tested too, since a network trained on few lying people predicts a standing pose for them.
     """
     if len(points) and (np.ptp(points[:, :2], axis=0) < _TIGHT).all():
         spread = points.std(0)
@@ -147,7 +151,7 @@ def is_lying(pose: Pose, points: np.ndarray) -> bool:
 
 
 def box_units(scan: Scan, people: Poses) -> str | None:
-    """All boxes, or some of them, have sizes of other units than meters."""
+    """The sizes of all or some boxes are not in meters."""
     boxes = scan.boxes or []
     warnings = [(str(person.id), unit_warning(box.size, what="it")) for person, box in zip(people, boxes, strict=True)]
     warnings = [(name, warning) for name, warning in warnings if warning]
@@ -159,7 +163,7 @@ def box_units(scan: Scan, people: Poses) -> str | None:
 
 
 def empty_boxes(scan: Scan, people: Poses) -> str | None:
-    """No box holds enough points: boxes and points are of different frames or units."""
+    """No box contains enough points: boxes and points are in different frames or units."""
     if any(person.num_points >= MIN_POINTS for person in people):
         return None
     low, high = scan.points.min(0), scan.points.max(0)
@@ -172,7 +176,7 @@ def empty_boxes(scan: Scan, people: Poses) -> str | None:
 
 
 def wide_boxes(scan: Scan, people: Poses) -> str | None:
-    """Boxes are wider than tall: their sizes are in another order."""
+    """Boxes are wider than tall: their sizes are in the wrong order."""
     sizes = np.array([box.size for box in scan.boxes or []])
     width, height = np.median(sizes[:, :2].max(1)), np.median(sizes[:, 2])
     if height >= _TALL_TO_WIDE * width:
@@ -181,14 +185,15 @@ def wide_boxes(scan: Scan, people: Poses) -> str | None:
 
 
 def boxes_at_feet(scan: Scan, people: Poses) -> str | None:
-    """People begin at the centers of their boxes: the centers are at the feet."""
+    """The points of people start at the centers of their boxes: the centers are at the feet."""
     boxes, points = scan.level_boxes(), scan.box_points()
     heights = _heights(boxes, points, scan.rows)
     if (heights < _GROUND).sum() > _ELSEWHERE * len(heights):
         return None
     raised_boxes = [replace(box, center=box.center + [0, 0, box.size[2]]) for box in boxes]
     raised_heights = 1 + _heights(raised_boxes, points, rows_inside(raised_boxes, points))
-    # a ceiling leaves room above the box, a tree goes on above the head
+    # points above the raised boxes rule this out: a tree continues above the head, while a ceiling leaves a gap above
+    # the box
     trunk_count, sky_count = (raised_heights < _CHEST).sum(), (raised_heights > _TOP).sum()
     if trunk_count < max(_FEWEST, len(heights) / 4) or sky_count > _ELSEWHERE * len(raised_heights):
         return None
@@ -202,13 +207,13 @@ SCAN_CHECKS: tuple[Callable[[Scan, Poses], str | None], ...] = (box_units, empty
 
 
 def check_scan(scan: Scan, people: Poses) -> list[str]:
-    """The warnings of all checks. people: in the level frame, in the order of the scan's clouds."""
+    """Runs all checks and returns their warnings. people: in the level frame, in the order of `Scan.clouds`."""
     if not len(scan.points):
         return []
-    # boxes that were found are nobody's fault, and the axes were looked at before
+    # detected boxes need no check, and detection has already checked the axes
     is_given = scan.detected_rows is None
     warnings = {check: check(scan, people) for check in SCAN_CHECKS if scan.boxes and is_given}
-    # one wrong axis is one warning, and people who are cut short by their boxes only seem to lie
+    # warn of a wrong axis only once; people who are cut off by wrong boxes only appear to lie
     axis = flat_along_another_axis(scan) if is_given else None
     if not (axis or warnings.get(wide_boxes) or warnings.get(boxes_at_feet)):
         axis = all_lying(scan, people)
@@ -216,7 +221,7 @@ def check_scan(scan: Scan, people: Poses) -> list[str]:
 
 
 def origin_warning(scan: Scan) -> str | None:
-    """The sensor is farther from the boxes than a LiDAR sees people."""
+    """The sensor is farther from the boxes than a LiDAR can see people."""
     if scan.origin is None or not scan.boxes:
         return None
     distance = float(np.median([np.linalg.norm(box.center - scan.origin) for box in scan.boxes]))
@@ -230,7 +235,8 @@ def origin_warning(scan: Scan) -> str | None:
 
 
 def scan_unit_warning(points: np.ndarray, count: int) -> str | None:
-    """What is likely wrong where the points (n, 3) of a whole scan of `count` points, z up, are not in meters."""
+    """The points (n, 3) of a whole scan, z up, are not in meters. count: number of points, also if some were thinned
+    out."""
     extent = _extent(points)
     width, largest = float(extent[:2].max()), float(extent.max())
     if largest < _SMALLEST_SCAN:
@@ -242,7 +248,7 @@ def scan_unit_warning(points: np.ndarray, count: int) -> str | None:
 
 
 def unlikely_origin(points: np.ndarray, origin: np.ndarray) -> str | None:
-    """A sensor at origin (3,) m cannot have seen the points (n, 3) m of a whole scan, z up."""
+    """A sensor at origin (3,) m cannot have recorded the points (n, 3) m of a whole scan, z up."""
     distance = np.hypot(*(points[:, :2] - origin[:2]).T)
     near_heights = points[distance < _BELOW_SENSOR, 2]
     nearest_distance = np.hypot(distance, points[:, 2] - origin[2]).min()
@@ -256,9 +262,9 @@ def unlikely_origin(points: np.ndarray, origin: np.ndarray) -> str | None:
 
 
 def flat_axis(points: np.ndarray) -> str | None:
-    """points (n, 3) m of a whole sweep -> the axis that they hardly extend along, "x", "y" or "z": its up axis.
+    """points (n, 3) m of a whole sweep -> "x", "y" or "z", the axis with by far the smallest extent: the up axis.
 
-    None where no axis stands out, as in a small room.
+    None if no axis stands out, as in a small room.
     """
     extent = _extent(points)
     axis = int(np.argmin(extent))
@@ -267,7 +273,7 @@ def flat_axis(points: np.ndarray) -> str | None:
 
 
 def flat_along_another_axis(scan: Scan) -> str | None:
-    """The points of the whole scan hardly extend along another axis than the one said to be up."""
+    """The points of the whole scan have by far the smallest extent along an axis other than the given up axis."""
     axis = flat_axis(scan.points)
     if axis is None or axis == scan.upright_axis:
         return None
@@ -275,7 +281,7 @@ def flat_along_another_axis(scan: Scan) -> str | None:
 
 
 def all_lying(scan: Scan, people: Poses) -> str | None:
-    """Everybody lies down, as where another axis is up. people: in the level frame."""
+    """All people lie, which suggests another up axis. people: in the level frame."""
     posed_people = [(person.pose, person.points) for person in people if person.pose is not None]
     if not posed_people or not all(is_lying(pose, points) for pose, points in posed_people):
         return None
@@ -285,23 +291,23 @@ def all_lying(scan: Scan, people: Poses) -> str | None:
 
 
 def rows_inside(boxes: list[Box], points: np.ndarray) -> list[np.ndarray]:
-    """points (n, 3) m, z up -> of each `Box` the rows (k,) of the points in it, ascending."""
+    """points (n, 3) m, z up -> for each `Box`, the rows (k,) of the points inside it, ascending."""
     centers = np.array([box.center for box in boxes]).reshape(-1, 3)
-    # twice what a corner reaches, whatever the yaw
+    # twice the distance from the center to a corner, for any yaw
     reach = np.array([np.hypot(*box.size[:2]) for box in boxes])
     near_rows = rows_near(centers, points, reach)
     return [rows[box.contains(points[rows])] for box, rows in zip(boxes, near_rows, strict=True)]
 
 
 def _heights(boxes: list[Box], points: np.ndarray, rows: list[np.ndarray]) -> np.ndarray:
-    """(k,): how high above the centers of their boxes, in those boxes' heights, points lie."""
+    """(k,): heights of the points inside boxes above the box centers, relative to the box heights."""
     return np.concatenate(
         [(points[box_rows, 2] - box.center[2]) / box.size[2] for box, box_rows in zip(boxes, rows, strict=True)]
     )
 
 
 def _extent(points: np.ndarray) -> np.ndarray:
-    """(3,) m: how far most of a scan's points (n, 3) m reach along each axis, by enough of them."""
+    """(3,) m: extent along each axis between the percentiles `_MOST` of a scan's points (n, 3) m, subsampled."""
     low, high = np.percentile(points[:: -(-len(points) // _ENOUGH)], _MOST, axis=0)
     return high - low
 

@@ -1,5 +1,5 @@
-"""`detect`: the people in a whole scan. The detector scores places where somebody may stand, the verifier says which of
-the best are people, and the default network poses these.
+"""`detect`: finds the people in a whole scan. The detector scores candidate positions, the verifier classifies the best
+of them, and the default pose network poses the verified people to fit their boxes.
 
 Legend: D detections.
 """
@@ -29,24 +29,24 @@ from lidarpose.sample import MIN_POINTS, Box
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-# detections that may be verified, and posed
+# maximum number of detections that are verified and posed
 MOST_POSED = 60
-# a scan of more points is thinned, of an unknown sensor and of a known one; what is farther away than this beyond the
-# range goes first, m; points looked at in one go, and bins of their distances
+# maximum number of points with an unknown and with a known sensor position; scans with more are thinned. Points more
+# than `_BEYOND` m beyond the range are dropped first. Points processed per chunk, and bins of the distance histogram
 _MOST_POINTS, _MOST_AROUND, _BEYOND = 1_500_000, 400_000, 15.0
 _CHUNK, _DISTANCES = 1_000_000, 4096
-# a smaller share of points that are copies of others changes nothing
+# maximum fraction of duplicate points that may remain
 _FEW_COPIES = 0.01
-# points that tell which way is up
+# number of points used to estimate the up direction
 _ENOUGH_FOR_UP = 250_000
-# less of a scan on its background, as a share, and it is the background of something else
+# minimum fraction of a scan's points on its background; below it, the background belongs to another sensor or frame
 _LEAST_STATIC = 0.2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Search:
-    """How people are searched for, see `detect`. background (k, 3) m: static points in the scan's frame; detector: None
-    for the bundled one."""
+    """Settings of people detection, see `detect`. background (k, 3) m: static points in the scan's frame; detector:
+    None for the bundled one."""
 
     max_range: float = MAX_RANGE
     min_score: float | None = None
@@ -74,27 +74,28 @@ def detect(
     max_people: int | None = None,
     background: "str | os.PathLike | Sequence | ArrayLike | None" = None,
 ) -> Boxes:
-    """The people in a whole scan, surest first, as boxes that `predict` takes.
+    """Detects the people in a whole scan and returns their boxes, highest score first, ready for `predict`.
 
     Args:
-        points: a point file, or (n, 3+) m in any frame.
-        sensor_origin: (x, y, z) m in that frame, or "unknown"; None means 0, 0, 0.
-        up: what is up there, as in `predict`; None means z.
-        columns: values a row of a .bin file.
-        max_range: how far from the sensor people are searched, m, level, None for 40; of an unknown sensor everywhere.
-        min_score: people with a lower score are left out; None for the detector's own, at which about one false person
-            a scan is found.
-        max_people: only so many, the surest.
-        background: what stands still about a sensor that does not move, and is not searched: a file or array (k, 3) m
-            of static points (see `learn_background`), or several scans or a folder of them, of which it is learned.
+        points: path of a point file, or points (n, 3+) m in any frame.
+        sensor_origin: (x, y, z) m, the sensor position in the frame of the points, or "unknown". None means 0, 0, 0.
+        up: up axis of the scan, as in `predict`. None means z.
+        columns: number of values per row of a .bin file.
+        max_range: maximum horizontal distance of people from the sensor, m. None means 40. Ignored if the sensor
+            position is unknown.
+        min_score: score threshold. None means the detector's default, which gives about one false positive per scan.
+        max_people: maximum number of people; those with the highest scores are returned.
+        background: static background of a stationary sensor, in which no people are searched for: a file or an array
+            (k, 3) m of static points, see `learn_background`; or several scans or a folder of scans, from which the
+            background is learned.
 
     Returns:
-        `Boxes` in the frame of the points, each with `score`, the probability that it is a person, and `mounted`,
-        whether the person rides or sits in a wheelchair; `warnings` say what looks wrong about the scan, and `up` is
-        what is up after all, of a tilted sensor a direction.
+        `Boxes` in the frame of the points. Each box has `score`, the probability that it contains a person, and
+        `mounted`, whether the person rides or sits in a wheelchair. `Boxes.warnings` lists problems with the scan.
+        `Boxes.up` is the up axis of the scan, or a direction if the sensor was found to be tilted.
 
     Raises:
-        InputError: a file that cannot be read, or an option of another type.
+        InputError: a file that cannot be read, or an invalid option.
     """
     up = "z" if up is None else up
     rotation_from_up(up)
@@ -120,8 +121,9 @@ def search_options(
     topic: str | None = None,
     meta: str | os.PathLike | None = None,
 ) -> Search:
-    """A search with its background read; max_range None: the default. Raises InputError."""
-    # arrays without axes are numbers too
+    """Validates the options of a search and reads its background. max_range: None for the default. Raises
+    InputError."""
+    # accept arrays with zero dimensions as numbers
     min_score, max_range, max_people = (
         value.item() if getattr(value, "shape", None) == () else value for value in (min_score, max_range, max_people)
     )
@@ -133,29 +135,32 @@ def search_options(
 
 
 def find_people(scan: Scan, search: Search) -> Scan:
-    """The scan with the boxes of the people in it, surest first, `detected_rows`, and what looks wrong among its
-    warnings; without the place of a sensor that cannot have been there, and with the direction that is up after all."""
+    """Detects and verifies the people in a scan.
+
+    Returns the scan with their boxes, highest score first, with `detected_rows` and with warnings about the scan.
+    `origin` is None if the given sensor position is impossible, and `up` is corrected if the scan is tilted.
+    """
     return verify_people(detect_places(scan, search), search)
 
 
 def search_alone(scan: Scan, search: Search) -> Scan:
-    """`find_people` of a scan that is no frame of a recording, with `other_up_axis` where nobody is found."""
+    """`find_people` for a single scan. If no people are found, it also tries `other_up_axis`."""
     places = detect_places(scan, search)
     result = verify_people(places, search)
     if result.boxes or not (hint := other_up_axis(places, search)):
         return result
-    # what else looks odd follows from the axis
+    # other warnings of the search would follow from the wrong axis
     return replace(result, warnings=(*scan.warnings, hint))
 
 
 def other_up_axis(places: "DetectedScan", search: Search) -> str | None:
-    """A scan in which nobody was found -> a line for the user where people are found with another axis up."""
+    """For a scan without people: a warning for the user if people are found with another up axis, else None."""
     input_scan, detections = places.given, places.detections
     if detections is None or detections.has_ground and flat_axis(places.scan.points) == input_scan.upright_axis:
         # outdoors: the axis is right
         return None
     if scan_unit_warning(places.level, len(input_scan.points)) and not flat_along_another_axis(places.scan):
-        # in other units nobody is found with any axis up
+        # in wrong units, no people are found with any up axis
         return None
     other_axes = [up for up in UP_AXES if up != input_scan.up]
     boxes = {up: find_people(replace(input_scan, up=up), search).boxes or [] for up in other_axes}
@@ -168,8 +173,11 @@ def other_up_axis(places: "DetectedScan", search: Search) -> str | None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DetectedScan:
-    """A scan in which people were detected, but not verified: as given, and as it is searched; its points in the level
-    frame (n, 3) m; the detections there, None of a scan without points; moving (n,) bool, where a background is known.
+    """A scan with detections that are not yet verified.
+
+    given: the scan as given, thinned; scan: the scan as it was searched; level (n, 3) m: its points in the level frame;
+    detections: in the level frame, None for a scan without points; moving (n,) bool: points off the background, None
+    without a background.
     """
 
     given: Scan
@@ -180,7 +188,7 @@ class DetectedScan:
 
 
 def detect_places(scan: Scan, search: Search) -> DetectedScan:
-    """The first half of `find_people`, which depends on no other frame."""
+    """The first half of `find_people`, which does not depend on other frames of a recording."""
     full_scan, count = scan, len(scan.points)
     input_scan, notes = _thinned(scan, search)
     input_scan = replace(input_scan, points=_distinct(input_scan.points))
@@ -189,7 +197,7 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
         scan = replace(scan, warnings=(*warnings, f"under {MIN_POINTS} points"))
         return DetectedScan(given=input_scan, scan=scan, level=scan.points, detections=None)
     level = _leveled(scan)
-    # what else looks odd follows from wrong axes or units
+    # a warning of wrong axes or units suppresses others that would only follow from it
     if frame_warning := flat_along_another_axis(scan):
         warnings.append(frame_warning)
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
@@ -204,11 +212,11 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
         scan = replace(scan, up=up_text(up @ scan.R_level_input))
         level = _leveled(scan)
         origin = None if scan.origin is None else scan.R_level_input @ scan.origin
-    # level: a scan that leans is as tall as one in other units
+    # check units in the level frame: a tilted scan is as tall as one in wrong units
     if not frame_warning and (frame_warning := scan_unit_warning(level, count)):
         warnings.append(frame_warning)
     if origin is not None and (warning := unlikely_origin(level, origin)):
-        # from the beginning: of an unknown sensor other points are kept, and what is up is told by others
+        # start again: with an unknown sensor, thinning keeps other points, and other points determine the up direction
         scan_warnings = full_scan.warnings if frame_warning else (*full_scan.warnings, warning)
         return replace(detect_places(replace(full_scan, origin=None, warnings=scan_warnings), search), given=input_scan)
     is_moving = None
@@ -232,12 +240,12 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
 
 
 def verify_people(places: DetectedScan, search: Search, known: KnownPlaces | None = None) -> Scan:
-    """The second half of `find_people`. known: of a recording's frames before; with it the scan has `pelvises`,
-    `verified` and `rejected`, too."""
+    """The second half of `find_people`. known: people and rejected positions from earlier frames of a recording; with
+    it, the returned scan also has `pelvises`, `verified` and `rejected`."""
     scan, input_scan, detections = places.scan, places.given, places.detections
     if detections is None:
         return replace(scan, boxes=[], detected_rows=[])
-    # the boxes of a frame that leans are larger than their people: these are looked for anew
+    # boxes of a tilted scan are larger than the people in them and cannot be reused, so people are detected again
     is_tilted = not np.allclose(input_scan.R_boxes_input, scan.R_level_input)
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     known_level = None if known is None or is_tilted else known.level(scan.R_level_input)
@@ -266,14 +274,14 @@ def verify_people(places: DetectedScan, search: Search, known: KnownPlaces | Non
 
 
 def least_score(search: Search) -> float:
-    """The score below which detections are left out."""
+    """The score threshold of a search."""
     if search.min_score is not None:
         return search.min_score
     return float((search.detector or _detector()).header["default_score"])
 
 
 def detector_version() -> str:
-    """Of the bundled detector."""
+    """The version of the bundled detector."""
     return str(_detector().header["version"])
 
 
@@ -286,15 +294,16 @@ def _detector() -> Detector:
 
 
 def _thinned(scan: Scan, search: Search) -> tuple[Scan, list[str]]:
-    """The scan with about `_MOST_AROUND` points, and a note where more than what is dense is thinned.
+    """The scan thinned to about `_MOST_AROUND` points, with a warning if points are thinned over the whole range.
 
-    Around a sensor what is beyond the range goes, and of what is nearer than some distance so much that nobody has
-    fewer points than a person has who stands there. Of an unknown sensor `_MOST_POINTS` stay, drawn evenly.
+    With a known sensor, points beyond the range are dropped, and points nearer than some distance are thinned so that
+    people there keep as many points as a person at that distance has. With an unknown sensor, `_MOST_POINTS` points are
+    drawn uniformly.
     """
     points, origin, count = scan.points, scan.origin, len(scan.points)
     if count <= (_MOST_POINTS if origin is None else _MOST_AROUND):
         return scan, []
-    # in pieces: of 10^8 points a row of numbers more would take a gigabyte
+    # in chunks: for 10^8 points, another array of one number per point would take a gigabyte
     pieces = [slice(start, start + _CHUNK) for start in range(0, count, _CHUNK)]
     squared_reach, num_searched, squared_dense_range = (search.max_range + _BEYOND) ** 2, count, None
     if origin is not None:
@@ -319,7 +328,7 @@ def _thinned(scan: Scan, search: Search) -> tuple[Scan, list[str]]:
 
 
 def _distinct(points: np.ndarray) -> np.ndarray:
-    """Points (n, 3) m without copies: a second return is mostly the first one again, and the detector counts points."""
+    """Points (n, 3) m without duplicates: second returns mostly repeat the first, and the detector counts points."""
     factors = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)
     keys = np.zeros(len(points), np.uint64)
     for axis, factor in zip(np.ascontiguousarray(points.T, np.float64).view(np.uint64), factors, strict=True):
@@ -338,9 +347,10 @@ def _squared(points: np.ndarray, origin: np.ndarray) -> np.ndarray:
 
 
 def _dense_below(histogram: np.ndarray, squared_reach: float) -> float:
-    """The squared distance, m2, up to which points stay in proportion to their own, so that `_MOST_AROUND` stay.
+    """The squared distance, m2, below which points are kept with a probability proportional to their squared distance,
+    so that `_MOST_AROUND` points remain.
 
-    histogram: of all squared distances up to `squared_reach`, m2.
+    histogram: counts of the squared distances of all points up to `squared_reach`, m2.
     """
     edges = np.linspace(0, squared_reach, len(histogram) + 1)
     weighted_counts = np.cumsum(histogram * (edges[1:] + edges[:-1]) / 2)
@@ -350,14 +360,14 @@ def _dense_below(histogram: np.ndarray, squared_reach: float) -> float:
 
 
 def _leveled(scan: Scan) -> np.ndarray:
-    """The scan's points (n, 3) m in the level frame, one axis after the other in memory."""
+    """The scan's points (n, 3) m in the level frame, column-major in memory."""
     R_level_input = scan.R_level_input
     columns = np.ascontiguousarray(scan.points.T)
     return (columns if np.array_equal(R_level_input, np.eye(3)) else R_level_input @ columns).T
 
 
 def _near(points: np.ndarray, origin: np.ndarray | None, search: Search) -> np.ndarray:
-    """Enough of the points (n, 3) m that may lie under the people searched for."""
+    """A subsample of points (n, 3) m within the range of the search, for the estimate of the up direction."""
     rows = np.arange(len(points))
     if origin is not None:
         squared = (points[:, 0] - origin[0]) ** 2 + (points[:, 1] - origin[1]) ** 2
@@ -368,12 +378,12 @@ def _near(points: np.ndarray, origin: np.ndarray | None, search: Search) -> np.n
 
 
 def _in_input(box: Box, scan: Scan, input_scan: Scan) -> Box:
-    """A level box as a box of the input, along the axis that `input_scan` says is up. In a frame that leans it is
-    larger, so that it still holds the person."""
+    """A box in the level frame as a box in the input frame, upright along the up axis of `input_scan`. If the scan is
+    tilted, the box is enlarged so that it still contains the person."""
     R_boxes_level = input_scan.R_boxes_input @ scan.R_level_input.T
     center, size, yaw = R_boxes_level @ box.center, box.size, box.yaw
     if not np.allclose(R_boxes_level, np.eye(3)):
-        # the level frame of a tilted sensor is turned about its up axis, too, where the input's is not z
+        # if the input's up axis is not z, the level frame of a tilted sensor is also rotated about its up axis
         forward = R_boxes_level @ [np.cos(box.yaw), np.sin(box.yaw), 0]
         yaw = float(np.arctan2(forward[1], forward[0]))
         size = np.abs(rotation_about("z", yaw).T @ R_boxes_level @ rotation_about("z", box.yaw)) @ box.size

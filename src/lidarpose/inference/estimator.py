@@ -1,6 +1,7 @@
-"""`PoseEstimator`: from people's points to poses: batches, the pass that finds the pelvis, test-time augmentation.
+"""`PoseEstimator`: predicts poses from the points of people, in batches, with a first pass that finds the pelvis and
+with test-time augmentation.
 
-Legend: N clouds, B those of a batch.
+Legend: N clouds, B clouds of a batch.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,26 +19,31 @@ from lidarpose.models.voxelize import WINDOW
 from lidarpose.progress import Progress
 from lidarpose.sample import MIN_POINTS, PER_JOINT, PER_PERSON, Pose, center_of
 
-# to which the center of the second pass is rounded, m: backends differ by less than a micrometer, which must not move a
-# point to another voxel
+# decimals, in m, to which the centers of the second pass are rounded: backends differ by less than a micrometer, which
+# must not move a point to another voxel
 _CENTER_DECIMALS = 2
 _CENTER_STEP = 10**-_CENTER_DECIMALS
-# a cloud shows two people above this probability
+# `second_person` above which a cloud is centered on its box
 _TWO_PEOPLE = 0.2
 
 
 class PoseEstimator:
-    """A network, and how its answers become poses. decode, tta: as of `load`.
+    """Runs a network and decodes its outputs into poses.
 
-    The first pass finds the pelvis, on which the others are centered. The package's own networks see the person
-    mirrored in it, and its answer is averaged with the others': nearly as good as a mirrored pass of its own. The
-    paper's networks are run as released.
+    The first pass finds the pelvis, on which the following passes are centered. With the package's own networks, the
+    first pass sees the person mirrored and its pose is averaged with the others, which is nearly as good as a separate
+    mirrored pass. The paper's networks are run as released.
+
+    Args:
+        backend: runs the network.
+        decode: heatmap decoder, see `load`.
+        tta: number of test-time augmentation transforms, see `load`.
     """
 
     def __init__(self, backend: Backend, *, decode: str = "window", tta: int = 1):
         self.backend, self.header, self.skeleton = backend, backend.header, backend.header.skeleton
         self._decoder, self._tta = decoder(decode), tta_transforms(tta)
-        # of the first pass: how a person is shown, and whether its answer counts
+        # whether the pose of the first pass is averaged with the others, and the transform of the first pass
         self._averaged = self.header.network == NetworkConfig.kind
         self._first = MIRRORED if self._averaged else IDENTITY
         self._middle = list(self.skeleton.middle)
@@ -49,8 +55,17 @@ class PoseEstimator:
         origin: np.ndarray | None,
         clip: Clips | None = None,
     ) -> Pose:
-        """What the network says of clouds (n, 3) m seen about centers (B, 3), from a sensor at origin (3,) or None;
-        clip: of networks of clips, which of the clouds are frames of one person."""
+        """A single forward pass.
+
+        Args:
+            clouds: B clouds (n, 3) m.
+            centers: (B, 3) m, the origins of the persons' frames.
+            origin: (3,) m, the sensor position, None if unknown.
+            clip: for networks that read clips: which clouds are frames of the same person.
+
+        Returns:
+            Poses of B people relative to `centers`.
+        """
         return self._transformed(IDENTITY, clouds, centers, origin, clip)
 
     def _transformed(self, transform: TTATransform, clouds, centers, origin, clip) -> Pose:
@@ -72,9 +87,19 @@ class PoseEstimator:
         box_centers: np.ndarray | None = None,
         progress: bool = False,
     ) -> list[Pose | None]:
-        """The pose of each cloud (n, 3) m, None where too little of it is near its middle, and, of clips, where it is
-        in none; centers (N, 3) m: about where the pelvises are, where they need not be found; box_centers (N, 3) m:
-        who is meant where a cloud shows two people."""
+        """Poses of N clouds.
+
+        Args:
+            clouds: N clouds (n, 3) m.
+            origin: (3,) m, the sensor position, None if unknown.
+            clips: for networks that read clips: which clouds are frames of the same person.
+            centers: (N, 3) m, approximate pelvis positions; with them, the first pass is skipped.
+            box_centers: (N, 3) m; if a cloud shows two people, the one nearer to the box center is posed.
+            progress: whether to show a progress bar.
+
+        Returns:
+            One pose per cloud; None if too few points are near the center, or if the cloud is in no window of `clips`.
+        """
         poses: list[Pose | None] = [None] * len(clouds)
         centers = None if centers is None else np.round(centers, _CENTER_DECIMALS)
         count = 0
@@ -92,8 +117,8 @@ class PoseEstimator:
     def _batches(
         self, clouds: Sequence[np.ndarray], clips: Clips | None
     ) -> Iterator[tuple[Sequence[int], Clips | None]]:
-        """Rows of clouds, and which of those are frames of one person. People of like size go together: a batch costs
-        as much as if all were its largest."""
+        """Yields the rows of each batch of clouds, with the clips of these rows. Clouds of similar size share a batch,
+        since a batch costs as much as if all its clouds were as large as the largest."""
         count = self.backend.batch
         if clips is not None:
             yield from ((rows.tolist(), clip) for rows, clip in clips.batches(count))
@@ -116,7 +141,7 @@ class PoseEstimator:
             if box_centers is not None and first_pass.second_person is not None:
                 centers, first_pass = self._recenter_on_boxes(clouds, centers, box_centers, origin, first_pass)
             root = first_pass.joints[:, self._middle].mean(1)
-            # an answer that is no number stays one
+            # NaN stays NaN
             shift = np.round(np.clip(root, -WINDOW / 2, WINDOW / 2) / _CENTER_STEP) * _CENTER_STEP
             centers, first_pass = centers + shift, replace(first_pass, joints=first_pass.joints - shift[:, None])
         tta_poses = [self._transformed(transform, clouds, centers, origin, clip) for transform in self._tta]
@@ -140,8 +165,8 @@ class PoseEstimator:
         origin: np.ndarray | None,
         first_pass: Pose,
     ) -> tuple[np.ndarray, Pose]:
-        """Centers and first answers, those of clouds that show two people about the centers of their boxes: who is
-        nearer to them is meant."""
+        """Repeats the first pass around the box centers for clouds that show two people, so that the person nearer to
+        the box center is posed. Returns the centers and poses of all B clouds."""
         assert first_pass.second_person is not None
         rows = np.flatnonzero(first_pass.second_person > _TWO_PEOPLE)
         if not len(rows):

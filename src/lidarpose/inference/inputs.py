@@ -1,4 +1,4 @@
-"""From a user's cloud to one person's points: what an array must be, and where the person may stand."""
+"""Input validation and cleaning: from a user's point cloud to the points of one person."""
 
 import os
 import reprlib
@@ -16,37 +16,37 @@ from lidarpose.io.files import FormatError, one_line
 from lidarpose.io.text import is_image, is_transposed, pick_xyz
 from lidarpose.sample import CLIP_FRAMES, FARTHEST, MIN_POINTS, center_of, clip_windows, within_reach
 
-# frames a second of a clip without times
+# frames per second of a clip without times
 CLIP_RATE = 10.0
-# a person of more points is thinned: no sensor sees so many, and no voxel needs them
+# people with more points are thinned: no sensor records that many, and the voxels do not need them
 MAX_POINTS = 50_000
 
-# people are not recognized in coordinates that are rounded to more, m; points of a large scan that say how large its
-# coordinates are
+# rounding of coordinates, m, from which people are not recognized; number of points from which the magnitude of a large
+# scan's coordinates is estimated
 _COARSE, _LOOKED_AT = 0.1, 100_000
 
-# a crop wider than this may hold more than a person, so people are looked for in it, m
+# a crop wider than this, m, may contain more than one person, so candidates are searched in it
 _TIGHT = 2.0
-# they are looked for at most this far from the middle of the crop, in cells of this size, m
+# maximum distance of candidates from the middle of the crop, and size of the grid cells, m
 _SEARCH, _CELL = 10.0, 0.1
-# from above the ground to a raised arm, m
+# height range from above the ground to a raised hand, m
 _ABOVE_GROUND, _REACH = 0.25, 2.3
-# in cells: a trunk fits in the column, and around a person the ring is emptier than beside a wall
+# inner and outer radius in cells: the column contains a trunk; the ring is emptier around a person than beside a wall
 _COLUMN, _RING = (0.0, 2.0), (3.5, 5.0)
-# what fills a ring speaks against a column half as much as what fills the column speaks for it
+# weight of the heights filled in the ring, subtracted from the heights filled in the column
 _RING_WEIGHT = 0.5
-# columns a crop, m from one to the next, and m around each that a person takes
+# number of columns per crop, minimum distance between them, m, and radius around each that contains the person, m
 _COLUMNS, _APART, _AROUND = 3, 0.6, 0.75
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Clips:
-    """Which of N clouds are frames of one person that follow each other, for networks of clips.
+    """Which of N clouds are consecutive frames of the same person, for networks that read clips.
 
     Args:
-        windows: (C, 16) int, rows of the clouds; a row may repeat in its window, and is in no other.
-        background, neighbors: (N,) clouds (n, 3) m about each frame's person, as in `Sample`, in the clouds' frame; by
-            default none.
+        windows: (C, 16) int, rows of the clouds. A row may repeat within its window but is in no other window.
+        background, neighbors: (N,) clouds (n, 3) m around the person of each frame, as in `Sample`, in the frame of the
+            clouds; None for none.
     """
 
     windows: np.ndarray
@@ -55,12 +55,12 @@ class Clips:
 
     @classmethod
     def of_run(cls, count: int, **clouds: Sequence[np.ndarray]) -> "Clips":
-        """So many clouds, all frames of one person in order of time."""
+        """Clips of `count` clouds that are all frames of one person, in temporal order."""
         return cls(windows=clip_windows(np.arange(count)), **clouds)
 
     def checked(self, count: int) -> "Clips":
-        """The same, of so many clouds. Raises InputError where these are not each in one window, or other clouds are
-        not as many."""
+        """The validated clips of `count` clouds. Raises InputError unless each cloud is in exactly one window and
+        `background` and `neighbors` have one cloud per frame."""
         windows = np.asarray(self.windows)
         rows = [row for window in windows for row in np.unique(window).tolist()]
         if windows.ndim != 2 or windows.shape[1] != CLIP_FRAMES or sorted(rows) != list(range(count)):
@@ -78,7 +78,7 @@ class Clips:
         return replace(self, windows=windows, **surroundings)
 
     def around(self, rows: np.ndarray) -> dict[str, list[np.ndarray]]:
-        """The clouds about the persons of some rows, by name."""
+        """The clouds `background` and `neighbors` of the given rows, by name; empty clouds where there are none."""
         clouds = {"background": self.background, "neighbors": self.neighbors}
         return {
             name: [np.zeros((0, 3)) if person_clouds is None else np.asarray(person_clouds[row], float) for row in rows]
@@ -86,14 +86,14 @@ class Clips:
         }
 
     def mapped(self, change: Callable[[list[np.ndarray]], list[np.ndarray]]) -> "Clips":
-        """With the clouds about the persons changed."""
+        """The same clips with `change` applied to `background` and `neighbors`."""
         rows = np.arange(1 + self.windows.max())
         surroundings = self.around(rows)
         return replace(self, background=change(surroundings["background"]), neighbors=change(surroundings["neighbors"]))
 
     def usable(self, keep: np.ndarray) -> "Clips":
-        """Of windows the rows that are to be kept (N,) bool, the next or the last one filling up for each other;
-        windows without any are gone."""
+        """The windows with only the rows to keep (N,) bool. Each dropped row is replaced by the next kept row of its
+        window, or the last one; windows without kept rows are removed."""
         windows = []
         for window in self.windows:
             positions = np.flatnonzero(keep[window])
@@ -104,23 +104,23 @@ class Clips:
         return replace(self, windows=np.array(windows, int).reshape(-1, CLIP_FRAMES))
 
     def batches(self, count: int) -> Iterator[tuple[np.ndarray, "Clips"]]:
-        """So many windows at a time: rows (n,) of their clouds, and the clips of these alone."""
+        """Yields batches of `count` windows: the rows (n,) of their clouds, and the clips of these rows only."""
         for start in range(0, len(self.windows), count):
             rows, local_rows = np.unique(self.windows[start : start + count], return_inverse=True)
             yield rows, Clips(windows=local_rows.reshape(-1, CLIP_FRAMES), **self.around(rows))
 
 
 def as_points(points: Any, what: str = "points") -> np.ndarray:
-    """Anything array-like (n, 3+), or a table or records with columns x, y, z, as (n, 3) float64.
+    """Converts anything array-like (n, 3+), or a table or record array with columns x, y, z, to (n, 3) float64.
 
-    Raises InputError for another shape or type; n = 0 is legal.
+    Raises InputError for other shapes or types; n = 0 is legal.
     """
     if isinstance(points, str | os.PathLike):
         raise InputError(f"{what} must be an (n, 3) array, got a path: use lidarpose.predict({str(points)!r})")
     is_records = getattr(getattr(points, "dtype", None), "names", None) is not None
     points = _by_name(points, what)
     try:
-        # masked is no point
+        # `to_numpy` sets masked values to NaN, which are dropped later
         array = np.asarray(to_numpy(points))
     except (ValueError, TypeError) as error:
         raise InputError(f"{what} must be an (n, 3) array of numbers, got rows of unequal length ({error})") from None
@@ -135,7 +135,7 @@ def as_points(points: Any, what: str = "points") -> np.ndarray:
         raise InputError(f"{what} must be an (n, 3) array of numbers, got {array.dtype} of shape {array.shape}")
     looks_transposed, looks_depth = is_transposed(array.shape), is_image(array.shape)
     if array.ndim == 3 and array.shape[2] >= 3:
-        # a scan in rows of beams, or several people: only the caller knows
+        # may be a scan organized by beams or several people: only the caller knows
         one_scan = "ravel()" if is_records else f"reshape(-1, {array.shape[2]})"
         raise InputError(
             f"expected (n, 3 or more) {what}, got {array.shape}: one scan is points.{one_scan}, several people "
@@ -149,7 +149,7 @@ def as_points(points: Any, what: str = "points") -> np.ndarray:
 
 
 def _by_name(points: Any, what: str) -> Any:
-    """The columns x, y and z of a table (pandas, polars) or of records, wherever they stand; anything else as it is."""
+    """The columns x, y and z of a table (pandas, polars) or record array, in any position; other inputs unchanged."""
     names = getattr(getattr(points, "dtype", None), "names", None) or getattr(points, "columns", None)
     if names is None or not len(names) or not all(isinstance(name, str) for name in names):
         return points
@@ -157,17 +157,17 @@ def _by_name(points: Any, what: str) -> Any:
         columns = [points[names[i]] for i in pick_xyz(names)]
         return (np.ma if isinstance(points, np.ma.MaskedArray) else np).stack(columns, -1)
     except (FormatError, ValueError) as problem:
-        # two columns of one name cannot be told apart
+        # two columns with the same name are ambiguous
         raise InputError(f"{what}: {problem}") from None
 
 
 def clip_times(times: Any, count: int) -> np.ndarray:
-    """(T,) s of so many frames; None is ten a second. Raises InputError for anything but times that increase."""
+    """Times (T,) s of `count` frames; None means ten per second. Raises InputError unless they strictly increase."""
     if times is None:
         return np.arange(count) / CLIP_RATE
     try:
         seconds = np.asarray(times)
-        # dates and their differences would be taken for seconds, whatever their unit
+        # reject dates and time differences, which would be read as seconds whatever their unit
         is_date = seconds.dtype.kind in "mM" or not all(isinstance(time, Real) for time in seconds.ravel().tolist())
         seconds = np.full(0, np.nan) if is_date else seconds.astype(float)
     except (TypeError, ValueError):
@@ -181,7 +181,7 @@ def clip_times(times: Any, count: int) -> np.ndarray:
 
 
 def as_origin(value: object) -> np.ndarray | None:
-    """The sensor's place (3,) m from three numbers or "x,y,z"; None, also for "unknown". Raises InputError."""
+    """The sensor position (3,) m from three numbers or "x,y,z"; None for None or "unknown". Raises InputError."""
     if value is None or isinstance(value, str) and value.strip() == "unknown":
         return None
     origin = vector_of(value)
@@ -191,7 +191,8 @@ def as_origin(value: object) -> np.ndarray | None:
 
 
 def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """points (n, 3) m as of `only_returns`, at most `MAX_POINTS` of them, and a note for each thing done."""
+    """Drops invalid points of (n, 3) m as `only_returns` does and thins the rest to `MAX_POINTS`. Returns the points
+    and a message for each change."""
     points, notes = _finite_returns(points)
     if len(points) > MAX_POINTS:
         notes.append(
@@ -202,8 +203,9 @@ def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
 
 
 def rounding_warning(points: np.ndarray) -> str | None:
-    """Map coordinates (n, 3) m lost what makes a person where they were stored in 32 bits."""
-    # of most points, whatever a stray one says; some are enough of a large map
+    """A warning if points (n, 3) m are rounded too coarsely to show a person, as large map coordinates in 32 bits
+    are."""
+    # a quantile ignores stray points; a subsample suffices for a large map
     some = np.abs(points[:: max(len(points) // _LOOKED_AT, 1)])
     step = float(np.spacing(np.float32(np.quantile(some, 0.9)))) if len(points) else 0.0
     if step < _COARSE or not np.array_equal(points.astype(np.float32), points):
@@ -215,8 +217,8 @@ def rounding_warning(points: np.ndarray) -> str | None:
 
 
 def only_returns(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
-    """points (n, 3) m without rows that arithmetic would choke on or that are no returns, and a note for each kind, and
-    of rounded coordinates."""
+    """Drops rows of points (n, 3) m that are not finite, too large or not returns. Returns the points and a message for
+    each kind of dropped rows and for rounded coordinates."""
     points, notes = _finite_returns(points)
     return points, [*notes, *filter(None, [rounding_warning(points)])]
 
@@ -226,7 +228,7 @@ def _finite_returns(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     is_usable = within_reach(points)
     if num_dropped := int((~is_usable).sum()):
         notes.append(f"dropped {num_dropped} of {len(points)} points that were NaN, infinite or beyond {FARTHEST:g} m")
-    # so organized clouds fill the pixels that nothing came back from; a single one may be a point of a centered cloud
+    # organized clouds fill pixels without a return with 0, 0, 0; a single zero may be a point of a centered cloud
     is_zero = ~points.any(1)
     if (num_zeros := int(is_zero.sum())) > 1:
         notes.append(f"dropped {num_zeros} of {len(points)} points at 0,0,0, which are no returns")
@@ -235,7 +237,7 @@ def _finite_returns(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
 
 
 def is_few(points: np.ndarray) -> bool:
-    """Whether fewer than `MIN_POINTS` places are among points (n, 3), which may repeat."""
+    """Whether points (n, 3) have fewer than `MIN_POINTS` distinct positions."""
     for _ in range(MIN_POINTS):
         if not len(points):
             return True
@@ -244,10 +246,11 @@ def is_few(points: np.ndarray) -> bool:
 
 
 def candidates(points: np.ndarray) -> list[np.ndarray]:
-    """points (n, 3) m, z up, n >= 1 -> clouds (k, 3) that may be the person, the first being all of them.
+    """points (n, 3) m, z up, n >= 1 -> candidate clouds (k, 3) for the person, the first of which contains all points.
 
-    A crop of a person's width is all person. In a wider one, with ground and clutter, every upright column that fills
-    many heights and has room around it may be one too; which it is, the network's confidence tells.
+    A crop as narrow as a person has only this candidate. In a wider crop with ground and clutter, upright columns that
+    are filled at many heights and have free space around them are candidates too. The network's confidence then decides
+    between the candidates.
     """
     if (np.ptp(points[:, :2], axis=0) < _TIGHT).all():
         return [points]
@@ -273,7 +276,7 @@ def candidates(points: np.ndarray) -> list[np.ndarray]:
             break
         column_points = upper_points[_distance(upper_points, places[best_index]) < _AROUND / 2]
         middle = center_of(column_points)[:2] if len(column_points) else places[best_index]
-        # without the trees above
+        # drop what is above the person, such as trees
         cloud = points[(_distance(points, middle) < _AROUND) & (points[:, 2] < ground + _REACH)]
         if len(cloud) >= MIN_POINTS:
             clouds.append(cloud)
@@ -282,7 +285,7 @@ def candidates(points: np.ndarray) -> list[np.ndarray]:
 
 
 def _heights(grid: np.ndarray, inner: float, outer: float) -> np.ndarray:
-    """grid (X, Y, Z) bool -> (X, Y): at how many heights any cell `inner` to `outer` cells away is filled."""
+    """grid (X, Y, Z) bool -> (X, Y): number of heights at which any cell `inner` to `outer` cells away is filled."""
     reach = int(outer)
     x, y, _ = grid.shape
     padded_grid = np.pad(grid, ((reach, reach), (reach, reach), (0, 0)))

@@ -1,4 +1,4 @@
-"""What the frames of a recording before say of where people are, and are not, in a scan.
+"""Positions in a scan where people are expected, or were rejected, according to earlier frames of a recording.
 
 Legend: D detections, K people who need no verification, M tracks, R places.
 """
@@ -10,23 +10,23 @@ import numpy as np
 
 from lidarpose.sample import Box
 
-# a detection so near to where somebody is expected is that person, m, if no other is expected within the second
-# distance
+# maximum distance, m, between a detection and the expected position of the known person that it is matched to, if no
+# other person is expected within the second distance
 _EXPECTED, _ALONE = 0.5, 1.0
-# a place that held nobody is not looked at again for a while, so far about it, m
+# radius, m, around a rejected position in which detections are not verified again for a while
 _SAME_PLACE = 0.3
-# the least score where a track is expected
+# score threshold near the expected position of a track
 WEAK_SCORE = 0.1
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class KnownPlaces:
-    """What the frames before say of a scan, in its frame.
+    """Knowledge from earlier frames about a scan, in the frame of the scan.
 
-    boxes: of the K people who need no verification, where they are expected, with the scores they had when they were
-    verified; pelvises (K, 3) m; tracks (M, 3) m: where anybody is expected, the K first, within reach (M,) m: who is
-    not found there is searched for among detections of `WEAK_SCORE` or more; rejected (R, 3) m: places of detections
-    that were nobody.
+    boxes: expected boxes of the K people who need no verification, with the scores of their last verification;
+    pelvises (K, 3) m: of these people; tracks (M, 3) m: expected positions of all tracks, the K people first;
+    reach (M,) m: search radius around them: for a track that is not matched, detections of `WEAK_SCORE` or more within
+    it are accepted; rejected (R, 3) m: positions of detections that the verifier rejected.
     """
 
     boxes: Sequence[Box]
@@ -36,15 +36,15 @@ class KnownPlaces:
     rejected: np.ndarray
 
     def level(self, R_level_input: np.ndarray) -> "KnownPlaces":
-        """In the scan's level frame."""
+        """The same places in the scan's level frame."""
         level_points = {name: getattr(self, name) @ R_level_input.T for name in ("pelvises", "tracks", "rejected")}
         return replace(
             self, boxes=[replace(box, center=R_level_input @ box.center) for box in self.boxes], **level_points
         )
 
     def index_of(self, centers: np.ndarray, is_sure: np.ndarray) -> np.ndarray:
-        """Of each detection at centers (D, 3) m, those that are sure enough, which of the K people it is: (D,) int,
-        -1: none."""
+        """(D,) int: for each detection at centers (D, 3) m, the index of the known person (of K) that it is matched to,
+        or -1. is_sure (D,) bool: detections that may be matched."""
         known_index = np.full(len(centers), -1)
         sure_rows = np.flatnonzero(is_sure)
         if len(sure_rows) and self.boxes:
@@ -57,8 +57,8 @@ class KnownPlaces:
         return known_index
 
     def least_scores(self, centers: np.ndarray, known_index: np.ndarray, least_score: float) -> np.ndarray:
-        """(D,): what the score of detections at centers (D, 3) m must be: less where a known person is missed, infinite
-        where it turned out to be nobody."""
+        """(D,): score thresholds for detections at centers (D, 3) m: lower near a track without a matched detection,
+        infinite where the verifier rejected a detection in an earlier frame."""
         thresholds = np.full(len(centers), least_score)
         is_missed = ~np.isin(np.arange(len(self.tracks)), known_index)
         is_near = (_apart(centers, self.tracks[is_missed]) < self.reach[is_missed]).any(1)
@@ -69,5 +69,5 @@ class KnownPlaces:
 
 
 def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Level distances of a (A, 2+) from b (B, 2+): (A, B) m."""
+    """(A, B) m: horizontal distances between a (A, 2+) and b (B, 2+)."""
     return np.linalg.norm(a[:, None, :2] - b[None, :, :2], axis=-1)

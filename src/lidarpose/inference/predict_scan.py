@@ -1,4 +1,4 @@
-"""`predict`: the people of a file or an array. The steps of one scan: read, search, load, pose."""
+"""`predict`: poses of the people in a file or an array. Steps for one scan: read, detect, load the network, pose."""
 
 import inspect
 import os
@@ -26,11 +26,11 @@ from lidarpose.skeleton import Skeleton
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-# a file of less than this across is taken for a crop, m
+# an input smaller than this is treated as a crop of one person, m
 CROP_SIZE = 4.0
-# of directions that are up: `detect` states them to three decimals
+# maximum difference of equal up directions, as unit vectors: `detect` rounds them to three decimals
 _SAME_UP = 2e-3
-# and of the same axis, as far as scans are leveled: 45 degrees
+# maximum difference of up directions along the same axis: 45 degrees, the limit for tilted scans
 _SAME_AXIS = 0.77
 
 
@@ -52,27 +52,43 @@ def predict(
     model: "Predictor | str | os.PathLike | Callable[[], Predictor]" = DEFAULT,
     progress: bool = False,
 ) -> Poses:
-    """Poses of the people in a point file or in an array, in its own frame.
+    """Predicts the poses of all people in a point file or an array, in the coordinate frame of the input.
+
+    People come from `boxes`, from detection (`find`), or the input is a crop of one person (`crop`). If none of these
+    is given, an input less than 4 m across is treated as a crop, and people are detected in any other input.
 
     Args:
-        path: a point file, or the points themselves, (n, 3+) m in any frame; "the file" below is either.
-        boxes: whatever `read_boxes` takes (a JSON file, a KITTI label, rows, a `Box` or several), their length and
-            width level, their height and yaw along and about the up axis, or the axis nearest to a direction `up`.
-        calib: of a KITTI label, None for `../calib/N.txt` beside it.
-        crop: the file is one person already.
-        find: people are searched for, with min_score, max_range (None: 40 m), max_people and background as in `detect`.
-            Without boxes, crop and find a file of less than 4 m across is taken as a crop, any other is searched.
-        sensor_origin: (x, y, z) m in the file's frame, or "unknown"; None means unknown for a crop and 0, 0, 0 else.
-        skeleton: one, or its name; None for smpl24, or for the network's own where it has other joints.
-        up: the file's up axis, "z", "y" or "x", with a minus where it points down ("-y": cameras), or for a sensor
-            mounted askew the direction that is up, (x, y, z) or "x,y,z" in the file's frame. None: as `detect` and
-            `predict` wrote into a file of boxes, else z.
-        columns: values a row of a .bin.
-        model: a predictor, what `load` takes (with its defaults), or a function that gives the predictor when needed.
-            Bundled networks are loaded once and kept by name; a file is loaded anew, since it may have changed.
+        path: path of a point file, or points (n, 3+) m in any frame.
+        boxes: boxes of the people in the input: anything that `read_boxes` takes, such as a JSON file, a KITTI label,
+            rows, or one or several `Box`. Height and yaw refer to the up axis, or to the axis nearest to it if `up` is
+            a direction; length and width are horizontal.
+        calib: calibration file of a KITTI label. None means `../calib/N.txt` relative to the label.
+        crop: whether the input is a crop of one person.
+        find: whether to detect people, regardless of the size of the input.
+        min_score: score threshold of detection, see `detect`. This and the following three options are for detection
+            only: they are rejected with `boxes` or `crop`.
+        max_range: maximum horizontal distance of detected people from the sensor, m. None means 40.
+        max_people: maximum number of detected people, see `detect`.
+        background: static background that is not searched, see `detect`.
+        sensor_origin: (x, y, z) m, the sensor position in the frame of the input, or "unknown". None means unknown for
+            a crop and 0, 0, 0 otherwise.
+        skeleton: skeleton of the result, or its name. None means smpl24, or the network's own skeleton if the network
+            lacks joints of smpl24.
+        up: up axis of the input: "z", "y" or "x", with a minus sign if it points down ("-y" for cameras); or, for a
+            tilted sensor, the up direction (x, y, z) or "x,y,z" in the frame of the input. None means the up axis
+            stated by `boxes`, as `detect` and `predict` write it, otherwise z.
+        columns: number of values per row of a .bin file.
+        model: a `Predictor`; or the name or path of weights, loaded with the default settings of `load`; or a function
+            without arguments that returns a `Predictor`, called when it is needed. Bundled networks are loaded once and
+            cached; files are loaded in each call, since they may have changed.
+        progress: whether to show a progress bar.
+
+    Returns:
+        `Poses` of the people in the order of the boxes; detected people have the order of their scores, highest first.
+        It is empty if no people are detected. An array without points is not an error; its result has no poses.
 
     Raises:
-        InputError: one line that says what to do. An array without points is no error: nobody is in it.
+        InputError: input that cannot be read or options that exclude each other; the message says what to do.
     """
     options = (min_score, max_range, max_people, background)
     check_choice(boxes, crop, find or any(option is not None for option in options), calib)
@@ -82,7 +98,7 @@ def predict(
         up = "z" if input_boxes is None else input_boxes.up
     rotation_from_up(up)
     if input_boxes is not None:
-        # of a tilted scan boxes say how it was leveled, which is still the same axis
+        # boxes of a tilted scan state its up direction, which may differ from the given axis
         check_up(input_boxes, up, most=_SAME_AXIS)
     scan = Scan(points=np.zeros((0, 3)), boxes=input_boxes, origin=as_origin(sensor_origin), up=up_text(up))
     scan = read_scan(scan, path, columns)
@@ -94,7 +110,7 @@ def predict(
         scan = replace(scan, origin=np.zeros(3))
     read_end = time.perf_counter()
     search = search_options(*options, columns)
-    # loaded once the input has proved readable
+    # the network is loaded only after the input has been read
     _, poses = predict_scan(
         scan, lambda: predictor_of(model), search=search if find else None, skeleton=skeleton, progress=progress
     )
@@ -102,13 +118,13 @@ def predict(
 
 
 def predictor_of(model: "Predictor | str | os.PathLike | Callable[[], Predictor]") -> "Predictor":
-    """What `predict` takes as its model, ready to use. Raises InputError for anything else."""
+    """The predictor for the argument `model` of `predict`. Raises InputError for an unsupported argument."""
     if isinstance(model, str) and model in BUNDLED:
         return _bundled(model)
     predictor: object = model
     if isinstance(model, str | os.PathLike):
         predictor = load(model)
-    # a network of torch can be called too
+    # torch modules are callable too: reject them
     elif callable(model) and not hasattr(model, "forward") and _needs_nothing(model):
         predictor = model()
     if not isinstance(predictor, Predictor):
@@ -141,16 +157,20 @@ def predict_scan(
     skeleton: str | Skeleton | None = None,
     progress: bool = False,
 ) -> tuple[Scan, Poses]:
-    """The steps of one scan: people are searched for where `search` is given, else they are the scan's boxes or its
-    crop; then everybody is posed.
+    """Processes one scan: detects people if `search` is given, otherwise uses the boxes or the crop of the scan; then
+    predicts all poses.
 
     Args:
-        scan: or a frame of a recording in which people were detected already.
-        model: loads the network, once people were searched for.
-        known: as of `find_people`.
+        scan: a scan, or a frame of a recording with detections that are not yet verified.
+        model: returns the network; called after the search.
+        search: settings of the search; None for a scan with boxes or a crop.
+        known: people and rejected positions from earlier frames, see `verify_people`.
+        skeleton: skeleton of the result.
+        progress: whether to show a progress bar.
 
     Returns:
-        The scan as it was searched, and the poses, whose `timing_ms` has "find", "load", "crop" and "predict".
+        The scan with the results of the search, and the poses, whose `timing_ms` has "find", "load", "crop" and
+        "predict".
     """
     start = time.perf_counter()
     times = {}
@@ -167,21 +187,21 @@ def predict_scan(
 
 def is_wide(scan: Scan) -> bool:
     """Whether the scan is larger than a crop of one person."""
-    # a map of 10^8 points is not turned for nothing
+    # do not rotate a map of 10^8 points unless needed
     upright_points = scan.points if scan.up in UP_AXES else scan.clouds()[0]
     return bool(np.ptp(upright_points, axis=0).max() >= CROP_SIZE)
 
 
 def check_up(boxes: Boxes, up: str | Sequence[float], *, most: float = _SAME_UP) -> None:
-    """Raises InputError where boxes say that something else is up than was given. most: how far both directions may be
-    apart, as unit vectors."""
+    """Raises InputError if the up axis stated by boxes differs from the given one. most: maximum difference of the
+    directions, as unit vectors."""
     difference = rotation_from_up(boxes.up)[2] - rotation_from_up(up)[2]
     if boxes.up != "z" and np.linalg.norm(difference) > most:
         raise InputError(f"the boxes say that up is {boxes.up}, not {up_text(up)}: give up {boxes.up}")
 
 
 def check_choice(boxes: object, crop: bool, searched: bool, calib: object) -> None:
-    """Raises InputError where it is said in two ways who is in the file, and for a calibration of no boxes."""
+    """Raises InputError if more than one of boxes, crop and search is given, or a calibration without boxes."""
     if calib is not None and boxes is None:
         raise InputError("calib is for boxes that are a KITTI label: expected boxes too, got none: name the label")
     if boxes is not None and crop:

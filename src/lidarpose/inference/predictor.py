@@ -1,4 +1,4 @@
-"""`load` a network and predict poses of clouds of any number type, one or many, empty ones too."""
+"""`load` a network and predict the poses of one or many point clouds, of any number type; clouds may be empty."""
 
 import os
 from collections.abc import Sequence
@@ -53,7 +53,8 @@ if TYPE_CHECKING:
 BACKENDS = ("onnx", "torch")
 # default number of test-time augmentation passes
 TTA = 1
-# an answer may be somebody's from this share of the surest one's confidence on; answers this near, m, are of one person
+# minimum confidence of a candidate pose, as a fraction of the highest confidence; poses nearer than this, m, are of the
+# same person
 _SURE, _SAME = 0.6, 0.3
 
 
@@ -67,24 +68,28 @@ def load(
     threads: int | None = None,
     tta: int = TTA,
 ) -> "Predictor":
-    """The bundled network, or the checkpoint or exported file at a path, ready to predict.
+    """Loads a pose network and returns a `Predictor`.
 
     Args:
-        weights: a name of bundled weights, or a path.
-        device: "cpu", or "cuda" by backend torch, also as torch's; None means cpu.
-        backend: "onnx" (ONNX Runtime, on the CPU) or "torch"; None takes onnx for bundled weights and .onnx files,
-            torch for other paths and devices.
-        decode: how heatmaps are read, "window" (the mean about the mode), "argmax" or "dark" (the released DAPT
-            code's); where two peaks are equally high, rounding decides.
-        compile: by `torch.compile`, backend torch only.
-        threads: over which people are spread, backend onnx only; None for the processors that the process may use, at
-            most 8 and at most what the environment variable OMP_NUM_THREADS says.
-        tta: test-time augmentation, the number of transforms of each person (1 to 8), averaged with the pass that
-            centers the cloud. A person costs that pass and one for each transform, so 1 takes two passes, 4 take five.
+        weights: name of bundled weights, or path of a checkpoint (.safetensors) or an exported file (.onnx).
+        device: "cpu", or, with the torch backend, any torch device such as "cuda". None means "cpu".
+        backend: "onnx" (ONNX Runtime on the CPU) or "torch". None selects onnx for bundled weights on the CPU and for
+            .onnx files, and torch otherwise.
+        decode: how joint positions are read from heatmaps: "window" (mean around the mode), "argmax", or "dark" (the
+            refinement of the released DAPT code). If two peaks are equally high, rounding decides between them.
+        compile: whether to compile the network with `torch.compile`. Torch backend only.
+        threads: number of threads over which people are distributed. ONNX backend only. None means the number of
+            processors available to the process, at most 8 and at most the environment variable OMP_NUM_THREADS.
+        tta: number of test-time augmentation transforms per person, 1 to 8. Their poses are averaged with the pose of
+            the first pass, which centers the cloud. Each person costs the first pass and one pass per transform, so
+            `tta=1` takes two passes and `tta=4` takes five.
+
+    Returns:
+        A `Predictor`.
 
     Raises:
-        InputError: an unknown name, a file that is no checkpoint, or a device that is not there. MissingExtra: torch is
-            needed and not installed.
+        InputError: an unknown name, a file that is not a checkpoint, or a device that is not available.
+        MissingExtra: torch is needed but not installed.
     """
     decoder(decode)
     tta_transforms(tta)
@@ -108,7 +113,7 @@ def load(
         option = "torch.compile" if compile else f"device {device!r}"
         raise InputError(f"{option} needs the backend torch and a .safetensors file, got the backend onnx")
     elif is_bundled and threads is None:
-        # which the search for people runs too
+        # the verification of detections runs the same network: share its session
         network_backend = bundled_backend(path.stem)
     elif is_bundled or is_exported:
         network_backend = OnnxBackend(path if is_exported else path.with_suffix(".onnx"), threads=threads)
@@ -120,7 +125,7 @@ def load(
 
 
 def _torch_backend(path: Path, device: str, compile: bool) -> Backend:
-    # a bad file is an error even where torch is not installed
+    # report a bad file even if torch is not installed
     read_header(path)
     try:
         from lidarpose.inference.torch_backend import torch_backend
@@ -130,7 +135,8 @@ def _torch_backend(path: Path, device: str, compile: bool) -> Backend:
 
 
 class _Array(Protocol):
-    """An array of numpy, torch or pandas. Unlike `ArrayLike` no list is one, which would leave the overloads open."""
+    """An array of numpy, torch or pandas. Unlike `ArrayLike` it excludes lists, which would make the overloads of
+    `predict` ambiguous."""
 
     def __array__(self) -> np.ndarray: ...
 
@@ -145,7 +151,16 @@ class _Options(TypedDict, total=False):
 
 
 class Predictor(PoseEstimator):
-    """A network ready to use. `predict` checks its input; `outputs` is one plain pass. model: as in results."""
+    """A loaded network that predicts poses; made by `load`.
+
+    `predict` and `predict_clip` check and clean their input. `outputs` is a single forward pass without checks.
+
+    Args:
+        backend: runs the network.
+        name: name of the weights, reported in the attribute `model` and in results.
+        decode: heatmap decoder, see `load`.
+        tta: number of test-time augmentation transforms, see `load`.
+    """
 
     def __init__(self, backend: Backend, *, name: str, decode: str = "window", tta: int = 1):
         super().__init__(backend, decode=decode, tta=tta)
@@ -153,9 +168,14 @@ class Predictor(PoseEstimator):
         self.model |= {"decode": decode} | ({"tta": tta} if tta > 1 else {})
 
     def in_skeleton(self, name: str | Skeleton | None) -> Skeleton:
-        """A skeleton, by name too; None is smpl24 where the network has its joints, else the network's own.
+        """The skeleton of predicted poses.
 
-        Raises InputError for an unknown name, or one of a joint that the network lacks.
+        Args:
+            name: a skeleton or its name. None means smpl24, or the network's own skeleton if the network lacks joints
+                of smpl24.
+
+        Raises:
+            InputError: an unknown name, or a skeleton with a joint that the network does not predict.
         """
         network_skeleton = self.skeleton
         if name is None:
@@ -198,24 +218,31 @@ class Predictor(PoseEstimator):
     def predict(
         self, points, *, boxes=None, find=False, sensor_origin=None, skeleton=None, progress=False, clips=None
     ) -> PersonPose | Poses:
-        """One cloud (n, 3+) -> `PersonPose`; a list of clouds, or one with boxes or find -> `Poses`, in their order.
+        """Predicts the pose of one person, of several people, or of all people in a scan.
 
         Args:
-            points (arrays): x, y, z in meters, z up, any frame, each cloud one person, ground and clutter allowed;
-                more columns are ignored, those of tables and records are taken by name. A cloud of under 5 different
-                points gets a result without joints and a warning. Arrays (a, b, 3) are refused: one scan or several
-                people?
-            boxes (as in `lidarpose.predict`): the people of a whole scan; where they say what is up, it need not be z.
-            find (bool): they are searched for, as by `lidarpose.detect`, whose result is for `boxes` where anything
-                about the search is to be chosen.
-            sensor_origin (array or str): (3,) m, where the sensor stood in that frame, or "unknown"; None means
-                0, 0, 0 with boxes and find, and unknown without.
-            skeleton (str or Skeleton): see `in_skeleton`.
-            clips (Clips): which of a list's clouds are frames of one person, for networks of clips, by default none:
-                a cloud then fills a clip.
+            points (array or list of arrays): a cloud (n, 3+) of x, y, z in meters, in any frame with z up; or a list of
+                such clouds. Without `boxes` and `find`, each cloud shows one person and may include ground and
+                clutter. Further columns are ignored; tables and record arrays are read by column name. A cloud with
+                fewer than 5 distinct points yields a result without joints and with a warning. Arrays (a, b, 3) are
+                rejected because they may be one scan or several people.
+            boxes (any input of `read_boxes`): boxes of the people in `points`, which then is a whole scan. If the boxes
+                state an up axis, it is used instead of z.
+            find (bool): whether to detect people in `points`, which then is a whole scan, with the default settings
+                of `lidarpose.detect`. For other settings, call `detect` and pass its result as `boxes`.
+            sensor_origin (array or str): (3,) m, the sensor position in the frame of the points, or "unknown". None
+                means 0, 0, 0 with `boxes` or `find`, and unknown otherwise.
+            skeleton (str or Skeleton): the skeleton of the result, see `in_skeleton`.
+            progress (bool): whether to show a progress bar.
+            clips (Clips): for networks that read clips: which clouds of a list are frames of the same person. By
+                default each cloud is repeated to fill a clip.
+
+        Returns:
+            A `PersonPose` for one cloud; `Poses` for a list of clouds, or with `boxes` or `find`. `Poses` has the order
+            of the clouds or boxes; detected people have the order of their scores, highest first.
 
         Raises:
-            InputError: arrays of another shape or type.
+            InputError: an array of unsupported shape or type, or options that exclude each other.
         """
         self.in_skeleton(skeleton)
         if clips is not None and getattr(self.backend, "frames", 1) == 1:
@@ -251,18 +278,22 @@ class Predictor(PoseEstimator):
         live: bool = False,
         progress: bool = False,
     ) -> Poses:
-        """One person through frames: steady poses, as many as clouds, whose ids are the frames' numbers.
+        """Predicts temporally smoothed poses of one person over a sequence of frames.
 
         Args:
-            clouds: (n, 3+) m each, of one person in a frame of coordinates that stays where it is, as in `predict`; one
-                without points is a frame in which the person was not seen, whose joints are filled in within gaps of up
-                to 2 s.
-            times: (T,) s, each later than the one before; None: ten frames a second.
-            sensor_origin: as in `predict`, in that frame.
-            live: each pose from its own frame and those before only, as it would come from a running sensor.
+            clouds: one cloud (n, 3+) m per frame, as in `predict`, all in the same fixed coordinate frame. An empty
+                cloud is a frame in which the person was not seen; its joints are filled in within gaps of up to 2 s.
+            times: (T,) s, strictly increasing. None means ten frames per second.
+            sensor_origin: sensor position in the same frame, as in `predict`.
+            skeleton: the skeleton of the result, see `in_skeleton`.
+            live: whether to compute each pose from the current and earlier frames only, as with a running sensor.
+            progress: whether to show a progress bar.
+
+        Returns:
+            `Poses` with one entry per frame, whose id is the index of the frame.
 
         Raises:
-            InputError: as `predict` does, and for other times.
+            InputError: as in `predict`, or times that are not strictly increasing seconds.
         """
         self.in_skeleton(skeleton)
         if not _is_many(clouds) and getattr(clouds, "ndim", 0) != 3:
@@ -294,17 +325,19 @@ class Predictor(PoseEstimator):
         is_scored: bool = False,
         check_upside_down: bool = True,
     ) -> Poses:
-        """As `predict` of clouds (n, 3) m, of which more is known; of rounded coordinates nothing is said.
+        """Like `predict` for a list of clouds (n, 3) m, with additional knowledge about them. Does not warn of rounded
+        coordinates.
 
         Args:
-            clips: as in `predict`, checked.
-            pelvises: (N, 3) m, nearly, where each cloud shows one person alone: the pass that finds them is spared.
-            box_centers: (N, 3) m of the boxes that cut the clouds out: where a cloud shows two people, who is nearer to
-                the center is meant.
-            is_scored: whether boxes say how sure it is that somebody is there, by more than the points in them: then
-                nothing is said of it.
-            check_upside_down: whether those whose pose is unsure are looked at upside down too, to warn of it, which
-                costs as much as the pose.
+            clips: as in `predict`, already checked.
+            pelvises: (N, 3) m, approximate pelvis positions of clouds that each show a single person. The first pass,
+                which finds the pelvis, is then skipped.
+            box_centers: (N, 3) m, centers of the boxes that cropped the clouds. If a cloud shows two people, the one
+                nearer to the box center is posed.
+            is_scored: whether the boxes have scores, which rest on more than the points inside the box. Warnings that
+                a cloud may not show a person are then suppressed.
+            check_upside_down: whether to pose clouds with uncertain poses upside down as well, in order to warn of a
+                wrong up axis. This costs as much as the pose itself.
         """
         target_skeleton = self.in_skeleton(skeleton)
         cleaned_clouds = [clean(cloud) for cloud in clouds]
@@ -333,11 +366,11 @@ class Predictor(PoseEstimator):
                 notes.append(warning)
             elif pelvises is None and check_upside_down and looks_unsure(pose, part):
                 unsure_rows.append(i)
-        # a second look at the few whose pose looks unsure; where pelvises are known people were seen upright before
+        # pose the few uncertain clouds again upside down; if pelvises are known, people were upright in earlier frames
         flipped_clouds = [best_poses[i][1] * UPSIDE_DOWN for i in unsure_rows]
         flipped_poses = self.poses(flipped_clouds, None if origin is None else origin * UPSIDE_DOWN)
         for i, flipped_pose in zip(unsure_rows, flipped_poses, strict=True):
-            # of somebody who lies another axis may be up, which is said of all together
+            # for lying people another up axis is possible; `check_scan` warns of it once for all people
             if (warning := upside_down_warning(best_poses[i][0], flipped_pose)) and not is_lying(*best_poses[i]):
                 cleaned_clouds[i][1].append(warning)
         people = tuple(
@@ -347,7 +380,8 @@ class Predictor(PoseEstimator):
         return Poses(people=people, skeleton=target_skeleton, model=self.model)
 
     def _predict_clouds(self, clouds, origin, skeleton, progress, clips) -> Poses:
-        """Of clouds as they were given: of scans' people the scan says how their coordinates are rounded."""
+        """Poses of clouds given by the user, with a warning for each cloud with rounded coordinates. People cropped
+        from a scan get no such warning; their scan does."""
         poses = self.predict_in(clouds, origin, skeleton, progress, clips=clips)
         people = list(poses)
         for i, cloud in enumerate(clouds):
@@ -358,14 +392,15 @@ class Predictor(PoseEstimator):
     def _best(
         self, cleaned_clouds, is_usable, origin, progress, clips, centers, box_centers
     ) -> dict[int, tuple[Pose, np.ndarray]]:
-        """By person the pose, where there is one, and what of the cloud (n, 3) m it is of."""
+        """For each person with a pose, by index: the pose, and the part (n, 3) m of the cloud from which it was
+        predicted."""
         if clips is not None:
-            # rows of clips are those of all clouds
+            # clips index all clouds, so unusable clouds stay in the list
             parts = list(enumerate(points for points, _ in cleaned_clouds))
             poses = self.poses([part for _, part in parts], origin, clips=clips.usable(is_usable), progress=progress)
         else:
             usable_clouds = [(i, cleaned_clouds[i][0]) for i in np.flatnonzero(is_usable).tolist()]
-            # a person's first candidate is the whole cloud
+            # the first candidate of a person is the whole cloud
             parts = [
                 (i, part) for i, cloud in usable_clouds for part in (candidates(cloud) if centers is None else [cloud])
             ]
@@ -386,10 +421,12 @@ class Predictor(PoseEstimator):
 
 
 def _select_pose(answers: list[tuple[Pose, np.ndarray]], box_center: np.ndarray | None) -> tuple[Pose, np.ndarray]:
-    """Of the answers about candidates of a crop, that of the whole cloud first, the one that is meant: the surest, in a
-    box the surest of whoever is nearest to its center. Whoever else is there stands beside them as a second person.
+    """Selects the pose of the intended person among the poses of a crop's candidates, the first of which is the whole
+    cloud.
 
-    Of a network without confidence the first.
+    This is the most confident pose; with a box, the most confident pose of the person nearest to the box center. Other
+    people among the candidates raise `second_person` of the selected pose. Without confidence, the first pose is
+    selected.
     """
     confidences = [0.0 if pose.confidence is None else float(pose.confidence.mean()) for pose, _ in answers]
     if len(answers) == 1 or not any(confidences):
@@ -421,30 +458,31 @@ def _range_warning(pose: Pose) -> str | None:
 
 
 def _with_person_probabilities(person: PersonPose, pose: Pose | None) -> Pose | None:
-    """A steady pose with what the network says of its frame as a whole, which is not smoothed; of a frame that was
-    filled in nothing is said."""
+    """The smoothed pose with the per-person probabilities of its frame, which are not smoothed. Filled-in frames
+    have none."""
     if pose is None or person.pose is None:
         return pose
     return replace(pose, **{name: getattr(person.pose, name) for name in PER_PERSON})
 
 
 def _steady_warnings(person: PersonPose, pose: Pose | None) -> tuple[str, ...]:
-    """What is to be said of a frame of a clip whose pose became another."""
+    """The warnings of a clip's frame after smoothing."""
     if person.pose is not None or pose is None:
         return person.warnings
     return ("filled in from other frames: the person was not seen in this one",)
 
 
 def _is_many(points) -> bool:
-    """A list of clouds, rather than one cloud, be it written as a list of rows."""
+    """Whether the input is a list of clouds rather than one cloud. A list of points is one cloud."""
     return isinstance(points, list | tuple) and (len(points) == 0 or not _is_row(points[0]))
 
 
 def _is_row(value) -> bool:
-    """One point: a flat list or array of numbers. Anything ragged is none, and what is empty is a cloud."""
+    """Whether the value is one point: a flat list or array of numbers. Ragged values are not; empty values are
+    clouds."""
     if isinstance(value, list | tuple):
         is_flat = not any(isinstance(entry, list | tuple) or getattr(entry, "ndim", 0) for entry in value)
     else:
-        # records are a cloud
+        # an array of records is a cloud
         is_flat = getattr(value, "ndim", 0) == 1 and not getattr(getattr(value, "dtype", None), "names", None)
     return is_flat and len(value) > 0

@@ -1,4 +1,5 @@
-"""What a prediction returns: one person (`PersonPose`) or all people of a call (`Poses`); JSON, files, pictures."""
+"""Results of a prediction: one person (`PersonPose`) or all people of a call (`Poses`), with JSON, file and picture
+output."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -24,7 +25,7 @@ SCHEMA = "lidarpose.poses/1"
 
 
 class Picture(bytes):
-    """The bytes of a PNG; a notebook shows the picture instead of printing them."""
+    """The bytes of a PNG image, which a notebook displays as a picture."""
 
     def __repr__(self) -> str:
         return f"<PNG, {len(self):,} bytes>"
@@ -35,10 +36,17 @@ class Picture(bytes):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PersonPose:
-    """One person's pose in the input's own frame.
+    """The pose of one person, in the coordinate frame of the input.
 
-    pose: None where there are too few points; points (n, 3) m: what it was read from; warnings: lines for the user;
-    up: the frame's up axis, which pictures need.
+    Args:
+        pose: the pose, None if the person has too few points.
+        skeleton: the skeleton of the pose.
+        points: (n, 3) m, the points of the person's crop, without invalid points.
+        id: id of the box, the track or the clip's frame; the index of the box if it has no id; None for arrays.
+        box: the box that cropped the person, None without boxes.
+        warnings: messages for the user about this person.
+        model: name, version and settings of the network.
+        up: up axis of the input frame, used for drawing.
     """
 
     pose: Pose | None
@@ -52,44 +60,46 @@ class PersonPose:
 
     @property
     def has_pose(self) -> bool:
-        """Whether there is a pose: without one `joints` and the other values of joints are None."""
+        """Whether there is a pose. Without one, `joints` and all other per-joint values are None."""
         return self.pose is not None
 
-    # typed as arrays, which they are for every person with a pose
+    # typed as arrays although they are None without a pose
     @property
     def joints(self) -> np.ndarray:
-        """(J, 3) m."""
+        """(J, 3) m: joint positions."""
         return self._of_pose("joints")
 
     @property
     def confidence(self) -> np.ndarray:
-        """(J,): probability that the joint is within 10 cm; None where the network does not say."""
+        """(J,): probability that the joint is within 10 cm of the ground truth; None if the network does not predict
+        it."""
         return self._of_pose("confidence")
 
     @property
     def spread(self) -> np.ndarray:
-        """(J,) m: expected distance between the joint and the truth; None where the network does not say."""
+        """(J,) m: expected distance between the joint and the ground truth; None if the network does not predict it."""
         return self._of_pose("spread")
 
     @property
     def visible(self) -> np.ndarray:
-        """(J,): probability that a point of the body lies within 18 cm of the joint; None where the network does not
-        say."""
+        """(J,): probability that a point of the body lies within 18 cm of the joint; None if the network does not
+        predict it."""
         return self._of_pose("visible")
 
     @property
     def in_range(self) -> np.ndarray:
-        """(J,) bool: False where the joint may lie farther out than it says; None where the network does not say."""
+        """(J,) bool: False if the joint lies at the end of the heatmap's range and may be farther out than predicted;
+        None for networks without heatmaps."""
         return self._of_pose("in_range")
 
     @property
     def person(self) -> float | None:
-        """The probability that the points show a person; None where the network does not say."""
+        """Probability that the points show a person; None if the network does not predict it."""
         return self._number("person")
 
     @property
     def second_person(self) -> float | None:
-        """The probability that they show a second person besides; None where the network does not say."""
+        """Probability that the points show a second person as well; None if the network does not predict it."""
         return self._number("second_person")
 
     def _number(self, name: str) -> float | None:
@@ -108,12 +118,12 @@ class PersonPose:
 
     @property
     def score(self) -> float | None:
-        """The probability that it is a person, as of the box; None where nobody says."""
+        """Score of the box: the probability that it contains a person; None if unknown."""
         return None if self.box is None else self.box.score
 
     @property
     def mounted(self) -> bool | None:
-        """Whether the person rides or sits in a wheelchair, as of the box; None where nobody says."""
+        """Whether the person rides or sits in a wheelchair, as stated by the box; None if unknown."""
         return None if self.box is None else self.box.mounted
 
     @property
@@ -121,10 +131,10 @@ class PersonPose:
         return len(self.points)
 
     def to_dict(self) -> dict:
-        """The entry of this person under "people"."""
+        """The entry of this person in the list "people" of `Poses.to_dict`."""
         return {
             "id": self.id,
-            # "up" stands beside the people
+            # the document states "up" once for all people
             "box": self.box and replace(self.box, up=None).to_dict(),
             "score": None if self.score is None else round(self.score, 4),
             "mounted": self.mounted,
@@ -140,31 +150,31 @@ class PersonPose:
         }
 
     def alone(self) -> "Poses":
-        """The same person as the only one of a call."""
+        """A `Poses` that contains only this person."""
         return Poses(people=(self,), skeleton=self.skeleton, model=self.model, up=self.up)
 
     def to_json(self) -> str:
-        """A document of the schema lidarpose.poses/1 with this one person."""
+        """A JSON document with the schema lidarpose.poses/1 that contains only this person."""
         return self.alone().to_json()
 
     def save(self, path: str | Path) -> None:
-        """As `Poses.save`."""
+        """Writes a .json or .csv file, see `Poses.save`."""
         self.alone().save(path)
 
     def picture(self, path: str | Path | None = None) -> Picture:
-        """The person from the front and the side, as PNG; also written to `path` where given."""
+        """Front and side view of the person as PNG; also written to `path` if given."""
         return self.alone().picture(path)
 
     def html(self, path: str | Path | None = None, *, title: str = "") -> str:
-        """As `Poses.html`."""
+        """An HTML page with the person in 3D, see `Poses.html`."""
         return self.alone().html(path, title=title)
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """A row a joint: see `Poses.to_dataframe`."""
+        """A table with one row per joint, see `Poses.to_dataframe`."""
         return self.alone().to_dataframe()
 
     def to_numpy(self) -> np.ndarray:
-        """Joints (J, 3) m, NaN without a pose."""
+        """Joint positions (J, 3) m, NaN without a pose."""
         return self.alone().to_numpy()[0]
 
     def __repr__(self) -> str:
@@ -183,11 +193,21 @@ class PersonPose:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Poses(Sequence[PersonPose]):
-    """The people of one call, in the order of the boxes or arrays. A sequence of `PersonPose`.
+    """All people of one call: a sequence of `PersonPose` in the order of the boxes or arrays.
 
-    warnings concern the whole input; timing_ms: what took how long; up: the frame's up axis, which pictures need. Where
-    people were searched for, scan (n, 3) m is all that was searched, and origin (3,) m the sensor's place or None: who
-    keeps many results and needs no pictures of scans, keeps `dataclasses.replace(poses, scan=None)`.
+    If people were detected in a scan, the result holds the whole scan. To store many results without the memory of
+    their scans, use `dataclasses.replace(poses, scan=None)`.
+
+    Args:
+        people: one entry per person, also for people without a pose.
+        skeleton: the skeleton of all poses.
+        source: name of the file or recording, None for arrays.
+        model: name, version and settings of the network.
+        warnings: messages for the user about the whole input.
+        timing_ms: duration of each step in milliseconds, by name.
+        up: up axis of the input frame, used for drawing.
+        scan: (n, 3) m, the points in which people were detected, None without detection.
+        origin: (3,) m, the sensor position of that scan, None if unknown.
     """
 
     people: tuple[PersonPose, ...]
@@ -210,7 +230,7 @@ class Poses(Sequence[PersonPose]):
     def __getitem__(self, index: slice) -> "Poses": ...
 
     def __getitem__(self, index: int | str | slice) -> "PersonPose | Poses":
-        """One person by place or by the text of their id, or a slice as `Poses`."""
+        """One person by index, one person by id given as text, or a slice as `Poses`."""
         if isinstance(index, slice):
             return replace(self, people=self.people[index])
         if isinstance(index, str):
@@ -238,7 +258,7 @@ class Poses(Sequence[PersonPose]):
         return f"<p>{escape(repr(self))}</p><table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
 
     def to_numpy(self) -> np.ndarray:
-        """Joints (N, J, 3) m, NaN for a person without a pose."""
+        """Joint positions (N, J, 3) m, NaN for people without a pose."""
         joints = np.full((len(self), len(self.skeleton), 3), np.nan)
         for row, person in zip(joints, self.people, strict=True):
             if person.pose is not None:
@@ -246,9 +266,11 @@ class Poses(Sequence[PersonPose]):
         return joints
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """A row for each joint of each person who has a pose: person (place in this sequence), id, joint, x, y, z (m),
-        confidence, spread (m), visible, in_range, person_probability (`PersonPose.person`), second_person, score,
-        mounted; NaN for what is not known."""
+        """A table with one row per joint of each person with a pose.
+
+        Columns: person (index in this sequence), id, joint, x, y, z (m), confidence, spread (m), visible, in_range,
+        person_probability (`PersonPose.person`), second_person, score, mounted. Unknown values are NaN.
+        """
         import pandas
 
         rows = []
@@ -259,7 +281,7 @@ class Poses(Sequence[PersonPose]):
             mounted = None if person.box is None else person.box.mounted
             known_values = (person.person, person.second_person, person.score, mounted)
             person_values = [np.nan if value is None else value for value in known_values]
-            # as tables are written
+            # escape characters that cannot be encoded when the table is written
             id = encodable(person.id) if isinstance(person.id, str) else person.id
             for j, joint in enumerate(self.skeleton.joints):
                 joint_values = [np.nan if value is None else value[j] for value in values]
@@ -267,7 +289,7 @@ class Poses(Sequence[PersonPose]):
         return pandas.DataFrame(rows, columns=["person", "id", *JOINT_COLUMNS])
 
     def to_dict(self) -> dict:
-        """The document of the schema lidarpose.poses/1; "warnings" beside it concern the whole input."""
+        """A document with the schema lidarpose.poses/1. Its top-level "warnings" concern the whole input."""
         return {
             "schema": SCHEMA,
             "source": self.source,
@@ -286,21 +308,22 @@ class Poses(Sequence[PersonPose]):
         }
 
     def to_json(self) -> str:
-        """`to_dict` as JSON, people a line each."""
+        """`to_dict` as JSON text with one line per person."""
         document = self.to_dict()
         last_entries = {key: document.pop(key) for key in ("people", "timing_ms")}
         return lined_json(document | last_entries, "people") + "\n"
 
     def save(self, path: str | Path) -> None:
-        """Writes `to_json` to a .json, or `to_dataframe` to a .csv, whole or not at all."""
+        """Writes `to_json` to a .json file or `to_dataframe` to a .csv file; the file is written completely or not at
+        all."""
         check_suffix(path, ".json", ".csv")
         is_csv = str(path).lower().endswith(".csv")
         write_atomic(path, self.to_dataframe().to_csv(index=False) if is_csv else self.to_json())
 
     def picture(self, path: str | Path | None = None, *, title: str = "") -> Picture:
-        """Everybody from the front and the side on one PNG; also written to `path` where given.
+        """Front and side views of all people on one PNG; also written to `path` if given.
 
-        Where people were searched for, the scan from above is over them.
+        If people were detected in a scan, a bird's-eye view of the scan is placed above them.
         """
         from lidarpose.viz.bird_eye import draw_scan_and_people
         from lidarpose.viz.draw import draw_people
@@ -312,8 +335,10 @@ class Poses(Sequence[PersonPose]):
         return Picture(draw_scan_and_people(scan, panels, path, title=title))
 
     def html(self, path: str | Path | None = None, *, title: str = "") -> str:
-        """A page on which everybody is turned in 3D, under the scan where people were searched for; also written to
-        `path` where given."""
+        """An HTML page with interactive 3D views of all people; also written to `path` if given.
+
+        If people were detected in a scan, a view of the scan is placed above them.
+        """
         from lidarpose.viz.html import render_report, write_report
 
         title = title or (self.source or "lidarpose")
@@ -324,7 +349,7 @@ class Poses(Sequence[PersonPose]):
         return render_report(panels, title=title, summary=[], scans=scans)
 
     def _panels(self) -> "tuple[list[Panel], ScanPanel | None]":
-        """What is drawn: everybody, and the scan where people were searched for."""
+        """The panels to draw: one per person, and the scan if people were detected in it."""
         from lidarpose.viz.person_view import Panel
 
         upright_people = [_upright(person, self.up) for person in self.people]
@@ -335,13 +360,14 @@ class Poses(Sequence[PersonPose]):
         return panels, None if self.scan is None else self._from_above(self.scan, upright_people)
 
     def _distance(self, person: PersonPose) -> float | None:
-        """From the sensor, m, where people were searched for; NaN where its place is unknown."""
+        """Distance of the person from the sensor, m; NaN if the sensor position is unknown, None without detection or
+        points."""
         if self.scan is None or not person.num_points:
             return None
         return np.nan if self.origin is None else float(np.linalg.norm(np.median(person.points, 0) - self.origin))
 
     def _from_above(self, points: np.ndarray, people: list[PersonPose]) -> "ScanPanel":
-        """What was searched, points (n, 3) m, with the people, z up."""
+        """The scan, points (n, 3) m in the input frame, with `people` in the level frame (z up)."""
         from lidarpose.viz.bird_eye import ScanPanel
 
         R_level_input = rotation_from_up(self.up)
@@ -358,7 +384,8 @@ class Poses(Sequence[PersonPose]):
 
 
 def _upright(person: PersonPose, up: str) -> PersonPose:
-    """The person with z up, as pictures are drawn. A box of a frame that leans would lean in them: it is left out."""
+    """The person rotated to z up for drawing. The box is dropped if `up` is a direction, since it would be drawn
+    tilted."""
     R_level_input = rotation_from_up(up)
     pose, box = person.pose, person.box if up in UP_AXES else None
     return replace(
@@ -370,7 +397,7 @@ def _upright(person: PersonPose, up: str) -> PersonPose:
 
 
 def _box_around(person: PersonPose) -> Box | None:
-    """The extent of a person's points, z up, the way the pose faces."""
+    """A box around the points of a person (z up), aligned with the heading of the pose; None without points."""
     if not person.num_points:
         return None
     yaw = facing_yaw(person.pose)
@@ -381,18 +408,18 @@ def _box_around(person: PersonPose) -> Box | None:
 
 
 def _label(person: PersonPose) -> str:
-    """The id, and the score where there is one."""
+    """The id, and the score if there is one."""
     words = [] if person.id is None else [str(person.id)]
     return " · ".join(words if person.score is None else [*words, f"score {person.score:.2f}"])
 
 
 def _rounded(values: np.ndarray | None, digits: int) -> list:
-    """Nothing for what is not known."""
+    """The rounded values as a list; an empty list for None."""
     return [] if values is None else np.round(np.asarray(values, float), digits).tolist()
 
 
 def _warning_count(warnings: Sequence[str]) -> str:
-    """ ", 2 warnings", or nothing for none."""
+    """ ", 2 warnings", or "" without warnings."""
     return f", {counted(len(warnings), 'warning')}" if warnings else ""
 
 

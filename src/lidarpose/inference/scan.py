@@ -1,4 +1,4 @@
-"""A scan with people: points, their boxes or none for a crop of one person; cropped, posed, checked."""
+"""A scan with people: points, and boxes unless it is a crop of one person; cropping, posing and checks."""
 
 from __future__ import annotations
 
@@ -30,14 +30,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scan:
-    """What is to be posed, in the input's frame.
+    """A scan whose people are to be posed, in the input frame.
 
-    points (n, 3) m; boxes: the people's, None for a crop of one person; origin: the sensor's position (3,) m or None;
-    up: the input's up axis or direction, see `rotation_from_up`; warnings: of reading; source: a name for reports.
-    Boxes stand along the input's own axis, where `up` is a direction the one nearest to it. Where people were searched
-    for, detected_rows holds of each box the rows (k,) of the person's points, which a box that leans does not give.
-    In recordings, pelvises (N, 3) m: where those of the boxes' people are about; verified (N,) bool: whose score is of
-    this scan; rejected (R, 3) m: places that turned out to hold nobody.
+    points (n, 3) m; boxes: of the people, None for a crop of one person; origin: sensor position (3,) m, None if
+    unknown; up: up axis or direction of the input, see `rotation_from_up`; warnings: from reading; source: a name for
+    reports. Boxes are upright along the input's up axis, or along the axis nearest to it if `up` is a direction.
+    After detection, detected_rows holds for each box the rows (k,) of the person's points, which the enlarged box of a
+    tilted scan does not determine. In recordings, pelvises (N, 3) m: approximate pelvis positions of the people in the
+    boxes; verified (N,) bool: whether the box was verified in this scan; rejected (R, 3) m: positions of detections
+    that the verifier rejected.
     """
 
     points: np.ndarray
@@ -57,7 +58,7 @@ class Scan:
 
     @property
     def upright_axis(self) -> str:
-        """The input's axis that is nearest to upright, "x", "y" or "z"."""
+        """The axis of the input that is nearest to vertical, "x", "y" or "z"."""
         return upright_axis(self.up)[-1]
 
     @property
@@ -65,35 +66,37 @@ class Scan:
         return rotation_of_boxes(self.up)
 
     def level_boxes(self) -> list[Box]:
-        """The boxes with z up, in the frame of `box_points`."""
+        """The boxes rotated to z up, in the frame of `box_points`."""
         return [replace(box, center=self.R_boxes_input @ box.center) for box in self.boxes or []]
 
     def box_points(self) -> np.ndarray:
-        """The points (n, 3) m in the frame in which boxes stand upright."""
+        """The points (n, 3) m in the frame in which the boxes are upright along z."""
         return _turned(self.points, self.R_boxes_input)
 
     @cached_property
     def rows(self) -> list[np.ndarray]:
-        """Of each box the rows of the points in it."""
+        """For each box, the rows of the points inside it."""
         if self.detected_rows is not None:
             return self.detected_rows
         return rows_inside(self.level_boxes(), self.box_points())
 
     def clouds(self) -> list[np.ndarray]:
-        """The points of each person in the level frame (z up); of a crop all points."""
-        # only who is posed is turned, not the whole scan
+        """The points of each person in the level frame (z up); for a crop, all points."""
+        # rotate only the points of people, not the whole scan
         clouds = [self.points] if self.boxes is None else [self.points[rows] for rows in self.rows]
         return [_turned(cloud, self.R_level_input) for cloud in clouds]
 
 
 def _turned(points: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """points (n, 3) turned by R; themselves where nothing is turned, which of a whole scan saves much time."""
+    """points (n, 3) rotated by R; the input itself if R is the identity, which saves much time for whole scans."""
     return points if np.array_equal(R, np.eye(3)) else points @ R.T
 
 
 def read_scan(scan: Scan, points: str | os.PathLike | ArrayLike, columns: int | None) -> Scan:
-    """The scan with the returns of a file, its name and notes, or those of an array (n, 3+) m. Raises InputError for a
-    file without any."""
+    """The scan with the valid points of a file or an array (n, 3+) m, the file's name, and warnings from reading.
+
+    Raises InputError for a file without valid points.
+    """
     source = os.fsdecode(points) if isinstance(points, str | os.PathLike) else None
     if source is None and columns is not None:
         check_int("columns", columns, least=3, hint=" (x y z first)")
@@ -108,7 +111,8 @@ def read_scan(scan: Scan, points: str | os.PathLike | ArrayLike, columns: int | 
 def pose_scan(
     scan: Scan, predictor: Predictor, *, skeleton: str | Skeleton | None = None, progress: bool = False
 ) -> Poses:
-    """Poses of the scan's people in the input's frame, with warnings; `timing_ms` has "crop" and "predict"."""
+    """Poses of the scan's people in the input frame, with warnings; `timing_ms` has "crop", "predict" and
+    "per_person"."""
     start = time.perf_counter()
     clouds = scan.clouds()
     crop_end = time.perf_counter()
@@ -119,7 +123,7 @@ def pose_scan(
     origin = None if scan.origin is None else scan.R_level_input @ scan.origin
     if scan.boxes:
         pelvises = None if scan.pelvises is None else scan.pelvises @ scan.R_level_input.T
-        # not where the pelvises are known
+        # not needed if the pelvises are known
         box_centers = np.stack([scan.R_level_input @ box.center for box in scan.boxes]) if pelvises is None else None
         is_scored = all(box.score is not None for box in scan.boxes)
         level_poses = predictor.predict_in(
@@ -132,7 +136,7 @@ def pose_scan(
     warnings += check_scan(scan, level_poses)
     people = [_in_input(person, scan) for person in level_poses]
     if scan.boxes is None:
-        # a crop's warnings are its person's
+        # warnings from reading a crop belong to its person
         people = [replace(people[0], warnings=(*scan.warnings, *people[0].warnings))]
         warnings = warnings[len(scan.warnings) :]
     per_person = predict_ms / max(sum(person.has_pose for person in people), 1)
@@ -149,7 +153,8 @@ def pose_scan(
 
 
 def _named(people: Sequence[PersonPose], boxes: list[Box] | None) -> tuple[PersonPose, ...]:
-    """People with the ids of their boxes, or their positions, counted on where that is another's id."""
+    """People with the ids of their boxes. A box without an id gets its index, or the next free number if another box
+    has that id."""
     if boxes is None:
         return (replace(people[0], id=0),)
     box_ids = {box.id for box in boxes}
@@ -157,7 +162,7 @@ def _named(people: Sequence[PersonPose], boxes: list[Box] | None) -> tuple[Perso
     named_people = []
     for i, (person, box) in enumerate(zip(people, boxes, strict=True)):
         id = box.id if box.id is not None else next(free_ids) if i in box_ids else i
-        # where a box is of other units, which the scan's warnings say, its points are not the person's fault
+        # if the box is in wrong units, the scan's warnings say so; warnings about its crop would be misleading
         is_misfit = person.has_pose and unit_warning(box.size, what="it")
         named_people.append(replace(person, id=id, box=box, warnings=() if is_misfit else person.warnings))
     return tuple(named_people)

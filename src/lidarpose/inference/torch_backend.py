@@ -1,4 +1,4 @@
-"""Networks run by torch: any device; the paper's network and its baselines too."""
+"""Backends that run networks with torch, on any device, including the paper's network and its baselines."""
 
 import os
 from collections.abc import Callable
@@ -20,23 +20,23 @@ from lidarpose.models.voxelize import WINDOW
 from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import SMPL24
 
-# people a call: more do not stay in a processor's cache, and accelerators want more; the paper's network and its
-# baselines are a hundred times as large
+# people per call, on the CPU, on accelerators, and for the paper's network and its baselines, which are a hundred times
+# as large: on the CPU, the activations of more do not fit in the cache, while accelerators need more
 _CPU_BATCH, _BATCH, _SLOW_BATCH = 16, 64, 8
 
 
 def torch_backend(path: str | os.PathLike, *, device: str = "cpu", compile: bool = False) -> Backend:
-    """The backend of a checkpoint; compile: by `torch.compile`, which takes about a minute at the first call.
+    """The torch backend of a checkpoint. compile: use `torch.compile`, which takes about a minute at the first call.
 
-    Raises InputError for a file that is no checkpoint, or a device that is not there.
+    Raises InputError for a file that is not a checkpoint, or a device that is not available.
     """
     network, header = load_checkpoint(path)
     try:
         network.to(device)
-        # there are devices, "meta", from which no number comes back
+        # no data can be read back from the device "meta"
         torch.zeros(1, device=device).cpu()
     except (RuntimeError, AssertionError) as error:
-        # torch raises either, or a NotImplementedError, which is a RuntimeError, for an unknown or a missing device
+        # for an unknown or missing device torch raises one of these, or NotImplementedError, a RuntimeError
         reason = str(error).partition("\n")[0]
         raise InputError(
             f"device {device!r} cannot be used ({reason}); expected cpu, or cuda where torch has it"
@@ -45,12 +45,12 @@ def torch_backend(path: str | os.PathLike, *, device: str = "cpu", compile: bool
 
 
 def no_poses(network: nn.Module, header: Header, **settings: Any) -> Backend:
-    """Raises InputError: what stands for the backend of a network that predicts no joints."""
+    """Raises InputError. Placeholder for the backend of networks that do not predict joints."""
     raise InputError(f"the network {header.network} finds people and poses nobody: name weights of a pose network")
 
 
 class TorchBackend:
-    """A `PoseNet` that torch runs."""
+    """Runs a `PoseNet` with torch."""
 
     name = "torch"
 
@@ -63,7 +63,7 @@ class TorchBackend:
         self._module: Callable | None = None
 
     def __getstate__(self) -> dict:
-        # what torch compiled stays in its process
+        # a compiled module cannot be pickled
         return {**self.__dict__, "_module": None}
 
     @torch.inference_mode()
@@ -83,7 +83,7 @@ class TorchBackend:
 
 
 class _PaperBackend:
-    """What the backends of the paper's network and its baselines have in common."""
+    """Common part of the backends of the paper's network and its baselines."""
 
     name = "torch"
     batch = _SLOW_BATCH
@@ -99,8 +99,8 @@ class _PaperBackend:
 
 
 class DaptBackend(_PaperBackend):
-    """The paper's network, its joints brought into the order of its skeleton. What it sees of a person is what this
-    package's own networks see, the points within `WINDOW`; it has no use for the sensor's place."""
+    """Runs the paper's network and reorders its joints to its skeleton. Like this package's own networks, it reads the
+    points within `WINDOW`; it does not use the sensor position."""
 
     def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
         config = self.network.config
@@ -118,8 +118,9 @@ class DaptBackend(_PaperBackend):
 
 
 class BaselineBackend(_PaperBackend):
-    """PRN or LPFormer. They subtract the middle of the cloud's extent themselves and add it back, so they answer in the
-    frame of the cloud. Of more points than they read a fixed draw stays."""
+    """Runs PRN or LPFormer. Their inputs are centered on the middle of the cloud's extent, which is added back to the
+    joints, so the joints are in the frame of the cloud. Clouds with more points than the network reads are subsampled
+    with a fixed seed."""
 
     @torch.inference_mode()
     def run(self, clouds: list[np.ndarray], view: np.ndarray) -> Raw:
@@ -131,8 +132,8 @@ class BaselineBackend(_PaperBackend):
 
 
 class ClipBackend(_PaperBackend):
-    """LiDARCap or NE. A person who is no frame of a clip fills a clip of equal frames. Of more points than the network
-    reads a fixed draw stays."""
+    """Runs LiDARCap or NE. Without `clip`, each cloud is repeated to fill a clip. Clouds with more points than the
+    network reads are subsampled with a fixed seed."""
 
     frames = CLIP_FRAMES
 
@@ -147,11 +148,11 @@ class ClipBackend(_PaperBackend):
             points, valid = pad_frames(clouds_by_name[name], config, [0] * len(rows), window=reach)
             inputs[name] = torch.as_tensor(points).to(self.device), torch.as_tensor(valid).to(self.device)
         index = torch.as_tensor(clip.windows, device=self.device)
-        # each frame once, however often it is in a clip
+        # each frame is encoded once, even if it repeats in its clip
         outputs = self.network.decode({name: value[index] for name, value in self.network.encode(inputs).items()})
         joints = np.full((len(clouds), len(SMPL24), 3), np.nan, np.float32)
         frame_rows, positions = np.unique(clip.windows, return_index=True)
-        # who fills a clip alone is in the middle of it
+        # for a clip of a single repeated frame, take the middle position
         is_alone = np.ptp(clip.windows, axis=1) == 0
         positions = positions + CLIP_FRAMES // 2 * is_alone[positions // CLIP_FRAMES]
         joints[frame_rows] = outputs.posed().flatten(0, 1)[positions].float().cpu().numpy()

@@ -1,7 +1,7 @@
-"""Test-time augmentation: a person is seen under several transforms, whose poses are averaged.
+"""Test-time augmentation: poses predicted under several transforms are averaged.
 
-A transform turns the person by quarters, mirrors them, and shifts the grid of voxels. The answers differ a little,
-where a point falls into another voxel; their mean is better than any of them.
+A transform rotates the person by a multiple of 90 degrees, mirrors it, and shifts the voxel grid. The predictions
+differ slightly because points fall into other voxels; their mean is more accurate than each of them.
 
 Legend: B people, J joints.
 """
@@ -15,15 +15,15 @@ from lidarpose.errors import check_int
 from lidarpose.models.voxelize import view_features
 from lidarpose.sample import PER_JOINT, PER_PERSON, Pose
 
-# a transform's answer counts by its mean confidence to this power: one flipped facing of four is outvoted
+# a prediction is weighted by its mean confidence to this power, so that one of four with a flipped heading is outvoted
 _POWER = 8
 _QUARTERS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 
 
 @dataclass(frozen=True)
 class TTATransform:
-    """How a person is seen: turned by so many quarters about z, then mirrored across y, about a center that is shifted
-    (3,) m."""
+    """A transform of a person: `turns` rotations by 90 degrees about z, then optionally mirroring of y, around a center
+    shifted by `shift` (3,) m."""
 
     turns: int = 0
     mirrored: bool = False
@@ -37,8 +37,8 @@ class TTATransform:
 
 
 IDENTITY, MIRRORED = TTATransform(), TTATransform(0, True)
-# no two shifts put the edges of fine voxels (6 cm) in the same place; a network has seen people of all headings in the
-# sensor's frame alone, so that turned ones come last
+# all shifts differ in where they put the edges of fine voxels (6 cm). Rotated transforms come last: networks are
+# trained on people of all headings, but only in the sensor's frame
 TRANSFORMS = (
     IDENTITY,
     TTATransform(0, True, (0.05, -0.04, 0.03)),
@@ -52,15 +52,15 @@ TRANSFORMS = (
 
 
 def tta_transforms(count: int) -> tuple[TTATransform, ...]:
-    """The first so many transforms; the very first is the identity. Raises InputError for none or too many."""
+    """The first `count` transforms, starting with the identity. Raises InputError for zero or too many."""
     return TRANSFORMS[: check_int("tta", count, least=1, most=len(TRANSFORMS))]
 
 
 def apply(
     transform: TTATransform, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Clouds (n, 3) m about centers (B, 3) under the transform, and their view features (B, 5) from a sensor at
-    origin (3,) or None."""
+    """Transforms clouds (n, 3) m around centers (B, 3). Returns the clouds and their view features (B, 5) from a sensor
+    at origin (3,), None if unknown."""
     R, shifted_centers = transform.R_view_person, centers + transform.shift
     view = np.stack([view_features(center, origin) for center in shifted_centers])
     view[:, :3] = view[:, :3] @ R.T
@@ -68,7 +68,7 @@ def apply(
 
 
 def invert(poses: Pose, transform: TTATransform) -> Pose:
-    """Poses of B people under the transform, brought back to the people's own frames."""
+    """Transforms poses of B people, predicted under the transform, back to the persons' own frames."""
     poses = replace(poses, joints=poses.joints @ transform.R_view_person + transform.shift)
     if not transform.mirrored:
         return poses
@@ -78,8 +78,7 @@ def invert(poses: Pose, transform: TTATransform) -> Pose:
 
 
 def average(poses: list[Pose]) -> Pose:
-    """One answer for B people: the mean of all, a person's answers weighted by their confidence where the network has
-    it."""
+    """The mean of several predictions for B people, weighted per person by confidence if the network predicts it."""
     if len(poses) == 1:
         return poses[0]
     names = [*_values(poses[0]), *(name for name in PER_PERSON if getattr(poses[0], name) is not None)]
@@ -87,19 +86,19 @@ def average(poses: list[Pose]) -> Pose:
     weight = np.ones(stacks["joints"].shape[:2])
     if "confidence" in stacks:
         weight = stacks["confidence"].mean(-1) ** _POWER
-        # where no answer is sure at all, all count the same
+        # equal weights if all confidences are zero
         weight = np.where(weight.sum(0) > 0, weight, 1.0)
     values: dict[str, Any] = {
         name: np.average(stack, 0, np.broadcast_to(weight.reshape(weight.shape + (1,) * (stack.ndim - 2)), stack.shape))
         for name, stack in stacks.items()
     }
     if "in_range" in values:
-        # out of range where most answers say so
+        # majority vote
         values["in_range"] = values["in_range"] > 0.5
     return replace(poses[0], **values)
 
 
 def _values(poses: Pose) -> dict[str, np.ndarray]:
-    """Joints and what the network says of each."""
+    """The joints and all per-joint values that are known, by name."""
     values = {name: getattr(poses, name) for name in ("joints", *PER_JOINT)}
     return {name: value for name, value in values.items() if value is not None}

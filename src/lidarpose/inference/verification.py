@@ -1,5 +1,5 @@
-"""Which detections are people: a small network says so of each. Those that are are posed by the default network, and
-boxes are drawn about their poses.
+"""Verification of detections: a small network classifies each detection as a person or not. People are then posed by
+the default network, and boxes are fitted to their poses.
 
 Legend: D detections.
 """
@@ -18,40 +18,40 @@ from lidarpose.models.decode import decoder, sigmoid
 from lidarpose.models.detector.detector import Detections
 from lidarpose.sample import MIN_POINTS, Box, Pose, facing_yaw
 
-# rows (m,) of a scan's points that are on nobody, and where people are (K, 2) m -> who else is beside them
+# rows (m,) of a scan's points that are not on people, and positions of these people (K, 2) m -> detections beside them
 DetectBeside = Callable[[np.ndarray, np.ndarray], Detections]
 
-# what is posed: a column so wide, and so far below and above the detection's box, m
+# the column of points that is verified and posed: radius, and margins below and above the detection's box, m
 _COLUMN, _BELOW, _ABOVE = 0.6, 0.15, 0.25
-# points around a detection that its final box may hold, m to each side
+# half width, m, of the region around a detection from which its final box may take points
 AROUND = 2.5
-# a box is so much larger than the joints on each side, m, beside another person no more than this; it ends half way to
-# the next person, less half a body
+# margin of a box around the joints on each side, m, and its minimum next to another person; next to one, the margin is
+# half the distance minus half a body
 _ROOM, _LEAST_ROOM, _HALF_BODY = 0.15, 0.1, 0.25
-# of two people whose pelvises are nearer than this the less certain one is the same person, m; nearer than the second
-# distance, the less certain one is posed once more, by the points in the box alone
+# if two pelvises are nearer than this, m, the lower-scoring detection is a duplicate; if nearer than the second
+# distance, the lower-scoring person is posed again using only the points in its box
 _SAME_PERSON, _CLOSE = 0.3, 0.8
-# places that are posed for each person that is asked for at most: some are the same person
+# detections posed per requested person if `max_people` is given: some are duplicates
 _PLACES = 2
-# so is who shares more than this with surer people, of the points in the box
+# a detection that shares more than this fraction of its box's points with higher-scoring detections is a duplicate, too
 _SHARED = 0.9
-# what the final score is made of, by detection: the scorer's logit; the verifier's log odds of a person; log of 1 + the
-# points of the column
+# features of the final score of a detection: the detector's logit, the verifier's log odds of a person, and log of
+# 1 + the number of points in the column
 FEATURES = ("logit", "verifier", "log_points")
-# their weights for a detector without its own
+# their weights for a detector whose header has none
 _FALLBACK_WEIGHTS = {"logit": 0.5, "verifier": 0.5}
-# log odds beyond this say hardly more: they count only by this share
+# log odds beyond `_MOST_ODDS` carry little more information: the excess is scaled by `_BEYOND_MOST`
 _MOST_ODDS, _BEYOND_MOST = 6.0, 0.01
-# the fewest and most points, between which a score is bounded before anybody is verified
+# minimum and maximum of the feature `log_points`, for the upper bound of scores before verification
 _LOG_POINTS = (np.log1p(MIN_POINTS), np.log1p(1e5))
-# whose points are left out where others are looked for beside them: people of at least this score, points so near to
-# their bones, m
+# when people beside others are searched for, the points of these others are removed: minimum score of these others,
+# and maximum distance of their points from the bones, m
 _SURE_SCORE, _BODY = 0.5, 0.18
-# who is expected may have moved by so much out of the box, m
+# distance, m, by which a known person may have moved out of the expected box
 _MOVED = 0.15
-# a place is known to hold nobody below this share of the least score
+# detections below this fraction of the score threshold are remembered as rejected
 _NOBODY = 1 / 3
-# decimals of meters in boxes, as they are written
+# decimals of the numbers in boxes, as they are written to files
 _DECIMALS = 4
 
 
@@ -60,35 +60,37 @@ def _bundled(name: str) -> Backend:
 
 
 def verification_features(detections: Detections, points: np.ndarray, origin: np.ndarray | None) -> np.ndarray:
-    """What the final score of detections in points (n, 3) m, level, from a sensor at origin (3,) or None is made of:
-    (D, 3) in the order of `FEATURES`, NaN of fewer than 5 points."""
+    """Features (D, 3) of the final score of detections in points (n, 3) m in the level frame, in the order of
+    `FEATURES`. origin (3,) m: sensor position, None if unknown. The verifier's log odds are NaN for fewer than 5
+    points."""
     near_rows = rows_near(detections.centers, points, AROUND)
     return Crops(detections, dict(enumerate(points[rows] for rows in near_rows)), origin).verdicts()[0]
 
 
 def final_score(features: np.ndarray, header: dict) -> np.ndarray:
-    """features (D, 3) -> (D,) in [0, 1]: the probability that a detection is a person, by the detector's header; 0 of
-    what could not be verified."""
+    """features (D, 3) -> (D,) in [0, 1]: the probability that a detection is a person, with the weights and calibration
+    of the detector's header; 0 for detections that were not verified."""
     verification = header.get("verification") or {}
     logit = final_logit(features, header)
     calibration = verification.get("calibration") or header.get("calibration")
-    # of a network that is not calibrated yet as it comes
+    # without calibration, the plain sigmoid
     probability = sigmoid(logit) if calibration is None else np.interp(logit, *calibration)
-    # as boxes state it
+    # rounded as in boxes
     return np.nan_to_num(probability).round(_DECIMALS)
 
 
 def final_logit(features: np.ndarray, header: dict) -> np.ndarray:
-    """features (D, 3) -> (D,): what the final score rises with, which ends at some probability."""
+    """features (D, 3) -> (D,): the logit of the final score, which still ranks detections where the calibrated score
+    saturates."""
     verification = header.get("verification") or {}
-    # the scores of detectors before 0.3 were of poses
+    # detectors before 0.3 have weights for other features, taken from poses
     weights = verification if "verifier" in verification else _FALLBACK_WEIGHTS
     return features @ [weights.get(name, 0.0) for name in FEATURES] + weights.get("bias", 0.0)
 
 
 def surest_rows(scores: np.ndarray, pelvises: np.ndarray, logits: np.ndarray) -> list[int]:
-    """Of detections with scores (D,) and pelvises (D, 3) m, NaN where there is none, the rows of different people, the
-    surest first; of equal scores by logits (D,)."""
+    """Rows of detections of different people, highest score first; equal scores are ordered by logits (D,). Detections
+    without a pelvis (D, 3) m, which is NaN then, and duplicates are left out."""
     rows: list[int] = []
     for i in _surest_first(scores, logits).tolist():
         is_same = (np.linalg.norm(pelvises[rows] - pelvises[i], axis=1) < _SAME_PERSON).any()
@@ -98,30 +100,30 @@ def surest_rows(scores: np.ndarray, pelvises: np.ndarray, logits: np.ndarray) ->
 
 
 def _surest_first(scores: np.ndarray, logits: np.ndarray) -> np.ndarray:
-    """(D,): rows by falling score, of equal ones by logits."""
+    """(D,): rows by descending score; equal scores by descending logit."""
     return np.lexsort((-logits, -scores))
 
 
 def inside_column(points: np.ndarray, center: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Which points (n, 3) m are posed of a detection with this center and box size (3,) m: (n,) bool."""
+    """points (n, 3) m -> (n,) bool: in the column of a detection with this center and box size (3,) m."""
     height = points[:, 2] - center[2]
     is_inside = (height > -size[2] / 2 - _BELOW) & (height < size[2] / 2 + _ABOVE)
     return is_inside & (np.hypot(*(points[:, :2] - center[:2]).T) < _COLUMN)
 
 
 class Crops:
-    """The columns about detections, of which those of `MIN_POINTS` and more are run through networks."""
+    """The columns of points around detections. Those with at least `MIN_POINTS` points are run through networks."""
 
     def __init__(self, detections: Detections, clouds: Mapping[int, np.ndarray], origin: np.ndarray | None):
-        """clouds: by rows of `detections`, the points (n, 3) m near each; origin (3,) m: the sensor, None: unknown."""
+        """clouds: points (n, 3) m near each detection, by row; origin (3,) m: sensor position, None if unknown."""
         self.detections, self.origin = detections, origin
         self.columns = [np.zeros((0, 3))] * len(detections)
         for i, cloud in clouds.items():
             self.columns[i] = cloud[inside_column(cloud, detections.centers[i], detections.sizes[i])]
 
     def verdicts(self) -> tuple[np.ndarray, np.ndarray]:
-        """features (D, 3), see `FEATURES`, and by the verifier the probability that whoever is there rides or sits in a
-        wheelchair (D,); of too few points NaN."""
+        """Runs the verifier. Returns features (D, 3), see `FEATURES`, and the probability (D,) that the person rides or
+        sits in a wheelchair; the verifier's values are NaN for too few points."""
         logits = np.full((len(self.detections), 2), np.nan)
         centers, all_rows = self.detections.centers, np.arange(len(self.detections))
         for rows, raw in _run(self.columns, centers, self.origin, all_rows, _bundled(VERIFIER)):
@@ -131,13 +133,14 @@ class Crops:
         return np.column_stack([self.detections.logit, odds, log_points]), sigmoid(logits[:, 1])
 
     def poses(self, rows: np.ndarray) -> Pose:
-        """By the default network, joints (D, 26, 3) m; NaN of all but the rows (C,), and of too few points."""
+        """Poses of the given rows (C,) by the default network: joints (D, 26, 3) m, NaN for other rows and for too few
+        points."""
         return _posed(self.columns, self.detections.centers, self.origin, rows)
 
 
 def _posed(clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None, rows: np.ndarray) -> Pose:
-    """Clouds (n, 3) m about centers (D, 3) m by the default network: joints (D, 26, 3) m, NaN of all but the rows (C,),
-    and of too few points."""
+    """Poses of the given rows (C,) of clouds (n, 3) m around centers (D, 3) m by the default network: joints
+    (D, 26, 3) m, NaN for other rows and for too few points."""
     backend = _bundled(DEFAULT)
     skeleton = backend.header.skeleton
     joints = np.full((len(centers), len(skeleton), 3), np.nan)
@@ -149,7 +152,7 @@ def _posed(clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | N
 def _run(
     clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None, rows: np.ndarray, backend: Backend
 ) -> Iterator[tuple[list[int], Raw]]:
-    """Batches of those among the rows that have enough points, and what a network says of them."""
+    """Runs a network on the given rows that have enough points. Yields the rows and the raw outputs of each batch."""
     enough = (i for i in rows.tolist() if len(clouds[i]) >= MIN_POINTS)
     ordered = sorted(enough, key=lambda i: len(clouds[i]))
     for start in range(0, len(ordered), backend.batch):
@@ -158,7 +161,7 @@ def _run(
 
 
 def _highest_score(detections: Detections, header: dict) -> np.ndarray:
-    """(D,): what `final_score` can be at most, whatever the verifier says."""
+    """(D,): upper bound of `final_score` for any output of the verifier."""
     odds = _MOST_ODDS + 1
     columns = (np.broadcast_arrays(detections.logit, odds, log_points) for log_points in _LOG_POINTS)
     return np.max([final_score(np.stack(own, -1), header) for own in columns], axis=0)
@@ -166,8 +169,11 @@ def _highest_score(detections: Detections, header: dict) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VerifiedPeople:
-    """N people, level, surest first: boxes, rows of their points, pelvises (N, 3) m, verified (N,) bool, logits (N,),
-    which scores rise with, NaN of known people; rejected (R, 3) m: detections that were nobody."""
+    """N people in the level frame, highest score first.
+
+    boxes; rows: of their points; pelvises (N, 3) m; logits (N,): of the final scores, NaN for known people; verified
+    (N,) bool: False for known people; rejected (R, 3) m: centers of rejected detections.
+    """
 
     boxes: list[Box]
     rows: list[np.ndarray]
@@ -187,14 +193,18 @@ def verified(
     known: KnownPlaces | None = None,
     detect_beside: DetectBeside | None = None,
 ) -> VerifiedPeople:
-    """The people among the detections, surest first, in boxes about their poses; of known people about where they are
-    expected.
+    """Verifies detections and returns the people among them, highest score first, with boxes fitted to their poses.
+    Known people keep their expected boxes.
 
     Args:
-        points: (n, 3) m, level, from a sensor at origin (3,) or None.
-        header: the detector's.
-        least_score: people of a lower score are left out; near where tracks are expected, `WEAK_SCORE` is enough.
-        detect_beside: also looks for people beside others, whom it had taken for one with them.
+        detections: in the level frame.
+        points: (n, 3) m in the level frame.
+        origin: (3,) m, sensor position, None if unknown.
+        header: the header of the detector.
+        least_score: score threshold; near expected tracks, `WEAK_SCORE` is the threshold.
+        max_people: maximum number of people.
+        known: people and rejected positions from earlier frames of a recording.
+        detect_beside: detects further people beside others, who were merged with them in the first detection.
     """
     highest_scores = _highest_score(detections, header)
     known_index, thresholds = np.full(len(detections), -1), np.full(len(detections), least_score)
@@ -202,7 +212,7 @@ def verified(
         known_index = known.index_of(detections.centers, highest_scores >= least_score)
         thresholds = known.least_scores(detections.centers, known_index, least_score)
     possible_rows = np.flatnonzero(highest_scores >= thresholds)
-    # who is expected needs neither verdict nor pose
+    # detections of expected people are neither verified nor posed
     posed_from = thresholds if detect_beside is None else np.minimum(thresholds, _SURE_SCORE)
     posed_from = np.where(known_index < 0, posed_from, np.inf)
     places = _score_detections(detections, points, origin, header, posed_from, max_people, possible_rows)
@@ -231,15 +241,15 @@ def verified(
     )
 
 
-# of a person: the row of the detection, the box, and rows of the points in it
+# row of the detection, box, and rows of the points in the box
 _FittedBox = tuple[int, Box, np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _ScoredDetections:
-    """What is known of D detections: scores and logits (D,), see `final_score`, NaN where they were not looked at;
-    mounted (D,), the probability; joints (D, J, 3) and pelvises (D, 3) m, NaN of who is not posed; near_rows: of each
-    the rows of the points about it."""
+    """Results for D detections: scores and logits (D,), see `final_score` and `final_logit`; mounted (D,): the
+    probability; joints (D, J, 3) and pelvises (D, 3) m, NaN for detections that are not posed; near_rows: for each
+    detection, the rows of the points around it. Detections that are not verified have score 0 and logit NaN."""
 
     scores: np.ndarray
     logits: np.ndarray
@@ -249,7 +259,7 @@ class _ScoredDetections:
     near_rows: list[np.ndarray]
 
     def joined(self, other: "_ScoredDetections", other_rows: np.ndarray) -> "_ScoredDetections":
-        """These, then the others, which know the points of some rows alone."""
+        """Appends other detections, made in a subset of the points. other_rows (m,): the rows of this subset."""
         near_rows = self.near_rows + [other_rows[rows] for rows in other.near_rows]
         arrays = {
             name: np.concatenate([values, getattr(other, name)])
@@ -268,8 +278,8 @@ def _score_detections(
     max_people: int | None,
     rows: np.ndarray,
 ) -> _ScoredDetections:
-    """Verifies the detections of some rows, and poses those whose scores are at least `posed_from` (D,); where that is
-    infinite nobody is verified."""
+    """Verifies the detections of the given rows and poses those with scores of at least `posed_from` (D,). Detections
+    for which that is infinite are not verified."""
     near_rows = [np.zeros(0, int)] * len(detections)
     for row, own_rows in zip(rows.tolist(), rows_near(detections.centers[rows], points, AROUND), strict=True):
         near_rows[row] = own_rows
@@ -297,7 +307,8 @@ def _add_people_beside(
     max_people: int | None,
     detect_beside: DetectBeside,
 ) -> _ScoredDetections:
-    """The places, and then those beside sure people, of what is left without these people's points."""
+    """Appends detections beside confident people, made in the points that remain without the points on these
+    people."""
     sure_pelvises = np.where(places.scores[:, None] >= _SURE_SCORE, places.pelvises, np.nan)
     people = _fit_boxes(replace(places, pelvises=sure_pelvises), points, _SURE_SCORE, None, known_boxes)
     posed_rows = [row for row, _, _ in people if row not in known_boxes]
@@ -314,14 +325,15 @@ def _add_people_beside(
 def _on_people(
     places: _ScoredDetections, people: list[_FittedBox], points: np.ndarray, known_boxes: dict[int, Box]
 ) -> np.ndarray:
-    """(n,) bool: which points are on the bodies of people, as of `_fit_boxes`, or in the boxes of known ones."""
+    """(n,) bool: whether a point is on the body of one of the people from `_fit_boxes`, or in the box of a known
+    one."""
     is_body = np.zeros(len(points), bool)
     starts, ends = np.array(_bundled(DEFAULT).header.skeleton.bones).T
     for row, _, own_rows in people:
         if row not in known_boxes:
             own_rows, joints = places.near_rows[row], places.joints[row]
             near_points, low, high = points[own_rows], joints.min(0) - _BODY, joints.max(0) + _BODY
-            # far fewer than those about a person
+            # a cheap test first: it leaves far fewer points
             own_rows = own_rows[((near_points > low) & (near_points < high)).all(1)]
             distance = distance_to_segments(points[own_rows], joints[starts], joints[ends])
             own_rows = own_rows[distance < _BODY]
@@ -332,11 +344,12 @@ def _on_people(
 def _without_repeats(
     people: list[_FittedBox], places: _ScoredDetections, points: np.ndarray, origin: np.ndarray | None
 ) -> list[_FittedBox]:
-    """The people as of `_fit_boxes`, without those whom the points in their boxes alone show where a surer one is: what
-    is left of somebody's points may look like one more beside them."""
+    """The people from `_fit_boxes` without duplicates: a person next to a higher-scoring one is dropped if the pose of
+    the points in its own box coincides with the higher-scoring one. The remaining points of a person may look like a
+    second person beside the first."""
     pelvises = places.pelvises[[row for row, _, _ in people]].reshape(-1, 3)
     distance = np.linalg.norm(pelvises[:, None] - pelvises[None], axis=-1)
-    # to the nearest surer one
+    # near any higher-scoring person
     close = np.flatnonzero(np.tril(distance < _CLOSE, -1).any(1))
     if not len(close):
         return people
@@ -357,8 +370,10 @@ def _fit_boxes(
     max_people: int | None,
     known_boxes: dict[int, Box],
 ) -> list[_FittedBox]:
-    """The different people of places that have a pelvis, the surest first; neighbor_score: people of this score, and
-    those who are as sure as oneself, are kept out of the own box; known_boxes: by row, where known people are expected.
+    """Fits boxes to the distinct people among detections with a pelvis, highest score first.
+
+    neighbor_score: a box is shrunk to exclude neighbors with at least this score or with a score not lower than its
+    own; known_boxes: expected boxes of known people, by row.
     """
     scores, pelvises = places.scores, places.pelvises
     skeleton = _bundled(DEFAULT).header.skeleton
@@ -384,18 +399,17 @@ def _fit_boxes(
 
 
 def box_about(pose: Pose, nearest_distance: float) -> Box:
-    """The box of a person by the pose, joints (J, 3) m; nearest_distance: to the next person, m, who is to be kept
-    out."""
+    """The box of a person around its pose, joints (J, 3) m. nearest_distance: m, to the nearest person to exclude."""
     yaw = facing_yaw(pose)
     R_level_local = rotation_about("z", yaw)
     local_joints = pose.joints @ R_level_local
     margin = max(_LEAST_ROOM, min(_ROOM, nearest_distance / 2 - _HALF_BODY))
-    # soles are nearer to the lowest joint than the top of the head to the highest
+    # the soles are nearer to the lowest joint than the top of the head is to the highest joint
     low, high = local_joints.min(0) - [margin, margin, 0.8 * _ROOM], local_joints.max(0) + [margin, margin, 1.2 * _ROOM]
     return rounded(Box(center=R_level_local @ ((low + high) / 2), size=high - low, yaw=yaw))
 
 
 def rounded(box: Box) -> Box:
-    """As it is written: a file of boxes crops the same points."""
+    """The box rounded as it is written, so that a file of boxes crops the same points."""
     center, size = box.center.round(_DECIMALS), box.size.round(_DECIMALS)
     return replace(box, center=center, size=size, yaw=round(box.yaw, _DECIMALS))

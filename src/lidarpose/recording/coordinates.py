@@ -1,5 +1,5 @@
-"""Coordinates of a recording: those of the sensor, in which points are, and of the fixed frame, in which tracks live:
-the world's where the sensor's poses are known, else the sensor's with z up."""
+"""Coordinate frames of a recording: points are in the sensor frame, tracks in the fixed frame. The fixed frame is the
+world frame if the sensor poses are known, otherwise the sensor frame rotated to z up."""
 
 from typing import Any
 
@@ -9,22 +9,23 @@ from lidarpose.geometry import rigid_transform, rotation_of_boxes, transform_poi
 
 
 class FixedFrame:
-    """The fixed frame as frames come. up: of the points, as in `predict`."""
+    """The transform to the fixed frame, updated frame by frame. up: up axis of the points, as in `predict`."""
 
     def __init__(self, up: str):
         self.R_upright = rotation_of_boxes(up)
         self.T_world_sensor: np.ndarray | None = None
 
     def from_sensor(self, T_world_sensor: np.ndarray | list | None) -> np.ndarray:
-        """T_fixed_sensor (4, 4) of the next frame; without the sensor's pose, where others have it, the last one."""
+        """T_fixed_sensor (4, 4) of the next frame; if the sensor pose of this frame is missing, that of the last
+        frame."""
         if T_world_sensor is not None:
             self.T_world_sensor = np.asarray(T_world_sensor, float)
         return rigid_transform(self.R_upright, np.zeros(3)) if self.T_world_sensor is None else self.T_world_sensor
 
 
 def moved_yaw(yaw: float, T: np.ndarray, R_from: np.ndarray | None = None, R_to: np.ndarray | None = None) -> float:
-    """The yaw of a box moved by T (4, 4), rad. R_from, R_to (3, 3): as of `rotation_of_boxes`, of both frames; None
-    where z is up."""
+    """The yaw, rad, of a box transformed by T (4, 4). R_from, R_to (3, 3): `rotation_of_boxes` of the source and target
+    frame, None if z is up."""
     heading = np.array([np.cos(yaw), np.sin(yaw), 0.0])
     heading = T[:3, :3] @ (heading if R_from is None else R_from.T @ heading)
     x, y, _ = heading if R_to is None else R_to @ heading
@@ -32,7 +33,8 @@ def moved_yaw(yaw: float, T: np.ndarray, R_from: np.ndarray | None = None, R_to:
 
 
 def in_world(line: dict[str, Any], up: str = "z") -> dict[str, Any]:
-    """The line with joints and boxes in the world's frame, where the sensor's pose is known. up: of the sensor's."""
+    """The line with joints and boxes in the world frame if the sensor pose is known, else unchanged. up: up axis of the
+    sensor frame."""
     if line["T_world_sensor"] is None:
         return line
     T = np.array(line["T_world_sensor"])
@@ -49,5 +51,5 @@ def in_world(line: dict[str, Any], up: str = "z") -> dict[str, Any]:
 
 
 def rounded_points(T: np.ndarray, points: Any) -> list:
-    """Points (..., 3) m moved by T (4, 4), as lines hold them."""
+    """Points (..., 3) m transformed by T (4, 4), rounded as in lines."""
     return transform_points(T, np.asarray(points)).round(4).tolist()

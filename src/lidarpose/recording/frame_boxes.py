@@ -1,4 +1,4 @@
-"""People's boxes of many frames: a folder with a file a frame, or one JSON or JSONL file that names its frames."""
+"""Boxes of people in many frames: a folder with one file per frame, or one JSON or JSONL file with frame numbers."""
 
 import json
 import os
@@ -18,17 +18,17 @@ _SUFFIXES = (".json", ".npy", ".txt")
 
 
 class FrameBoxes:
-    """The boxes of a recording's people by frame.
+    """The boxes of the people in a recording, by frame.
 
     Args:
-        given: a folder, whose files are named as the frames are (`ID.json`, `ID.npy`, KITTI's `ID.txt`, or
-            `ID.boxes.json`, as `lidarpose detect` names them); or a file: JSON lines or a list of
-            `{"frame": 0, "people": [...]}`, the frame by number or by id; or a mapping from either to whatever
-            `read_boxes` takes.
-        calib: KITTI's calibration, as in `read_boxes`.
+        given: a folder of files named like the frames (`ID.json`, `ID.npy`, KITTI's `ID.txt`, or `ID.boxes.json`, as
+            `lidarpose detect` names them); or a file of JSON lines or a JSON list of `{"frame": 0, "people": [...]}`,
+            where the frame is a number or an id; or a mapping from frame numbers or ids to anything that `read_boxes`
+            takes.
+        calib: KITTI calibration, see `read_boxes`.
 
     Raises:
-        InputError: one line that names the file and what was expected.
+        InputError: the message names the file and what was expected.
     """
 
     def __init__(self, given: "str | os.PathLike | Mapping[Any, Any]", *, calib: str | os.PathLike | None = None):
@@ -51,7 +51,7 @@ class FrameBoxes:
             raise file_error(self._name, f"expected boxes a frame, files named as the frames are or {_FORM}, got none")
 
     def of(self, frame: Frame | DamagedFrame) -> Boxes | None:
-        """The boxes of a frame; None where none are given. Raises InputError for those that cannot be read."""
+        """The boxes of a frame, None if none are given. Raises InputError for boxes that cannot be read."""
         key = frame.id if frame.id in self._by_frame else str(frame.index)
         if key not in self._by_frame:
             return None
@@ -63,14 +63,15 @@ class FrameBoxes:
             raise error if isinstance(boxes, str | os.PathLike) else file_error(f"frame {key}", error) from None
 
     def check_used(self, last: str) -> None:
-        """Raises InputError where no frame up to the last one's id has boxes, so that they are of something else."""
+        """Raises InputError if none of the frames had boxes, which means that the boxes belong to another recording.
+        last: id of the last frame."""
         if not self.was_used:
             ids = shorten(", ".join(list(self._by_frame)[:3]))
             raise file_error(self._name, f"has boxes of frames {ids}, none of which is here: the last one is {last}")
 
 
 def _by_frame(path: str | os.PathLike) -> dict[str, Any]:
-    """Entries of a file by number or id of the frame."""
+    """The entries of a file by frame number or id."""
     data = read_bytes(path, expected="a folder or a file of boxes")
     try:
         text = data.decode("utf-8-sig")

@@ -1,4 +1,4 @@
-"""What the frames before say of people: their tracks, whose scores still hold, and which places held nobody."""
+"""State carried between the frames of a recording: tracks, their last verification, and rejected positions."""
 
 from dataclasses import replace
 from typing import Any, NamedTuple, cast
@@ -15,20 +15,21 @@ from lidarpose.tracking.live import LiveFilter
 from lidarpose.tracking.smoothing import MAX_LATE
 from lidarpose.tracking.tracker import Tracker, TrackState
 
-# a known person is verified anew after so many seconds, and a place that held nobody looked at: between the two, so
-# that not all are due in one frame
+# time, s, after which known people and rejected positions are verified again: spread over this interval, so that not
+# all are due in the same frame
 _TRUSTED = (1.6, 2.4)
-# who was not seen for longer, s, or may be farther off than this, m, is searched for like anybody else
+# maximum time since a track was last seen, s, and maximum standard deviation of its position, m, for a known person;
+# beyond them, the person is verified like any other detection
 _RECENT, _MOST_DEVIATION = 0.5, 0.35
-# a detection within so many m, and standard deviations more, of where a track is expected may continue it
+# search radius around the expected position of a track: constant part, m, and number of standard deviations
 _NEAR, _NEAR_DEVIATIONS = 0.4, 3.0
-# what is remembered of a person whom nobody sees, s
+# time, s, after which the verification of an unseen person is dropped
 _FORGOTTEN = 10.0
 
 
 class _Verified(NamedTuple):
-    """Of a track: time s of the last verification, the score and mounted that it gave; offset (3,) m of the pelvis from
-    the box's center, in the fixed frame."""
+    """The last verification of a track: time s; score and mounted: its results; offset (3,) m: from the box center to
+    the pelvis, in the fixed frame."""
 
     time: float
     score: float
@@ -37,12 +38,12 @@ class _Verified(NamedTuple):
 
 
 class KnownPeople:
-    """The people of a recording as frames come, each with the number of a track.
+    """Tracks the people of a recording frame by frame.
 
     Args:
-        up: of the points, as in `predict`.
-        least_score: people of a lower one continue tracks and begin none.
-        live: poses are made steady by the past.
+        up: up axis of the points, as in `predict`.
+        least_score: minimum score to start a track; lower-scoring people only continue tracks.
+        live: whether to smooth poses using past frames only.
     """
 
     def __init__(self, *, up: str, least_score: float, live: bool):
@@ -56,7 +57,8 @@ class KnownPeople:
         self._filters: dict[int, tuple[float, LiveFilter]] = {}
 
     def expected(self, time: float, T_fixed_sensor: np.ndarray) -> KnownPlaces:
-        """Where people are expected in the next frame, those first who need no verification, in the sensor's frame."""
+        """Expected positions of people in the next frame, in the sensor frame; people who need no verification come
+        first."""
         T_sensor_fixed = inverse_transform(T_fixed_sensor)
         states = sorted(self._tracker.predicted(time), key=lambda state: not self._is_trusted(state, time))
         boxes, pelvises = [], []
@@ -80,7 +82,7 @@ class KnownPeople:
         )
 
     def _is_trusted(self, state: TrackState, time: float) -> bool:
-        """Whether somebody needs no verification."""
+        """Whether a track needs no verification."""
         verification = self._verified.get(state.id)
         if (
             verification is None
@@ -91,7 +93,7 @@ class KnownPeople:
         return state.age <= _RECENT and state.position_sd <= _MOST_DEVIATION
 
     def update(self, time: float, scan: Scan, poses: Poses, T_fixed_sensor: np.ndarray) -> Poses:
-        """The people of a frame with the numbers of their tracks; of a crop the one person is number 0."""
+        """Updates the tracks with a frame. Returns its people with track ids; the person of a crop has id 0."""
         if scan.boxes is None:
             people = tuple(replace(person, id=0) for person in poses)
         else:
@@ -102,12 +104,12 @@ class KnownPeople:
         if scan.rejected is not None:
             places = transform_points(T_fixed_sensor, scan.rejected)
             self._rejected = np.concatenate([self._rejected, np.insert(places, 3, time, axis=1)])
-        # whoever is searched for, or was given, has a box
+        # detected and given people all have boxes
         sensor_boxes = [cast(Box, person.box) for person in poses]
         pelvises = [_pelvis(person.pose) for person in poses]
         is_verified = np.zeros(len(sensor_boxes), bool) if scan.verified is None else scan.verified
         if scan.verified is not None and scan.pelvises is not None:
-            # the box of somebody known goes with the pelvis
+            # the box of a known person, which is only expected, is moved with the predicted pelvis
             for i in np.flatnonzero(~scan.verified).tolist():
                 pelvis = scan.pelvises[i] if pelvises[i] is None else pelvises[i]
                 sensor_boxes[i] = replace(
@@ -121,7 +123,7 @@ class KnownPeople:
             )
             for box in sensor_boxes
         ]
-        # the surest are first
+        # boxes are sorted by score
         num_strong = sum(box.score is None or box.score >= self._least_score for box in boxes)
         ids = self._tracker.update(time, boxes[:num_strong], boxes[num_strong:])
         for id, box, pelvis, is_new in zip(ids, boxes, pelvises, is_verified, strict=True):
@@ -135,7 +137,7 @@ class KnownPeople:
         return tuple(replace(person, id=id, box=replace(box, id=id)) for id, person, box in people if id >= 0)
 
     def _steadied(self, time: float, people: tuple[PersonPose, ...], T_fixed_sensor: np.ndarray) -> tuple:
-        """Poses by the past of their tracks."""
+        """Smooths poses with the past of their tracks."""
         T_sensor_fixed = inverse_transform(T_fixed_sensor)
         gap = self._tracker.max_gap
         self._filters = {id: entry for id, entry in self._filters.items() if -MAX_LATE <= time - entry[0] <= gap}
@@ -143,7 +145,7 @@ class KnownPeople:
         for person in people:
             if person.pose is not None and isinstance(person.id, int):
                 latest_time, live_filter = self._filters.get(person.id) or (time, LiveFilter(person.skeleton))
-                # a frame that comes late stays as it is
+                # a late frame is not smoothed
                 if time >= latest_time:
                     joints = transform_points(T_fixed_sensor, person.pose.joints)
                     pose = cast(Pose, live_filter.update(time, replace(person.pose, joints=joints)))
@@ -153,7 +155,7 @@ class KnownPeople:
         return tuple(steady_people)
 
     def state(self) -> dict[str, Any]:
-        """What the frames so far said, as JSON holds it."""
+        """The state after the frames so far, as JSON values."""
         T_world_sensor = self.fixed.T_world_sensor
         return {
             "tracker": self._tracker.state(),
@@ -164,7 +166,7 @@ class KnownPeople:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Goes on where those whose `state()` this is would."""
+        """Resumes from the result of `state()`."""
         self._tracker = Tracker.from_state(state["tracker"])
         self.fixed.from_sensor(state["T_world_sensor"])
         self._verified = {int(id): _Verified(*values) for id, values in state["verified"].items()}
@@ -176,11 +178,11 @@ class KnownPeople:
 
 
 def _trusted(number: Any) -> Any:
-    """For how long what was verified holds, s."""
+    """Time, s, for which a verification remains valid. number: id of the track or index of the rejected position."""
     shortest, longest = _TRUSTED
     return shortest + (longest - shortest) * (number % 5) / 4
 
 
 def _pelvis(pose: Pose | None) -> np.ndarray | None:
-    """(3,) m, or half way between the hips where the skeleton has none."""
+    """The pelvis (3,) m, or the midpoint of the hips if the skeleton has no pelvis; None without a pose."""
     return None if pose is None else pose.joints[list(pose.skeleton.middle)].mean(0)

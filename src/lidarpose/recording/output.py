@@ -1,7 +1,7 @@
-"""Results of recordings that grow as they are made and go on after a kill.
+"""Incremental output for recordings, which can be resumed after the process was killed.
 
-While frames come, RESULT.part holds a finished line each, and RESULT.part.json beside it how it is made and what the
-frames so far said of the next ones. At the end the lines become the result, whole.
+While frames are processed, RESULT.part holds one finished line per frame, and RESULT.part.json beside it the options
+and the state needed to resume. At the end, the lines are written to the result as a whole.
 """
 
 import json
@@ -27,24 +27,24 @@ from lidarpose.recording.steady_tracks import smoothed_lines
 try:
     import fcntl
 except ImportError:
-    # Windows has none
+    # not available on Windows
     fcntl = None  # type: ignore[assignment]
 
 
 class PartFile:
-    """The finished lines of a result that is not whole yet.
+    """The finished lines of an incomplete result.
 
     Args:
-        result: the file that is to be; `.part` and `.part.json` are added to its name.
-        command: what the lines depend on, as JSON holds it: lines of another command are not gone on with.
+        result: the final file; `.part` and `.part.json` are appended to its name.
+        command: all options that the lines depend on, as JSON values; lines of another command are not resumed.
     """
 
     def __init__(self, result: Path, command: dict[str, Any]):
         self.path = result.with_name(result.name + ".part")
         self.state_path = result.with_name(result.name + ".part.json")
         self.command = json.loads(json.dumps(command))
-        # what was found: frames that are finished, the last one's index, id and digest, the predictor's state, and,
-        # where it is of another command, what differs
+        # from an existing part: number of finished frames; index, id and digest of the last one; state of the
+        # predictor; names of the options that differ if it belongs to another command
         self.frames = 0
         self.last: tuple[int, str, int] | None = None
         self.state: dict[str, Any] | None = None
@@ -53,21 +53,21 @@ class PartFile:
         parent = self.path.parent
         self._new_folders = [folder for folder in (parent, *parent.parents) if not folder.exists()]
         parent.mkdir(parents=True, exist_ok=True)
-        # neither emptied nor read before it is this process's own
+        # do not truncate or read the file before it is locked by this process
         self._file = os.fdopen(os.open(self.path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666), "r+b")
         if not _is_locked(self._file):
             self._file.close()
             raise file_error(self.path, "another lidarpose writes it: wait for its end, or choose another --out")
-        # what is there stays until there is a line to write: a command that is wrong costs nothing
+        # an existing part is kept until there is a line to write, so that a wrong command destroys nothing
         self._size: int | None = self._read()
 
     def _read(self) -> int:
-        """How many bytes of the part hold finished lines of this command."""
+        """Number of bytes of the part that hold finished lines of this command."""
         try:
             content = json.loads(self.state_path.read_bytes())
             command, size, frames, state = (content[name] for name in ("command", "bytes", "frames", "state"))
             index, id, digest = content["last"]
-            # a power cut may leave the state of lines that are not there
+            # after a power failure, the state may refer to lines that were not written
             is_whole = self._last_line(size) == (frames, index, id)
             if not (is_whole and isinstance(command, dict) and isinstance(state, dict)):
                 return 0
@@ -81,8 +81,8 @@ class PartFile:
         return size
 
     def _last_line(self, size: int) -> tuple[int, int, str]:
-        """How many lines so many bytes are, and the last one's frame and id. Raises ValueError where they are not whole
-        lines of JSON."""
+        """Number of lines in the first `size` bytes, and frame and id of the last line. Raises ValueError if the bytes
+        are not whole lines of JSON."""
         count, length, text = 0, 0, b""
         with open(self.path, "rb") as file:
             while length < size and (text := file.readline()):
@@ -101,15 +101,15 @@ class PartFile:
         self._file.close()
 
     def _cut(self) -> None:
-        """Leaves the finished lines of this command alone."""
+        """Truncates the file to the finished lines of this command."""
         if self._size is not None:
             self._file.truncate(self._size)
             self._file.seek(self._size)
             self._size = None
 
     def append(self, frame: FramePoses, state: dict[str, Any], digest: int) -> None:
-        """One more finished frame; digest: of its points. A kill in between costs this frame: lines without their state
-        are cut off."""
+        """Appends a finished frame. digest: of its points. If the process is killed during the call, the frame is lost:
+        lines without a state are truncated on resume."""
         self.frames, self.last, self.state = self.frames + 1, (frame.index, frame.id, digest), state
         temporary = self.state_path.with_name(self.state_path.name + ".new")
         try:
@@ -131,20 +131,20 @@ class PartFile:
             raise write_error(self.path, self.path.parent, error) from None
 
     def lines(self) -> Iterator[dict[str, Any]]:
-        """The finished lines."""
+        """Reads the finished lines."""
         self._cut()
         with open(self.path, "rb") as file:
             yield from map(json.loads, file)
 
     def remove(self) -> None:
-        """Removes it, and the folders that were made for it, where they hold nothing else."""
-        # while it is locked: after it is closed, another process may have begun
+        """Removes the part, and the folders that were created for it if they are empty."""
+        # remove it while it is locked: once it is closed, another process may open it
         for path in (self.state_path, self.path):
             with suppress(OSError):
                 path.unlink()
         self._file.close()
         if fcntl is None:
-            # Windows does not let go of a file that is open
+            # Windows cannot remove open files
             with suppress(OSError):
                 self.path.unlink()
         for folder in self._new_folders:
@@ -153,7 +153,8 @@ class PartFile:
 
 
 def _is_locked(file: BinaryIO) -> bool:
-    """Whether the file is this process's until it is closed; True too where a system or a disk knows no locks."""
+    """Locks a file until it is closed. Returns whether this process holds the lock; True as well if the system or disk
+    does not support locks."""
     if fcntl is None:
         return True
     try:
@@ -162,14 +163,17 @@ def _is_locked(file: BinaryIO) -> bool:
         return False
     except OSError:
         pass
-    # whoever held it may have removed it in between
+    # the previous holder of the lock may have removed the file in the meantime
     return os.fstat(file.fileno()).st_nlink > 0
 
 
 @dataclass
 class Summary:
-    """What a recording holds: counts, of frames also how many are in the world's frame, and of the warnings of
-    frames and people an example and in how many frames; those that differ in numbers alone are one.
+    """Statistics of a recording's result.
+
+    frames, people, damaged, in_world: counts; damaged and in_world count frames, the latter those in the world frame;
+    tracks: ids; first_error: message of the first damaged frame; warnings: an example of each kind of warning of frames
+    and people; warned: number of frames with each kind. Warnings that differ only in numbers are of one kind.
     """
 
     frames: int = 0
@@ -197,14 +201,14 @@ class Summary:
         self.warned.update(kinds.keys())
 
     def warning_lines(self, most: int) -> list[str]:
-        """Lines for the user, at most so many, the first about damaged frames."""
+        """At most `most` messages for the user, starting with damaged frames."""
         lines = [] if self.first_error is None else [f"{self.damaged:,} damaged, first {self.first_error}"]
         for kind, count in self.warned.most_common(most - 1):
             lines.append(f"{counted(count, 'frame')}: {self.warnings[kind]}")
         return lines
 
     def text(self, is_tracked: bool) -> str:
-        """The counts."""
+        """The counts as text."""
         parts = [counted(self.frames, "frame"), counted(self.people, "person", "people")]
         parts += [counted(len(self.tracks), "track")] if is_tracked else []
         return ", ".join(parts + ([f"{self.damaged:,} damaged"] if self.damaged else []))
@@ -220,18 +224,23 @@ def write_recording(
     on_line: Callable[[dict[str, Any]], None] | None = None,
     tell: Callable[[str], None] = print,
 ) -> Summary:
-    """Poses all frames of a source and writes them, going on where the same command was stopped.
+    """Poses all frames of a source and writes the result, resuming if the same command was interrupted.
 
     Args:
-        result: NAME.jsonl, .csv or .parquet.
+        source: the frames.
+        predictor: poses the frames.
+        result: path NAME.jsonl, .csv or .parquet.
         command: see `PartFile`.
-        world: joints and boxes in the world's frame where the sensor's poses are known.
-        on_line: is called with each final line.
-        tell: what is said about lines that were there.
+        world: whether to write joints and boxes in the world frame if the sensor poses are known.
+        on_line: called with each final line.
+        tell: called with a message if finished lines are found.
+
+    Returns:
+        Statistics of the result.
 
     Raises:
-        InputError: a result that cannot be written, or finished lines that are not of these frames.
-        MissingExtra: Parquet without pyarrow.
+        InputError: the result cannot be written, no frame can be read, or the finished lines belong to other frames.
+        MissingExtra: Parquet output without pyarrow.
     """
     check_format(result)
     check_writable(result)
@@ -267,14 +276,14 @@ def write_recording(
 
 
 def nothing_read(name: str, frames: int, first_error: str | None) -> InputError:
-    """The error of a recording of which no frame could be read, of so many."""
+    """The error for a recording without readable frames. frames: number of frames."""
     if not frames:
         return file_error(name, "has no frames between start and end: choose others")
     return file_error(name, f"of {counted(frames, 'frame')} none can be read, the first: {first_error}")
 
 
 def _add_frames(source: FrameSource, predictor: FramePredictor, part: PartFile) -> None:
-    """Poses the frames that are not in the part yet."""
+    """Poses the frames that are not yet in the part."""
     frames = source.frames()
     if part.state is not None and part.last is not None:
         predictor.restore(part.state)
@@ -298,5 +307,5 @@ def _add_frames(source: FrameSource, predictor: FramePredictor, part: PartFile) 
 
 
 def _digest(frame: Frame | DamagedFrame) -> int:
-    """By which a frame is known again; 0 of a damaged one."""
+    """A checksum of a frame's points, to recognize the frame on resume; 0 for a damaged frame."""
     return crc32(frame.points.tobytes()) if isinstance(frame, Frame) else 0

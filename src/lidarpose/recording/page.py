@@ -1,4 +1,4 @@
-"""The page of a recording: its people in 3D, frame by frame, to be played and turned."""
+"""The HTML page of a recording: an interactive 3D player of its people, frame by frame."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -16,18 +16,18 @@ from lidarpose.skeleton import Skeleton
 from lidarpose.viz.bird_eye import ScanPanel
 from lidarpose.viz.html import render_report
 
-# frames that are shown at most, and points of each person in each
+# maximum number of frames shown, and of points per person and frame
 _MOST_FRAMES, _PERSON_POINTS = 300, 200
-# frames of whose points the surroundings are made, without what lies so near to people's boxes, m
+# number of frames whose points show the surroundings, and margin around boxes of people that is left out, m
 _SURROUNDINGS, _NEAR = 4, 0.3
-# ms that a frame is shown where nobody knows, and the shortest and longest
+# duration of a frame in ms if unknown; minimum and maximum duration
 _STEP, _STEPS = 100.0, (30.0, 1000.0)
 
 
 @dataclass
 class _Track:
-    """frames: in which the person has a pose; first, last: their times, s, or frames; way: level, m; place: the last
-    (2,)."""
+    """frames: number of frames with a pose; first, last: their times, s, or frame numbers if times are unknown; way:
+    horizontal length of the path, m; place: last position (2,) m."""
 
     frames: int
     first: float
@@ -37,7 +37,7 @@ class _Track:
 
 
 class RecordingPage:
-    """Collects people line by line of the result, in the fixed frame; of a long recording every so manieth frame."""
+    """Collects the people of each line of a result, in the fixed frame; long recordings are subsampled."""
 
     def __init__(self, up: str):
         self._fixed = FixedFrame(up)
@@ -66,7 +66,7 @@ class RecordingPage:
         track.frames, track.last, track.place = track.frames + 1, time, place
 
     def render(self, source: FrameSource, skeleton: Skeleton, *, title: str) -> bytes:
-        """The HTML; the source is read again for the points of what is shown."""
+        """The HTML page; reads the source again for the points of the frames shown."""
         shown = {about["frame"]: k for k, (about, _, _) in enumerate(self._lines)}
         is_surroundings = set(evenly_spaced(len(shown), _SURROUNDINGS).tolist())
         panels: dict[int, ScanPanel] = {}
@@ -96,7 +96,8 @@ class RecordingPage:
         return render_report([], title=title, summary=rows, scans=[panel]).encode("utf-8", "replace")
 
     def _of_people(self, points: np.ndarray, people: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
-        """Some points (m, 3) m of people's boxes, and which of the points (n, 3) are in nobody's: (n,) bool."""
+        """A subsample (m, 3) m of the points inside the boxes of people, and (n,) bool: which of the points (n, 3) are
+        outside all boxes and their margins."""
         is_far, clouds = np.ones(len(points), bool), [np.zeros((0, 3))]
         for box in (person["box"] for person in people if person["box"] is not None):
             is_far &= ~box.contains(points, margin=_NEAR)
@@ -119,6 +120,6 @@ class RecordingPage:
         )
 
     def _step(self) -> float:
-        """ms between two frames that are shown."""
+        """Time between two shown frames, ms."""
         times = np.array([about["time"] for about, _, _ in self._lines if about["time"] is not None])
         return float(np.clip(1e3 * np.median(np.diff(times)), *_STEPS)) if len(times) > 1 else _STEP

@@ -1,4 +1,5 @@
-"""The picture of a recording: the ways of its people from above, over some of its frames; of one frame, people too."""
+"""The picture of a recording: the paths of its people from above, over the points of some frames. For a recording of
+one frame, the people too."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -15,15 +16,15 @@ from lidarpose.skeleton import Skeleton
 from lidarpose.viz.bird_eye import ScanPanel, draw_scan_and_people
 from lidarpose.viz.person_view import Panel
 
-# frames whose points are drawn where the sensor moves
+# number of frames whose points are drawn if the sensor moves
 _FRAMES = 8
 
 
 def in_fixed_frame(line: dict[str, Any], fixed: FixedFrame) -> tuple[np.ndarray, list[dict[str, Any]]]:
-    """T_fixed_sensor (4, 4) of the next line, and its people with joints (J, 3) m and `Box` there, None where it has
-    none."""
+    """T_fixed_sensor (4, 4) of the next line, and its people with joints (J, 3) m and `Box` in the fixed frame, each
+    None if missing."""
     T_fixed_sensor = fixed.from_sensor(line["T_world_sensor"])
-    # lines may hold people in the world's frame already
+    # people may already be in the world frame
     is_moved = line.get("coordinates") == "world"
     T, R_upright = (np.eye(4), None) if is_moved else (T_fixed_sensor, fixed.R_upright)
     people = []
@@ -38,7 +39,7 @@ def in_fixed_frame(line: dict[str, Any], fixed: FixedFrame) -> tuple[np.ndarray,
 
 
 class TrajectoryPicture:
-    """Collects where people are, line by line of the result, in the fixed frame."""
+    """Collects the positions of people from each line of a result, in the fixed frame."""
 
     def __init__(self, up: str):
         self._fixed = FixedFrame(up)
@@ -46,7 +47,7 @@ class TrajectoryPicture:
         self._to_fixed: list[np.ndarray] = []
         self._ways: dict[int | None, list[np.ndarray]] = {}
         self._yaws: dict[int | None, float] = {}
-        # of the frame that came last
+        # people of the last frame
         self._people: list[dict[str, Any]] = []
 
     def add(self, line: dict[str, Any]) -> None:
@@ -63,12 +64,12 @@ class TrajectoryPicture:
                     self._yaws[person["track"]] = box.yaw
 
     def draw(self, source: FrameSource, skeleton: Skeleton, *, title: str) -> bytes:
-        """The PNG; the source is read again for the points of some frames."""
+        """The PNG image; reads the source again for the points of some frames."""
         paths = {id: np.array(places) for id, places in self._ways.items()}
         points, poses = self._points(source), None
         is_single = len(self._frames) == 1
         if is_single:
-            # as of a scan: the numbers are those of the cards
+            # draw people as in a single scan: box ids match those on the cards
             boxes = [person["box"] for person in self._people if person["box"] is not None]
             joints = [person["joints"] for person in self._people if person["joints"] is not None]
             poses = Pose(joints=np.stack(joints), skeleton=skeleton) if joints else None
@@ -94,7 +95,7 @@ class TrajectoryPicture:
         return draw_scan_and_people(panel, list(self._cards(points, skeleton)) if is_single else [], title=title)
 
     def _cards(self, points: np.ndarray, skeleton: Skeleton) -> Iterator[Panel]:
-        """Everybody in a recording of one frame of points (n, 3) m."""
+        """One panel per person in a recording of one frame with points (n, 3) m."""
         for person in self._people:
             joints, box, score = person["joints"], person["box"], person["score"]
             person_points = points if box is None else points[box.contains(points)]
@@ -108,7 +109,7 @@ class TrajectoryPicture:
             yield Panel(points=person_points, pose=pose, label=label, box=box, distance=float(distance))
 
     def _points(self, source: FrameSource) -> np.ndarray:
-        """(n, 3) m of frames from the beginning to the end; of one where the sensor stays."""
+        """Points (n, 3) m of evenly spaced frames; only of the last frame if the sensor is stationary."""
         if not self._frames:
             return np.zeros((0, 3))
         is_static, count = self._fixed.T_world_sensor is None, len(self._frames)

@@ -1,4 +1,4 @@
-"""`predict_recording`: the people of every frame of a folder or recording, posed and, if asked, joined over time."""
+"""`predict_recording`: poses of the people in each frame of a folder or recording, optionally tracked over time."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -30,15 +30,17 @@ SCHEMA = "lidarpose.recording/1"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FramePoses:
-    """The people of one frame.
+    """The poses of the people in one frame of a recording.
 
     Args:
-        index: of the frame, see `Frame`.
-        id: of the frame.
-        time: of the frame, s.
-        poses: in the sensor's frame; with tracks the people's ids are those of their tracks. Nobody in a damaged frame.
-        T_world_sensor: (4, 4) m, None where it is not known.
-        error: why the frame could not be read or posed, None for a good one.
+        index: number of the frame, see `Frame`.
+        id: name of the frame.
+        time: time of the frame, s, None if unknown.
+        poses: poses in the sensor frame. With tracking, the ids of people are those of their tracks. Empty for a
+            damaged frame.
+        T_world_sensor: (4, 4) m, the sensor pose, None if unknown.
+        is_tracked: whether people are tracked over time.
+        error: the reason why the frame could not be read or posed, None if there was no error.
     """
 
     index: int
@@ -50,7 +52,7 @@ class FramePoses:
     error: str | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """A line of NAME.poses.jsonl: the keys of poses.json but for its times, and those of the frame."""
+        """A line of NAME.poses.jsonl: the keys of `Poses.to_dict` except "timing_ms", and those of the frame."""
         document = self.poses.to_dict()
         del document["timing_ms"]
         people = []
@@ -68,7 +70,7 @@ class FramePoses:
 
 
 class PosingOptions(TypedDict, total=False):
-    """How the frames of a recording are posed, see `FramePredictor`."""
+    """Options for posing the frames of a recording, see `predict_recording`."""
 
     boxes: "str | os.PathLike | Mapping[Any, Any] | None"
     calib: str | os.PathLike | None
@@ -98,25 +100,34 @@ def predict_recording(
     every: int = 1,
     **posing: Unpack[PosingOptions],
 ) -> Iterator[FramePoses]:
-    """Poses of the people of each frame of a recording, one frame after the other.
+    """Predicts the poses of the people in each frame of a recording, frame by frame.
 
-    Sources are read in another thread, one frame ahead; who leaves early does not wait for it.
+    Frames are read and searched in another thread, one frame ahead. Stopping early does not wait for that thread.
 
     Args:
-        source: files, folders or recordings as `open_source` takes them, with columns, topic, meta, rate, start, end
-            and every; or a source, or any iterable of `Frame`, as of a running sensor, whose arrays may be used again
-            for the next frame.
-        **posing: how frames are posed: boxes, calib, crop, find, min_score, max_range, max_people, background,
-            sensor_origin, skeleton, up, track, live and model. boxes as of `FrameBoxes`; track: people are joined over
-            time, and people known need no verification; live: with tracks, whose poses are made steady by the past
-            alone; the others as in `predict`. Whether the frames are crops of one person is decided by the first one.
+        source: paths of files, folders or recordings, see `open_source`; or a frame source; or any iterable of `Frame`,
+            for example from a running sensor, which may reuse its arrays for the next frame.
+        columns: number of values per row of .bin files, see `open_source`.
+        topic: the topic or scene to read from a recording, see `open_source`.
+        meta: JSON file of an Ouster sensor, see `open_source`.
+        rate: frames per second for sources without times, or to override times in file names, see `open_source`. This
+            and the next three options are for paths only.
+        start: start of the part to read, in seconds from the first frame.
+        end: end of the part to read, in seconds from the first frame.
+        every: read only every n-th frame.
+        **posing: options for posing. `boxes` takes a folder, a file or a mapping with the boxes of each frame, see
+            `FrameBoxes`. `track=True` tracks people over time; known people are then not verified in each frame.
+            `live=True` tracks people and smooths their poses using past frames only. `up=None` means z. `calib`,
+            `crop`, `find`, `min_score`, `max_range`, `max_people`, `background`, `sensor_origin`, `skeleton` and
+            `model` are as in `predict`, except that the first frame with points decides whether all frames are crops of
+            one person.
 
     Yields:
-        `FramePoses`, of damaged frames too.
+        `FramePoses` of each frame, including damaged frames.
 
     Raises:
-        InputError: options that contradict each other, a source that cannot be read at all, and after the last frame
-            boxes of which no frame had any.
+        InputError: options that exclude each other, a source that cannot be read, or, after the last frame, `boxes` of
+            which no frame had any.
     """
     if unknown := set(posing) - set(PosingOptions.__annotations__):
         raise TypeError(f"predict_recording() got an unexpected keyword argument {min(unknown)!r}")
@@ -133,7 +144,8 @@ def predict_recording(
 
 
 def _frames_among(source: Any) -> tuple[Any, Iterator[Frame | DamagedFrame] | None]:
-    """The paths that are given as a source, or the frames of one or of an iterable."""
+    """Splits a source into paths, and frames if it is a frame source or an iterable of frames; the other one is
+    None."""
     if hasattr(source, "frames") and hasattr(source, "name"):
         return None, source.frames()
     if isinstance(source, str | bytes | os.PathLike) or not isinstance(source, Iterable):
@@ -149,11 +161,11 @@ def _frames_among(source: Any) -> tuple[Any, Iterator[Frame | DamagedFrame] | No
 
 
 class FramePredictor:
-    """Poses the frames of a recording in their order, and knows what the frames before said of people.
+    """Poses the frames of a recording in order, with the state carried from earlier frames.
 
     Args:
-        name: of the recording, for reports.
-        others: as of `predict_recording`.
+        name: name of the recording, for reports.
+        others: as in `predict_recording`.
     """
 
     def __init__(
@@ -186,7 +198,7 @@ class FramePredictor:
         self.up, self.name, self.skeleton = up_text(up), name, skeleton
         self.boxes = None if boxes is None else FrameBoxes(boxes, calib=calib)
         self._origin = sensor_origin if sensor_origin is None else (as_origin(sensor_origin),)
-        # whether the frames are crops: None before the first one
+        # whether the frames are crops; None until the first frame with points decides
         self._is_crop = True if crop else False if is_searched or boxes is not None else None
         # whether any frame was searched
         self._was_searched = False
@@ -195,7 +207,7 @@ class FramePredictor:
         self._loaded: Predictor | None = None
         self.live, self.people = live, None
         if track or live:
-            # boxes that are given are all people
+            # given boxes all count as people, whatever their score
             threshold = 0.0 if boxes is not None else least_score(self._search)
             self.people = KnownPeople(up=self.up, least_score=threshold, live=live)
 
@@ -211,16 +223,16 @@ class FramePredictor:
 
     @property
     def wanted(self) -> Skeleton:
-        """The skeleton of the poses."""
+        """The skeleton of the predicted poses."""
         return self.predictor.in_skeleton(self.skeleton)
 
     def check_boxes(self, last: tuple[int, str] | None) -> None:
-        """Raises InputError where no frame up to the last one, index and id, had boxes, though some were given."""
+        """Raises InputError if boxes were given but no frame had any. last: index and id of the last frame."""
         if self.boxes is not None and last is not None:
             self.boxes.check_used(last[1])
 
     def predict_all(self, frames: Iterator[Frame | DamagedFrame]) -> Iterator[FramePoses]:
-        """The people of the next frames; while one is posed the one after is read and searched."""
+        """Poses the next frames. While one frame is posed, the following one is read and searched."""
 
         def prepare() -> tuple[Frame | DamagedFrame, Scan | DetectedScan | InputError] | None:
             frame = next(frames, None)
@@ -235,16 +247,17 @@ class FramePredictor:
                 last = prepared_frame[0].index, prepared_frame[0].id
                 yield self._predicted(*prepared_frame)
         finally:
-            # the next frame of a running sensor may never come
+            # do not wait: the next frame of a running sensor may never come
             pool.shutdown(wait=False, cancel_futures=True)
         self.check_boxes(last)
 
     def predict(self, frame: Frame | DamagedFrame) -> FramePoses:
-        """The people of the next frame."""
+        """Poses the next frame."""
         return self._predicted(frame, self._prepared(frame))
 
     def _prepared(self, frame: Frame | DamagedFrame) -> Scan | DetectedScan | InputError:
-        """What depends on no other frame: the scan, searched where people are searched for; or what is wrong."""
+        """The steps that do not depend on other frames: returns the scan, with detections if people are searched for,
+        or the error."""
         if isinstance(frame, DamagedFrame):
             return InputError(frame.error)
         try:
@@ -282,7 +295,7 @@ class FramePredictor:
         return frame_poses(poses=replace(poses, source=self.name))
 
     def _scan(self, frame: Frame) -> Scan:
-        # a copy: results keep points, and a driver may fill the same array with the next frame
+        # `as_points` copies: results keep the points, and a driver may write the next frame into the same array
         points, notes = only_returns(as_points(frame.points))
         scan = Scan(points=points, up=self.up)
         if self.boxes is not None:
@@ -301,14 +314,14 @@ class FramePredictor:
         return replace(scan, origin=origin, warnings=(*frame.warnings, *notes))
 
     def state(self) -> dict[str, Any]:
-        """What the frames so far said, as JSON holds it."""
+        """The state after the frames so far, as JSON values."""
         people = None if self.people is None else self.people.state()
         boxes_used = self.boxes is not None and self.boxes.was_used
         search_state = {"is_crop": self._is_crop, "was_searched": self._was_searched}
         return search_state | {"boxes_used": boxes_used, "people": people}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Goes on where the predictor whose `state()` this is would."""
+        """Resumes from the result of `state()`."""
         self._is_crop, self._was_searched = state["is_crop"], state["was_searched"]
         if self.boxes is not None:
             self.boxes.was_used = state["boxes_used"]

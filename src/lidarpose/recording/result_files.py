@@ -1,4 +1,4 @@
-"""NAME.poses.jsonl, .csv and .parquet: the lines of a recording, written whole."""
+"""Writes the lines of a recording to NAME.poses.jsonl, .csv or .parquet, completely or not at all."""
 
 import json
 from collections.abc import Iterable, Iterator
@@ -11,16 +11,16 @@ from lidarpose.io.files import atomic_path, encodable
 from lidarpose.sample import JOINT_COLUMNS
 
 FORMATS = ("jsonl", "csv", "parquet")
-# frames whose rows are written at a time
+# number of frames whose rows are written at a time
 _ROWS_OF = 200
 _COLUMNS = ("frame", "frame_id", "time", "person", "id", "track", "filled", *JOINT_COLUMNS, "coordinates")
 _TEXT_COLUMNS = ("id", "frame_id", "joint", "coordinates")
 
 
 def write_result(path: Path, lines: Iterable[dict[str, Any]]) -> None:
-    """Writes lines as the one of `FORMATS` that the file's name says, whole or not at all.
+    """Writes lines in the format given by the file's suffix, one of `FORMATS`, completely or not at all.
 
-    Raises InputError where it cannot be written, MissingExtra for Parquet without pyarrow.
+    Raises InputError if the file cannot be written, MissingExtra for Parquet without pyarrow.
     """
     suffix = path.suffix.lower()
     with atomic_path(path) as temporary:
@@ -35,7 +35,7 @@ def write_result(path: Path, lines: Iterable[dict[str, Any]]) -> None:
 
 
 def check_format(path: Path) -> None:
-    """Raises MissingExtra where a format cannot be written, before the work."""
+    """Raises MissingExtra if the format cannot be written; called before any work is done."""
     if path.suffix.lower() == ".parquet":
         try:
             import pyarrow.parquet  # noqa: F401
@@ -55,7 +55,8 @@ def _write_parquet(path: Path, lines: Iterable[dict[str, Any]]) -> None:
 
 
 def _tables(lines: Iterable[dict[str, Any]]) -> Iterator[Any]:
-    """Data frames of a row a frame, person and joint, of some frames at a time; of the same types all, one at least."""
+    """Yields tables with one row per frame, person and joint, each for some frames, all with the same column types; at
+    least one table, which may be empty."""
     import pandas
 
     remaining = iter(lines)
@@ -79,7 +80,7 @@ def _rows(line: dict[str, Any]) -> Iterator[tuple]:
         id = None if person["id"] is None else encodable(str(person["id"]))
         person_cells = (number, id, person["track"], person["filled"])
         joint_values = [person[name] or [None] * len(joints) for name in ("confidence", "spread", "visible")]
-        # a network that says nothing of its joints does not say this either
+        # a network without per-joint outputs has no in_range either
         is_known = any(person[name] for name in ("confidence", "spread", "visible"))
         person_values = (
             person["person"],

@@ -1,4 +1,4 @@
-"""The lines of a recording with the poses of every track smoothed."""
+"""Smooths the poses of all tracks in the lines of a recording."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -12,19 +12,19 @@ from lidarpose.skeleton import Skeleton
 from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.smoothing import MAX_LATE, smooth
 
-# what is smoothed besides the joints, and its decimals
+# values smoothed besides the joints, and their decimals
 _SMOOTHED = {"spread": 4, "visible": 3, "confidence": 3}
 
 
 def smoothed_lines(
     lines: Callable[[], Iterator[dict[str, Any]]], up: str, skeleton: Skeleton
 ) -> Iterator[dict[str, Any]]:
-    """The lines with every track made steady, and people added where they were hidden.
+    """The lines with all tracks smoothed, and with people added in frames in which they were occluded.
 
     Args:
-        lines: reads them, from the first.
-        up: of the points, as in `predict`.
-        skeleton: of the poses.
+        lines: returns an iterator over the lines from the first; called twice.
+        up: up axis of the points, as in `predict`.
+        skeleton: skeleton of the poses.
     """
     times: list[float] = []
     to_fixed: list[np.ndarray] = []
@@ -33,7 +33,7 @@ def smoothed_lines(
     fixed = FixedFrame(up)
     for row, line in enumerate(lines()):
         to_fixed.append(fixed.from_sensor(line["T_world_sensor"]))
-        # nobody is in a damaged frame, nor is its time always right
+        # a damaged frame contains no people, and its time may be wrong
         times.append(np.nan if line["time"] is None or line["error"] is not None else line["time"])
         for person in line["people"]:
             if person["joints"] is not None:
@@ -55,13 +55,14 @@ def smoothed_lines(
 
 
 def _steady(poses: dict[int, Pose], times: np.ndarray) -> Iterator[tuple[int, Pose, bool]]:
-    """The smoothed poses of a track by row, first to last, and whether each was filled in. times: s, of all rows."""
+    """Yields the smoothed poses of a track in temporal order: row, pose, and whether it was filled in. times: s, of all
+    rows."""
     rows = np.arange(min(poses), max(poses) + 1)
     rows = rows[np.isfinite(times[rows])]
     skeleton = next(iter(poses.values())).skeleton
-    # where the clock was set back, what follows is smoothed by itself
+    # after the clock was set back, the rest is smoothed separately
     for run in np.split(rows, np.flatnonzero(np.diff(times[rows]) < -MAX_LATE) + 1):
-        # frames that come late, or at the time of another, stay as they are
+        # frames that come late, or have the same time as another, are not smoothed
         run = run[times[run] > np.maximum.accumulate(np.concatenate([[-np.inf], times[run]]))[:-1]]
         track = smooth(TrackPoses.of_poses(times[run], [poses.get(row) for row in run.tolist()], skeleton))
         for i, row in enumerate(run.tolist()):
@@ -70,7 +71,7 @@ def _steady(poses: dict[int, Pose], times: np.ndarray) -> Iterator[tuple[int, Po
 
 
 def _entry(pose: Pose, T_sensor_fixed: np.ndarray) -> dict[str, Any]:
-    """What a line holds of a smoothed pose."""
+    """The entries of a line for a smoothed pose."""
     arrays = {name: (getattr(pose, name), digits) for name, digits in _SMOOTHED.items()}
     values = {
         name: value.astype(np.float32).astype(float).round(digits).tolist()
@@ -81,7 +82,7 @@ def _entry(pose: Pose, T_sensor_fixed: np.ndarray) -> dict[str, Any]:
 
 
 def _with_steady(people: list[dict[str, Any]], entries: dict[int, dict[str, Any]]) -> Iterator[dict[str, Any]]:
-    """People of a line, with what is smoothed of them, then those who were hidden."""
+    """The people of a line with their smoothed values, then the occluded people that were added."""
     for person in people:
         yield person | entries.pop(person["track"], {})
     for id, entry in sorted(entries.items()):
