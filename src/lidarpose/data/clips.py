@@ -1,4 +1,4 @@
-"""Clips: frames of a person that follow each other, and what stands about the person, for networks that read both.
+"""Clips: consecutive frames of a person, and the surroundings of the person, for networks that read both.
 
 Legend: n points of a cloud, N samples.
 """
@@ -10,23 +10,23 @@ import numpy as np
 
 from lidarpose.geometry import to_spherical
 
-# how far the window about a person reaches beyond the person, rad, and how many of its points are kept. Source: NE
+# margin of the angular window about a person, rad, and maximum number of its points that are kept. Source: NE
 MARGIN, MOST = np.radians(1.0), 512
-# a step between frames of more than this many usual ones ends a run
+# a step between frames that exceeds the median step by more than this factor ends a run
 _GAP = 1.5
-# edge of a map's cells, m; which are static where they are occupied in so many of so many scans
+# cell size of a map, m; a cell is static if it is occupied in at least this many scans; number of scans used
 _CELL, _LEAST, SCANS = 0.1, 3, 24
-# points this close to a person's belong to them, m
+# cell size for finding a person's points in a scan, m
 _OWN = 0.05
 
 
-# ---- frames that follow each other
+# ---- consecutive frames
 
 
 def consecutive(tracks: Sequence[Hashable], frames: Sequence[int]) -> list[np.ndarray]:
-    """Runs of samples of one track whose frames follow each other, as rows (n,) in order of time.
+    """Runs of samples of one track with consecutive frames, as rows (n,) in order of time.
 
-    tracks, frames (N,): whose sample it is, and its number, whatever the step; a gap ends a run.
+    tracks, frames (N,): each sample's track and frame number; the step between numbers may be any, a gap ends a run.
     """
     rows = defaultdict(list)
     for row, track in enumerate(tracks):
@@ -43,12 +43,12 @@ def consecutive(tracks: Sequence[Hashable], frames: Sequence[int]) -> list[np.nd
     return runs
 
 
-# ---- what stands about a person
+# ---- surroundings of a person
 
 
 def window_points(points: np.ndarray, person: np.ndarray) -> np.ndarray:
-    """(k, 3) float32 m, at most `MOST`, evenly picked: those of the points (n, 3) m that are in the window of azimuth
-    and elevation about a person's points (m, 3); none for a person without points. The sensor is the origin."""
+    """(k, 3) float32 m: those of the points (n, 3) m that are in the window of azimuth and elevation about a person's
+    points (m, 3); at most `MOST`, evenly picked; none for a person without points. The sensor is the origin."""
     if not len(points) or not len(person):
         return np.zeros((0, 3), np.float32)
     x, y, _ = person.mean(0)
@@ -65,19 +65,19 @@ def window_points(points: np.ndarray, person: np.ndarray) -> np.ndarray:
 
 
 def _angles(points: np.ndarray, center_azimuth: float) -> tuple[np.ndarray, np.ndarray]:
-    """Azimuth from the direction `center_azimuth`, and elevation of points, (n,) rad."""
+    """Azimuth relative to `center_azimuth`, and elevation of points, (n,) rad."""
     _, azimuth, elevation = to_spherical(points)
     return (azimuth - center_azimuth + np.pi) % (2 * np.pi) - np.pi, elevation
 
 
 def without_person(points: np.ndarray, person: np.ndarray) -> np.ndarray:
-    """A scan's points (n, 3) m without a person's (m, 3), which were cut out of it and perhaps rounded."""
+    """A scan's points (n, 3) m without a person's points (m, 3), which were cropped from it and may be rounded."""
     return points[~np.isin(_cells(points, _OWN), _cells(person, _OWN))]
 
 
 def static_points(scans: Iterable[np.ndarray]) -> np.ndarray:
-    """A map (k, 3) m of what stands still in scans (n, 3) m of one frame of coordinates, moving people cut out: a point
-    of every cell of 10 cm that is occupied in three scans or more."""
+    """A map (k, 3) m of the static points in scans (n, 3) m, which share one frame and have moving people removed: one
+    point of every 10 cm cell that is occupied in at least three scans."""
     cells, points = [], []
     for scan in scans:
         scan_cells, first_rows = np.unique(_cells(scan, _CELL), return_index=True)
@@ -90,6 +90,6 @@ def static_points(scans: Iterable[np.ndarray]) -> np.ndarray:
 
 
 def _cells(points: np.ndarray, edge: float) -> np.ndarray:
-    """(n,) int64: the number of a point's cell, the same for cells 2^21 edges apart."""
+    """(n,) int64: the number of each point's cell; cells 2^21 edges apart share a number."""
     x, y, z = (np.floor(np.asarray(points, float) / edge).astype(np.int64) & 0x1FFFFF).T
     return x << 42 | y << 21 | z

@@ -1,4 +1,4 @@
-"""dataset.json: what a dataset is of, and how it was made."""
+"""dataset.json: the contents of a dataset and how it was made."""
 
 import json
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from lidarpose.skeleton import BODY26, skeleton
 SCHEMA = 1
 CARD = "dataset.json"
 SENSOR_FRAME = "level frame at the sensor: x forward, y left, z up"
-# singular of what a dataset counts
+# singular of the items that a dataset counts
 _SINGULAR = {"people": "person", "clips": "clip", "streets": "street", "parts": "part"}
 
 
@@ -26,9 +26,9 @@ def content_count(count: int, what: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetCard:
-    """What dataset.json says: settings, all that decides the content; count of persons, clips, streets or parts;
-    per_shard; tables; skeleton's name; version of the package that wrote it; frame of points and joints; about: of a
-    real dataset, its license, quirks and parts; summary: what a finished one holds."""
+    """The contents of dataset.json: settings, which determine the content; count of persons, clips, streets or parts;
+    per_shard: items per shard; tables; skeleton's name; version of the package that wrote it; frame of points and
+    joints; about: license, quirks and parts of a real dataset; summary: of a finished dataset's content."""
 
     settings: dict[str, Any]
     count: int
@@ -42,7 +42,7 @@ class DatasetCard:
 
     @property
     def people(self) -> str:
-        """The table of people: "people" of synthetic ones, "labelled" of real ones."""
+        """The table of people: "people" for synthetic people, "labelled" for real ones."""
         return "labelled" if "labelled" in self.tables else "people"
 
     @property
@@ -52,11 +52,11 @@ class DatasetCard:
 
     @property
     def shards(self) -> int:
-        """How many shards a table has."""
+        """Number of shards of a table."""
         return -(-self.count // self.per_shard)
 
     def size(self, shard: int) -> int:
-        """How many persons, clips or streets a shard holds."""
+        """Number of persons, clips, streets or parts in a shard."""
         return min(self.per_shard, self.count - shard * self.per_shard)
 
     def to_json(self) -> str:
@@ -78,7 +78,7 @@ _OPTIONAL = ("frame", "about", "summary")
 
 
 def read_card(folder: str | Path) -> DatasetCard:
-    """The card of a dataset's folder. Raises InputError where it is missing, damaged or of another schema."""
+    """The card of a dataset's folder. Raises InputError if it is missing, damaged or of another schema."""
     path = Path(folder) / CARD
     if not path.is_file():
         raise file_error(folder, f"is no dataset: {CARD} is missing; write one with lidarpose synth or prepare")
@@ -102,5 +102,5 @@ def read_card(folder: str | Path) -> DatasetCard:
 
 
 def write_card(folder: str | Path, card: DatasetCard) -> None:
-    """Writes dataset.json, whole or not at all."""
+    """Writes dataset.json atomically."""
     write_atomic(Path(folder) / CARD, card.to_json())

@@ -1,7 +1,7 @@
-"""`lidarpose prepare`: the raw files of a real dataset into the Parquet shards that synthetic people come in.
+"""`lidarpose prepare`: converts the raw files of a real dataset to Parquet shards, the format of synthetic people.
 
-One shard a part (a sequence, a segment, a file), with what was skipped and why beside it. A part that is whole is not
-read again: to have a repaired file read, delete its two shards and run the same command.
+Each part (a sequence, a segment, a file) becomes one shard, with a second one of what was skipped and why. A complete
+part is not read again: to read a repaired file, delete its two shards and run the same command.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ from lidarpose.progress import Progress
 from lidarpose.sample import HIDDEN, SEEN, UNLABELED, LabeledSample
 from lidarpose.skeleton import skeleton
 
-# dataset -> module and class of its reader, and whether that takes the user's SMPL
+# dataset -> module and class of its reader, and whether the reader takes the user's SMPL
 READERS: dict[str, tuple[str, str, bool]] = {
     "humanm3": ("humanm3", "HumanM3", False),
     "lidarhuman26m": ("lidarhuman26m", "LidarHuman26M", True),
@@ -38,26 +38,26 @@ READERS: dict[str, tuple[str, str, bool]] = {
     "freemotion": ("corpora", "FreeMotion", True),
     "noisemotion": ("corpora", "NoiseMotion", True),
 }
-# whose frame is turned level unless somebody wants the release's own
+# datasets whose frame is turned level unless the release's own frame is requested
 _LEVELED = ("lidarhuman26m",)
-# tables of such a dataset; the people's last, since a part is whole once they are there
+# tables of a prepared dataset; people come last, since a part is complete once their shard exists
 _TABLES = ("skipped", "labelled")
-# how many people are counted at once for the progress bar
+# number of people per update of the progress bar
 _PROGRESS_STEP = 200
-# what the summary reads of the shards
+# columns of the shards that the summary reads
 _SUMMARIZED = ("sequence", "frame", "split", "source", "joints", "joint_labels", "center")
-# people whose trunks lean more than this on average are in a frame whose z is not up
+# if the z component of the mean trunk direction is below this, z is not the up axis of the frame
 _LEAST_UP = 0.7
-# the middle of a person's points is hardly ever so far from the middle of the joints, m
+# the center of a person's points is hardly ever this far from the mean of the joints, m
 _FAR = 1.0
 
 
 def reader(name: str, smpl: str | Path | None = None, *, level: bool = True) -> Reader:
     """The reader of a dataset, by its name in `READERS`. smpl: the user's SMPL model, a file or a folder of them;
-    level: turn the frame level where the release's is not.
+    level: turn the frame level if the release's is not.
 
-    Raises InputError for an unknown name, where SMPL is needed and not given or cannot be read, where it is given and
-    not needed, and where the release's frame is asked for and there is no other.
+    Raises InputError for an unknown name, if SMPL is needed but missing or unreadable, if it is given but not needed,
+    and if `level` is False for a dataset that is never turned.
     """
     check_name("dataset", name, READERS)
     module, kind, takes_smpl = READERS[name]
@@ -82,13 +82,13 @@ def prepare(
     workers: int = 1,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Writes a dataset's people as Parquet shards into `out`, or what is missing of them, and returns the summary.
+    """Writes a dataset's people as Parquet shards into `out`, if they are missing, and returns the summary.
 
     name: one of `READERS`; root: the folder of its raw files; split: only people of that split ("train", "val",
-    "test"), by default all; split_by: the published split to go by, by default the user's own train.txt and test.txt in
-    `root`, else the dataset's usual one; smpl: the user's SMPL model, a file or a folder of one for each gender;
-    level: turn lidarhuman26m's sequences level, False keeps the release's frame; workers: processes; progress: draw a
-    bar on a terminal.
+    "test"), by default all; split_by: the published split to use, by default the user's own train.txt and test.txt in
+    `root`, else the dataset's usual one; smpl: the user's SMPL model, a file or a folder with a file for each gender;
+    level: turn lidarhuman26m's sequences level, False keeps the release's frame; workers: number of processes;
+    progress: draw a bar on a terminal.
 
     The summary, also in out/dataset.json: people, skipped by reason with an example each, people by split and source,
     parts, and warnings. Raises InputError, one line, for a wrong root, name, split or SMPL model and for a folder that
@@ -102,7 +102,7 @@ def prepare(
     parts = list(source.parts(root))
     rule = split_rule(name, root, split_by, parts)
     absent_names = rule.absent(parts) if rule is not None else {}
-    # of a split that is asked for alone, nobody misses the others
+    # if a single split is requested, missing names of other splits do not matter
     absent_names = {split_name: names for split_name, names in absent_names.items() if split in (None, split_name)}
     parts = _parts_of(name, parts, rule, split)
     for part in parts:
@@ -112,7 +112,7 @@ def prepare(
     make = PartWriter(reader=source, root=root, out=out, parts=tuple(parts), rule=rule, only=split)
     num_finished = len(parts) - len(missing_shards)
     with lock_dataset(out):
-        # the summary of a run that is not over would be wrong
+        # without the summary of an earlier run, which would be wrong until this run is finished
         if missing_shards or not (out / CARD).is_file():
             write_card(out, card)
         with Progress(len(parts), unit="parts", done=num_finished, shown=progress) as bar:
@@ -126,7 +126,7 @@ def prepare(
 
 
 def _parts_of(name: str, parts: list[str], rule: SplitRule | None, split: str | None) -> list[str]:
-    """The parts in which people of the split may be. Raises InputError where there are none."""
+    """The parts that may contain people of the split. Raises InputError if there are none."""
     if split is None:
         return parts
     if rule is None:
@@ -139,7 +139,7 @@ def _parts_of(name: str, parts: list[str], rule: SplitRule | None, split: str | 
 
 
 def _card(source: Reader, parts: list[str], rule: SplitRule | None, split: str | None) -> DatasetCard:
-    # the names themselves would fill the line that says what differs
+    # a digest: the names themselves would be too long for the error about different settings
     settings: dict[str, Any] = {"what": "parts", "dataset": source.name, "parts": _digest("\n".join(parts))}
     settings |= {"split": split, "split_by": rule and rule.name}
     about = {key: value for key, value in source.about.items() if key not in ("frame", "settings")}
@@ -164,8 +164,10 @@ def _digest(text: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class PartWriter:
-    """Reads parts of a dataset and writes their shards: called with a part's number, yields counts of people as they
-    are done. only: the split to keep, None for all; the rest as in `prepare`. May be pickled."""
+    """Reads parts of a dataset and writes their shards: called with a part's number, yields counts of finished people.
+
+    only: the split to keep, None for all; the rest as in `prepare`. Picklable.
+    """
 
     reader: Reader
     root: Path
@@ -189,7 +191,7 @@ class PartWriter:
         yield people % _PROGRESS_STEP
 
     def _with_split(self, part: str) -> Iterator[LabeledSample | Skipped]:
-        """Everybody in a part, with the split."""
+        """All people of a part, with their splits."""
         records: Iterable[LabeledSample | Skipped] = self._read(part)
         splits: Iterator[str | None] = repeat(self.rule.of_part(part) if self.rule else None)
         if self.rule is not None and not self.rule.by_part:
@@ -199,24 +201,24 @@ class PartWriter:
             yield replace(record, split=next(splits)) if isinstance(record, LabeledSample) else record
 
     def _read(self, part: str) -> Iterator[LabeledSample | Skipped]:
-        """As the reader, but a part that turns out to be unreadable ends there, which is counted."""
+        """Like the reader, but an error ends the part and is recorded as skipped."""
         try:
             yield from self.reader.read(self.root, part)
         except InputError as error:
             yield Skipped(BAD_REST, f"{part}: {error}")
         except (OSError, ArithmeticError, LookupError, TypeError, ValueError, AttributeError) as error:
-            # what no reader foresaw must not cost the other parts; its kind tells a mistake in a reader from a bad file
+            # an unexpected error must not affect other parts; its type tells a bug in a reader from a bad file
             kind = type(error).__name__
             yield Skipped(f"{BAD_REST} ({kind})", one_line(f"{part}: {kind}: {error}"))
 
 
-# ---- the summary: from the shards alone, so that it is the same however often a run was stopped
+# ---- the summary: computed from the shards only, so that it does not depend on interruptions of the run
 
 
 def _summarize(
     dataset: DatasetReader, *, parts: list[str], absent_names: dict[str, list[str]], rule: SplitRule | None
 ) -> dict[str, Any]:
-    """The summary of `prepare`: counts, and warnings of what looks wrong. absent_names: split -> missing sequences."""
+    """The summary of `prepare`: counts and warnings. absent_names: split -> missing sequences."""
     labels, splits, sources, reasons = Counter[int](), Counter[str](), Counter[str](), Counter[str]()
     examples: dict[str, str] = {}
     frames: set[tuple[str, int]] = set()
@@ -283,7 +285,7 @@ def _warnings(summary: dict[str, Any], absent_names: dict[str, list[str]], rule:
 
 
 def summary_lines(summary: dict[str, Any]) -> list[str]:
-    """The summary for a terminal, a line each: people, what was skipped with an example, warnings."""
+    """The summary as lines for a terminal: people, skipped items by reason with an example, warnings."""
     splits = ", ".join(f"{split} {count:,}" for split, count in summary["splits"].items())
     lines = [f"{summary['people']:,} people in {summary['frames']:,} frames ({splits or 'none'})"]
     for reason, count in summary["skipped"].items():

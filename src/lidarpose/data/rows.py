@@ -1,32 +1,32 @@
-"""Rows of datasets: the columns of their tables, and samples as rows.
+"""Rows of datasets: the columns of their tables, and conversion between samples and rows.
 
 A row of people-*.parquet is one synthetic person in one frame:
 
-    index, frame, track     number of the person, clip or street in the dataset; frame of it; person in a street
-    points                  x, y, z of all points one after the other, m: reshape to (n, 3); the level frame at the
-                            sensor, x forward, y left, z up
-    part, ring              one a point: 0 = background, 1 + j = the bone of SMPL-24's joint j; the beam
+    index, frame, track     number of the person, clip or street in the dataset; its frame; person in a street
+    points                  x, y, z of all points, flattened, m: reshape to (n, 3); in the level frame at the sensor,
+                            x forward, y left, z up
+    part, ring              one per point: 0 = background, 1 + j = the bone of SMPL-24's joint j; the beam
     joints                  x, y, z of the joints named in dataset.json, m
     center                  origin of the person's own frame, computed from the points
     box_center, box_size, box_yaw    a detector's box: m, m, rad
     source, frame_id        as in `Sample`
-    rotations, translation, background, neighbors    the same, for networks of clips; null where nobody knows them
-    sensor, kind, ...       the fields of `PersonInfo`; null where it was not measured
+    rotations, translation, background, neighbors    as in `Sample`, for networks of clips; null if unknown
+    sensor, kind, ...       the fields of `PersonInfo`; null if not measured
 
-Datasets of real people, which `lidarpose prepare` wrote, have a part of the raw files (a sequence, a file) in each
-shard: labelled-*.parquet (columns as above where they mean the same; index numbers the part) with
+Datasets of real people, written by `lidarpose prepare`, have one part of the raw files (a sequence, a file) per shard:
+labelled-*.parquet (columns as above, except that index is the number of the part) with
 
-    sequence, time, split   of the raw dataset; s since the sequence's beginning; train, val, test or null
+    sequence, time, split   of the raw dataset; s since the start of the sequence; train, val, test or null
     track                   text; the person in the sequence
-    joints                  NaN where a joint is not labeled
-    joint_labels            one a joint: 0 not labeled, 1 hidden or uncertain, 2 seen
-    center_trans, ...       other origins that published protocols use, m; null where there is none
-    distance                of the center from the sensor, m; null where the sensor's position is unknown
+    joints                  NaN if a joint is not labeled
+    joint_labels            one per joint: 0 not labeled, 1 hidden or uncertain, 2 seen
+    center_trans, ...       other origins that published protocols use, m; null if there is none
+    distance                of the center from the sensor, m; null if the sensor position is unknown
 
-and skipped-*.parquet: what was left out, `reason` and `where`.
+and skipped-*.parquet: what was left out, with `reason` and `where`.
 
-Streets have frames-*.parquet beside them: whole turns of the sensor, with the person of every point, and of everybody
-in the street, seen or not, track (P,), box (P, 7: center, size, yaw) and joints (P, J, 3), flattened.
+Streets also have frames-*.parquet: full revolutions of the sensor, with the person of every point, and for all P people
+in the street, visible or not, track (P,), box (P, 7: center, size, yaw) and joints (P, J, 3), flattened.
 """
 
 import math
@@ -40,14 +40,15 @@ from lidarpose.errors import InputError
 from lidarpose.sample import FARTHEST, SEEN, Box, LabeledSample, PersonInfo, Pose, Sample
 from lidarpose.skeleton import BODY26, SMPL24, skeleton
 
-# origins that published protocols use, by name: a column center_NAME each
+# names of origins that published protocols use; each has a column center_NAME
 CENTERS = ("trans", "box", "joints_box")
 # frames per second of synthetic clips and streets
 _CLIP_HZ = 10
 
 
 class Column(NamedTuple):
-    """type: of Arrow; shape: of a list, flattened; None for a single value. text: both, as in the table below."""
+    """A column. type: Arrow's; shape: of a flattened list, None for a single value; text: both, as written below;
+    optional: may be null."""
 
     text: str
     type: str
@@ -64,8 +65,8 @@ def _columns(text: str) -> dict[str, Column]:
     }
 
 
-# name:type[shape], of n points, J joints, P people; "?": null for what is unknown, and missing in older shards.
-# A column of the name of a field of `LabeledSample` or `PersonInfo` is that field
+# name:type[shape] for n points, J joints, P people; "?": null if unknown, and may be missing in older shards.
+# A column with the name of a field of `LabeledSample` or `PersonInfo` holds that field
 _BOX = "box_center:float64[3]? box_size:float64[3]? box_yaw:float64?"
 _CLIP = "rotations:float32[24,3]? translation:float64[3]? background:float32[b,3]? neighbors:float32[k,3]?"
 TABLES = {
@@ -98,8 +99,8 @@ def person_row(
 
 
 def labeled_row(sample: LabeledSample, *, index: int) -> dict[str, Any]:
-    """A row of the table of real people. index: number of the part that the person is from. Raises InputError for a
-    center without a column."""
+    """A row of the table of real people. index: number of the person's part. Raises InputError for a center that has no
+    column."""
     unknown_names = sorted(sample.centers.keys() - set(CENTERS))
     if unknown_names:
         raise InputError(f"centers have the names {', '.join(CENTERS)}, got {', '.join(unknown_names)}")
@@ -116,10 +117,10 @@ def _sample_columns(sample: Sample, table: str) -> dict[str, Any]:
 
 
 def sample_of(row: dict[str, Any], skeleton_name: str = BODY26.name, what: str = "people") -> LabeledSample:
-    """The sample of a row, as `read_rows` gives it. what: as in the settings of the dataset's card.
+    """The sample of a row from `read_rows`. what: as in the settings of the dataset's card.
 
-    The id of the box is the track, of real people and in streets. All joints of synthetic people count as seen.
-    Raises InputError that names the column for a row that is none.
+    For real people and in streets, the id of the box is the track. All joints of synthetic people are labeled `SEEN`.
+    Raises InputError that names the column for an invalid row.
     """
     dataset_skeleton = skeleton(skeleton_name)
     is_real = "joint_labels" in row
@@ -144,7 +145,7 @@ def sample_of(row: dict[str, Any], skeleton_name: str = BODY26.name, what: str =
 
 
 def _check_row(row: dict[str, Any], table: str, joints: int) -> None:
-    """Raises InputError for a null that may be none, lists of wrong lengths and values that cannot be."""
+    """Raises InputError for a null in a required column, lists of wrong lengths, and invalid values."""
     for name, column in TABLES[table].items():
         if row[name] is None and not column.optional:
             raise InputError(f"column {name} is null, expected {column.text}")
@@ -164,8 +165,7 @@ def _check_row(row: dict[str, Any], table: str, joints: int) -> None:
 
 
 def check_lengths(row: dict[str, Any], table: str, joints: int = 0) -> None:
-    """Raises InputError for lists whose lengths do not belong together. The first list of points or of people says how
-    many there are."""
+    """Raises InputError for lists of inconsistent lengths. The first list of points or of people sets their number."""
     sizes = {"J": joints}
     for name, column in TABLES[table].items():
         if column.shape is None or row[name] is None:

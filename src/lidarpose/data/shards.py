@@ -1,6 +1,6 @@
 """Datasets of people as Parquet shards: a folder with dataset.json and numbered .parquet files, see `data.rows`.
 
-Any reader of Parquet opens the shards (pandas, DuckDB, Hugging Face datasets, Ray, ...).
+Any Parquet reader opens the shards (pandas, DuckDB, Hugging Face datasets, Ray, ...).
 """
 
 import re
@@ -18,7 +18,7 @@ from lidarpose.errors import InputError, MissingExtra
 from lidarpose.io.files import atomic_path, encodable, file_error
 from lidarpose.sample import LabeledSample
 
-# rows that are compressed together: what a writer and a reader must hold. A turn of 128 rings has up to 260,000 points
+# rows per row group, which writers and readers hold in memory. A revolution of 128 rings has up to 260,000 points
 _ROW_GROUP = {"people": 500, "frames": 4, "labelled": 500, "skipped": 5000}
 
 
@@ -52,15 +52,15 @@ def to_arrow(pa, table: str, rows: list[dict[str, Any]]):
 
 
 def _rows_of(pa, batch, table: str) -> Iterator[dict[str, Any]]:
-    """The rows of a record batch, lists as numpy arrays; None where a value is null or its column is missing. Raises
-    InputError that names the column for one of another type."""
+    """The rows of a record batch with lists as numpy arrays; None if a value is null or its column is missing. Raises
+    InputError that names the column if its type is wrong."""
     columns: dict[str, Any] = {}
     for name, column in TABLES[table].items():
         if name not in batch.schema.names:
             columns[name] = [None] * batch.num_rows
             continue
         values = batch.column(name)
-        # of tables of people `sample_of` names the row
+        # for tables of people, `sample_of` checks nulls and names the row
         if table in ("frames", "skipped") and values.null_count and not column.optional:
             raise InputError(f"column {name} has nulls, expected {column.text}")
         try:
@@ -86,10 +86,10 @@ def shard_path(folder: str | Path, table: str, shard: int) -> Path:
 
 @contextmanager
 def shard_writer(path: str | Path, table: str) -> Iterator[Callable[[dict[str, Any]], None]]:
-    """Writes the rows of a table ("people", "frames", ...), whole or not at all; the same rows give the same bytes.
+    """Writes the rows of a table ("people", "frames", ...) atomically; the same rows give the same bytes.
 
-    Yields what adds a row, and holds a row group of them at a time. Raises InputError where the folder cannot be
-    written, MissingExtra without pyarrow.
+    Yields a function that adds a row, and buffers one row group. Raises InputError if the folder cannot be written,
+    MissingExtra without pyarrow.
     """
     pa, parquet = pyarrow()
     buffer: list[dict[str, Any]] = []
@@ -103,7 +103,7 @@ def shard_writer(path: str | Path, table: str) -> Iterator[Callable[[dict[str, A
         if len(buffer) == _ROW_GROUP[table]:
             flush()
 
-    # a flipped bit in points would pass unnoticed
+    # with checksums: a flipped bit in points would go unnoticed
     options = {"compression": "zstd", "use_dictionary": False, "write_page_checksum": True}
     schema = to_arrow(pa, table, []).schema
     with atomic_path(path) as temporary, parquet.ParquetWriter(temporary, schema, **options) as writer:
@@ -114,7 +114,7 @@ def shard_writer(path: str | Path, table: str) -> Iterator[Callable[[dict[str, A
 
 @contextmanager
 def open_parquet(path: str | Path, remedy: str, **options: Any) -> Iterator[Any]:
-    """An open Parquet file. Whatever goes wrong with it in the block is an InputError of one line that names it."""
+    """An open Parquet file. Any error with it in the block becomes an InputError of one line that names the file."""
     pa, parquet = pyarrow()
     try:
         with parquet.ParquetFile(path, **options) as file:
@@ -128,16 +128,16 @@ def open_parquet(path: str | Path, remedy: str, **options: Any) -> Iterator[Any]
 
 
 def rows_of_shard(path: str | Path) -> int | None:
-    """How many rows a shard says it holds; None where it is missing or damaged."""
+    """The number of rows in a shard's metadata; None if it is missing or damaged."""
     with suppress(InputError), open_parquet(path, "") as file:
         return file.metadata.num_rows
     return None
 
 
 def read_rows(path: str | Path, table: str, columns: tuple[str, ...] | None = None) -> Iterator[dict[str, Any]]:
-    """The rows of a shard, list columns as numpy arrays; of `columns` alone where they are named, the others None.
+    """The rows of a shard with list columns as numpy arrays; if `columns` are given, all others are None.
 
-    Raises InputError for a damaged file, and for a column that is missing or of another type.
+    Raises InputError for a damaged file, and for a column that is missing or has the wrong type.
     """
     pa, _ = pyarrow()
     with open_parquet(path, "delete it and make it again", page_checksum_verification=True) as file:
@@ -152,24 +152,24 @@ def read_rows(path: str | Path, table: str, columns: tuple[str, ...] | None = No
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetReader:
-    """A folder of shards, read as it is iterated: its samples in order. card: what dataset.json says."""
+    """A folder of shards, read lazily by iteration: its samples in order. card: the contents of dataset.json."""
 
     folder: Path
     card: DatasetCard
 
     def path(self, shard: int, table: str | None = None) -> Path:
-        """A shard of a table, by default that of people."""
+        """The path of a shard of a table, by default the table of people."""
         return shard_path(self.folder, table or self.card.people, shard)
 
     def written(self, table: str | None = None) -> list[int]:
-        """Numbers of the shards of a table, by default that of people, that are there: no count in dataset.json makes
-        this long."""
+        """Numbers of the existing shards of a table, by default the table of people. Lists the folder, so a wrong large
+        count in dataset.json costs no time."""
         name = re.compile(rf"{table or self.card.people}-(\d{{5,9}})\.parquet")
         numbers = (name.fullmatch(path.name) for path in self.folder.iterdir())
         return sorted(k for k in (int(number[1]) for number in numbers if number) if k < self.card.shards)
 
     def rows(self, table: str | None = None, shards: Iterable[int] | None = None) -> Iterator[dict[str, Any]]:
-        """The rows of a table, of some shards or of all; see `TABLES`. By default those of people."""
+        """The rows of a table, by default that of people, in some shards or in all; see `TABLES`."""
         for shard in range(self.card.shards) if shards is None else shards:
             path = self.path(shard, table)
             if not path.is_file():
@@ -177,7 +177,7 @@ class DatasetReader:
             yield from read_rows(path, table or self.card.people)
 
     def rows_of(self, table: str, shard: int) -> int:
-        """How many rows a shard has. Raises InputError where it is missing or damaged."""
+        """Number of rows of a shard. Raises InputError if it is missing or damaged."""
         path = self.path(shard, table)
         rows = rows_of_shard(path)
         if rows is None:
@@ -192,9 +192,9 @@ class DatasetReader:
         return (self.sample(row) for row in self.rows())
 
     def samples(self, split: str | None = None) -> Iterator[LabeledSample]:
-        """Everybody with what is labeled, or of a dataset of real people those of a split ("train", "val", "test").
+        """All samples with their labels; of real people optionally those of a split ("train", "val", "test").
 
-        Raises InputError for a split of synthetic people, and for one that nobody is in.
+        Raises InputError for a split of synthetic people, and for an empty split.
         """
         if split is not None and self.card.people != "labelled":
             raise file_error(self.folder, f"holds synthetic people, which have no split {split!r}: leave it out")
@@ -206,11 +206,11 @@ class DatasetReader:
         if is_empty and split is not None:
             raise file_error(self.folder, f"has nobody in the split {split!r}; prepare says which splits it has")
 
-    # the name until 0.2
+    # the method's name until 0.2
     items = samples
 
     def sample(self, row: dict[str, Any]) -> LabeledSample:
-        """The sample of a row of people. Raises InputError that names its shard and column for a row that is none."""
+        """The sample of a row of people. Raises InputError that names the shard and the column for an invalid row."""
         try:
             return sample_of(row, self.card.skeleton, self.card.settings.get("what", "people"))
         except (ValueError, TypeError, AttributeError, KeyError) as error:
@@ -220,6 +220,7 @@ class DatasetReader:
 
 
 def open_dataset(folder: str | Path) -> DatasetReader:
-    """A dataset that `lidarpose synth` or `prepare` wrote. Raises InputError for none, MissingExtra without pyarrow."""
+    """Opens a dataset that `lidarpose synth` or `prepare` wrote. Raises InputError if the folder is not a dataset,
+    MissingExtra without pyarrow."""
     pyarrow()
     return DatasetReader(folder=Path(folder), card=read_card(folder))

@@ -1,10 +1,10 @@
-"""Which people are for training and which for testing: published splits, and a user's own train.txt and test.txt.
+"""Training and test splits: published ones, and a user's own train.txt and test.txt.
 
-Published ones are small files in `splits/` that name their source. A rule is one of
+Published splits are small files in `splits/` that name their source. A rule is one of
 
     sequences   a sequence's name is in a list
     folders     the first folder of a part's name is in a list
-    chunks      of every part, runs of `length` people, a `share` of them drawn for train with a seed
+    chunks      every part is cut into runs of `length` people; a `share` of them is drawn for train with a seed
 """
 
 import json
@@ -21,17 +21,17 @@ from lidarpose.errors import InputError, check_name
 from lidarpose.io.files import FormatError, file_error, read_bytes
 from lidarpose.io.text import decode
 
-# what a user's own lists are called
+# file names of a user's own lists
 _LISTS = {"train": "train.txt", "val": "val.txt", "test": "test.txt"}
-# without these there is no split
+# lists that a split requires
 _NEEDED = ("train", "test")
 
 
 @dataclass(frozen=True, kw_only=True)
 class SplitRule:
-    """name and source of a split; sets: split -> the names of its sequences or folders; leaks: what of train is also in
-    test, "" for nothing; usual: whether it is the one of its dataset that is taken where nobody names one. See the
-    module for rule, length, share and seed."""
+    """A split. name, source; sets: split -> the names of its sequences or folders; leaks: the data of train that is
+    also in test, "" for none; usual: whether it is the default of its dataset. See the module for rule, length, share
+    and seed."""
 
     name: str
     source: str
@@ -49,16 +49,16 @@ class SplitRule:
         return self.rule != "chunks"
 
     def of_part(self, part: str) -> str | None:
-        """The split of a part, where it is told by its name."""
+        """The split of a part by its name, None if no list has it or the rule does not go by names."""
         name = self._name(part)
         return next((split for split, names in self.sets.items() if self.by_part and name in names), None)
 
     def _name(self, part: str) -> str:
-        """What lists call a part: its first folder, or all of its name."""
+        """The name of a part in lists: its first folder, or its full name."""
         return part.split("/")[0].removesuffix(".pkl") if self.rule == "folders" else part
 
     def of_chunks(self, part: str, people: int) -> list[str]:
-        """The split of each of a part's people, in their order."""
+        """The split of each person of a part, in order."""
         chunks = -(-people // self.length)
         part_seed = zlib.crc32(part.encode("utf-8", "backslashreplace"))
         order = np.random.default_rng([self.seed, part_seed]).permutation(chunks)
@@ -66,7 +66,7 @@ class SplitRule:
         return ["train" if k // self.length in train_chunks else "test" for k in range(people)]
 
     def absent(self, parts: list[str]) -> dict[str, list[str]]:
-        """Split -> names in the list that no part has."""
+        """Split -> names in its list that match no part."""
         present_names = set(map(self._name, parts))
         missing_names = {
             split: [name for name in names if name not in present_names] for split, names in self.sets.items()
@@ -76,11 +76,11 @@ class SplitRule:
 
 def split_rule(dataset: str, root: Path, name: str | None = None, parts: Sequence[str] = ()) -> SplitRule | None:
     """The split to use: the published one called `name`; by default the user's own lists in `root` (train.txt, test.txt
-    and val.txt, a part a line), else the dataset's usual one; None where it has none.
+    and val.txt, one part per line), else the dataset's usual one; None if there is none.
 
-    parts: the names that the user's lists may have, also without what is before the first "/" where only one then has
-    the name. Raises InputError for an unknown name, half of the lists, one that is empty or no text, lists of which no
-    name is a part's, and a part in two of them.
+    parts: the names that the user's lists may contain; what precedes the first "/" may be omitted if the rest is
+    unique. Raises InputError for an unknown name, a missing train or test list, a list that is empty or not text, lists
+    that match no part, and a part in two lists.
     """
     rules = {rule.name: rule for rule in _published(dataset)}
     if name is not None:
@@ -100,7 +100,7 @@ def _own(root: Path, parts: Sequence[str]) -> SplitRule | None:
     if missing_files:
         present_file = next(iter(paths.values())).name
         raise file_error(root, f"has {present_file} and no {missing_files[0]}: add it, or take the other away")
-    # a name without its first folder, where only one part has it
+    # names without their first folder, if only one part has that name
     short_name_counts = Counter(part.partition("/")[2] for part in parts)
     full_names = {name: part for part in parts if short_name_counts[name := part.partition("/")[2]] == 1} | {
         part: part for part in parts
@@ -112,7 +112,7 @@ def _own(root: Path, parts: Sequence[str]) -> SplitRule | None:
             lines = decode(read_bytes(path, expected="names of sequences, one a line")).splitlines()
         except FormatError as problem:
             raise file_error(path, problem) from None
-        # a line end at the end of the file is no sequence
+        # empty lines, such as at the end of the file, are not sequences
         names = [line.strip() for line in lines if line.strip()]
         if not names:
             raise file_error(path, "names no sequence; expected one a line")

@@ -1,8 +1,8 @@
-"""Shards by several processes, restartable: what is missing of a folder, who makes it, and what killed runs left.
+"""Restartable writing of shards by several processes: finds the missing shards of a folder and makes them.
 
-Behind `lidarpose synth` and `prepare`. A shard is written whole or not at all, and its content depends on the settings
-and its number alone. So nothing else need be remembered: what is missing is made, whoever makes it, and the folder ends
-up the same byte for byte.
+Used by `lidarpose synth` and `prepare`. A shard is written atomically, and its content depends only on the settings and
+its number. So no other state is needed: missing shards are made by any process, and the resulting folder is always the
+same, byte for byte.
 """
 
 import json
@@ -24,14 +24,14 @@ from lidarpose.data.shards import rows_of_shard, shard_path
 from lidarpose.errors import InputError
 from lidarpose.io.files import file_error, is_unused, locked
 
-# how many people, clips or streets are done since it last told
+# yields the number of people, clips or streets done since the last yield
 Counts = Generator[int, None, None]
-# makes and writes a shard, by its number
+# makes and writes the shard of a number
 Make = Callable[[int], Counts]
 
-# how often progress is told, s
+# interval between progress reports, s
 _TICK = 0.5
-# of the files in a dataset's folder
+# pattern of the file names in a dataset's folder
 _NAMES = rf"(?:(?:{'|'.join(TABLES)})-\d{{5}}\.parquet|{re.escape(CARD)})"
 # keeps other processes from writing into a dataset's folder
 lock_dataset = partial(
@@ -40,10 +40,10 @@ lock_dataset = partial(
 
 
 def open_folder(folder: Path, card: DatasetCard, rows: Mapping[str, int] | None = None) -> list[int]:
-    """The numbers of the shards that are missing, damaged or, by `rows`, not whole.
+    """The numbers of the shards that are missing, damaged or, according to `rows`, incomplete.
 
-    rows: by table, how many rows each one of `card.count` has, where that is known. Raises InputError unless the folder
-    is missing, empty or of this very dataset.
+    rows: by table, the number of rows of each of the `card.count` items, if known. Raises InputError unless the folder
+    is missing, empty or of this dataset.
     """
     if folder.exists() and not folder.is_dir():
         raise file_error(folder, "is a file; give a folder for the dataset")
@@ -55,7 +55,7 @@ def open_folder(folder: Path, card: DatasetCard, rows: Mapping[str, int] | None 
 
 
 def check_settings(folder: str | Path, present: DatasetCard, wanted: DatasetCard) -> None:
-    """Raises InputError that names the settings in which a dataset differs from what is wanted."""
+    """Raises InputError that names the settings in which a dataset differs from the wanted one."""
     old_settings, new_settings = (
         {"count": c.count, "per_shard": c.per_shard, "version": c.version, **c.settings} for c in (present, wanted)
     )
@@ -69,7 +69,7 @@ def check_settings(folder: str | Path, present: DatasetCard, wanted: DatasetCard
         if present_value != wanted_value
     }
     if len(differences) > 1:
-        # digests, which say nothing that the others do not
+        # a digest, which adds nothing to the other differences
         differences.pop("parts", None)
     if differences:
         problem = f"{folder} holds a dataset of other settings: {'; '.join(differences.values())}"
@@ -85,11 +85,11 @@ def _is_whole(folder: Path, card: DatasetCard, shard: int, rows: Mapping[str, in
 
 
 def make_shards(make: Make, shards: list[int], *, workers: int = 1) -> Iterator[tuple[int, int]]:
-    """Makes shards, here or in other processes; yields how many shards, and how many of what `make` counts, are done
-    since it last did.
+    """Makes shards, in this or in other processes; yields the numbers of shards, and of the items that `make` counts,
+    done since the last yield.
 
-    With several workers `make` is pickled once for each; they end with this process, however it ends. Raises what
-    `make` raises, and InputError where a worker dies.
+    With several workers, `make` is pickled once for each; workers end with this process, however it ends. Raises what
+    `make` raises, and InputError if a worker dies.
     """
     workers = min(workers, len(shards))
     if workers > 1:
@@ -103,7 +103,7 @@ def make_shards(make: Make, shards: list[int], *, workers: int = 1) -> Iterator[
 
 
 def _by_processes(make: Make, shards: list[int], workers: int) -> Iterator[tuple[int, int]]:
-    # a fresh interpreter: threads and open files of this one are none of theirs
+    # fresh interpreters: workers must not inherit threads and open files
     context = multiprocessing.get_context("spawn")
     counter, stop = context.Value("q", 0), context.Event()
     with ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(make, counter, stop)) as pool:
@@ -126,20 +126,20 @@ def _by_processes(make: Make, shards: list[int], workers: int) -> Iterator[tuple
             pool.shutdown(wait=True, cancel_futures=True)
 
 
-# of a worker process: what makes a shard, the count of what all have done, and whether to stop
+# state of a worker process: the maker of shards, the counter shared by all workers, and the stop event
 _worker_state: tuple = ()
 
 
 def _start(make: Make, counter, stop) -> None:
     global _worker_state
-    # the parent says when to stop
+    # only the parent decides when to stop
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
     _worker_state = (make, counter, stop)
 
 
 def end_with_parent() -> None:
-    """Ends this worker process when its parent is gone: a killed parent cannot stop it, and it would wait for ever."""
+    """Ends this worker process when its parent ends: a killed parent cannot stop it, and it would wait forever."""
     parent = multiprocessing.parent_process()
     assert parent is not None, "runs in a worker"
 
@@ -161,8 +161,8 @@ def _shard(shard: int) -> None:
 
 
 def _counts(make: Make, shard: int) -> Counts:
-    """As `make`, on one thread: in products of a few thousand numbers threads of BLAS only get in each other's way.
-    What `make` does before it returns, such as reading what all shards need, has them all."""
+    """Iterates `make` with one BLAS thread: in matrix products of a few thousand numbers, more threads slow each other
+    down. Work that `make` does before it returns, such as reading data for all shards, may use all threads."""
     from threadpoolctl import threadpool_limits
 
     with closing(make(shard)) as counts, threadpool_limits(limits=1, user_api="blas"):

@@ -1,6 +1,6 @@
-"""How a sample becomes an `Example`: crop, center, turn, mirror, scale, dropout and clutter points.
+"""From a sample to an `Example`: crop, center, turn, mirror, scale, dropout and clutter points.
 
-All happens in the person's own frame but for the crop. Legend: n points.
+All steps except the crop happen in the person's own frame. Legend: n points.
 """
 
 from collections.abc import Sequence
@@ -17,21 +17,22 @@ from lidarpose.sample import FEWEST_OF_SECOND, LabeledSample, Pose, Sample, cent
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth.noise import half_space_keep, jitter, noise_clusters, random_keep
 
-# half of the samples are centered as a user's cloud is, half about a guess of the pelvis, as in a second pass
+# share of samples that are centered on an estimated pelvis, as in a second pass, instead of like a user's cloud; and
+# the standard deviation of that estimate, m
 REFINED, PELVIS_ERROR = 0.5, 0.06
-# the same of a pelvis where nobody is, m
+# the same standard deviation for a crop without a person, m
 _OBJECT_ERROR = 0.15
-# how often the sensor's position is kept from the network
+# how often the sensor position is withheld from the network
 BLIND = 0.3
-# a joint of which the body's surface is seen within this distance is visible, m: hips lie 12 cm deep
+# a joint is visible if a point of the body's surface is within this distance, m: hips are 12 cm below the surface
 VISIBLE_RADIUS = 0.18
-# part of a point of which nothing is known
+# part of a point whose part is unknown
 UNKNOWN_PART = -1
-# a sample of fewer points after the crop stays whole
+# a sample that would have fewer points after the crop is not cropped
 LEAST_POINTS = 5
-# largest number of clutter points in a cluster
+# maximum number of clutter points per cluster
 _CLUTTER = 60
-# of a synthetic sample's, and standard deviations of its noise, m
+# the same for synthetic samples, and the range of the standard deviation of their noise, m
 _MOST_CLUTTER, _NOISE = 200, (0.005, 0.08)
 _PELVIS = BODY26.index("pelvis")
 _HIPS = [BODY26.index("left_hip"), BODY26.index("right_hip")]
@@ -41,13 +42,13 @@ _Sample = TypeVar("_Sample", bound=Sample)
 
 @dataclass(frozen=True, kw_only=True)
 class Example:
-    """One person in their own frame, z up, as a training step shows them.
+    """One person in their own frame, z up, as a training example.
 
     points (n, 3) float32 m; part (n,) int: 0 = background, 1 + j = the bone of SMPL-24's joint j, -1 = unknown; joints
-    (26, 3) float32 m of body26, NaN where there is no label; visible (26,) float32: 1 seen, 0 not, NaN not known;
-    view (5,): `voxelize.view_features`; seed: of what is drawn when the example is collated; person (2,) float32:
-    whether somebody is there, and a second one besides, 1, 0 or NaN as of joints; scale: by which the augmentation
-    multiplied all lengths.
+    (26, 3) float32 m of body26, NaN if unlabeled; visible (26,) float32: 1 visible, 0 not, NaN unknown; view (5,):
+    `voxelize.view_features`; seed: for random draws when the example is collated; person (2,) float32: whether the crop
+    shows a person, and a second person, 1, 0 or NaN if unknown; scale: factor by which the augmentation multiplied all
+    lengths.
     """
 
     points: np.ndarray
@@ -61,19 +62,19 @@ class Example:
 
     @property
     def frames(self) -> tuple["Example", ...]:
-        """Of a clip several, here one."""
+        """The frames, here one; a clip has several."""
         return (self,)
 
     @property
     def size(self) -> int:
-        """Cells of 10 cm that hold points: they stand for voxels."""
+        """Number of occupied 10 cm cells, a proxy for the number of voxels."""
         return _cells(self.points)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClipExample:
-    """Frames of one person, each about its own center, its rotations (T, 24, 3) as in `Sample`, and by name the frames'
-    clouds (n, 3) float32 m about the same centers: person, background, neighbors."""
+    """T frames of one person, each about its own center; rotations (T, 24, 3) as in `Sample`; clouds: by name (person,
+    background, neighbors) the frames' points (n, 3) float32 m about the same centers."""
 
     frames: tuple[Example, ...]
     rotations: np.ndarray
@@ -81,7 +82,7 @@ class ClipExample:
 
     @property
     def points(self) -> np.ndarray:
-        """(n, 3) m, of all frames."""
+        """Points (n, 3) m of all frames."""
         return np.concatenate([frame.points for frame in self.frames])
 
     @property
@@ -90,21 +91,21 @@ class ClipExample:
 
 
 def _cells(points: np.ndarray) -> int:
-    # one number a cell: seven times as fast as rows
+    # one integer per cell: seven times as fast as unique rows
     x, y, z = np.floor(points * 10).astype(np.int64).T
     return len(np.unique((x << 42) + (y << 21) + z))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Augmentation:
-    """How often a sample is changed, and by how much.
+    """Probabilities and magnitudes of the changes of a sample.
 
-    released: crop and center as the released code's, else by a box and by the points; box: probability that a box has a
-    detector's errors, those of the protocol clean, else it crops nothing; refined: that the center is a guess of the
-    pelvis; cut: that part of the cloud is cut off by a plane; turn: of a turn about z by up to `angle` rad; scale:
-    sizes from 1 - scale to 1 + scale; flip: of a mirror, across x and across y on their own; jitter: deviation of each
-    coordinate, m, cut at four times that; drop: probability that a fifth of the points is lost; strays: of clusters of
-    clutter points.
+    released: crop and center as in the released code, else by a box and by the points; box: probability of a crop by
+    the box with a detector's errors (those of the protocol clean), else there is no crop; refined: probability that the
+    center is an estimated pelvis; cut: probability that part of the cloud is cut off by a plane; turn: probability of a
+    turn about z by up to `angle` rad; scale: sizes range from 1 - scale to 1 + scale; flip: probability of a mirror,
+    independently along x and along y; jitter: standard deviation of each coordinate, m, clipped at four times that;
+    drop: probability that a fifth of the points is dropped; strays: probability of clusters of clutter points.
     """
 
     released: bool = False
@@ -123,9 +124,10 @@ class Augmentation:
 AUGMENTATIONS = {
     "none": Augmentation(),
     "turn": Augmentation(turn=1.0),
-    # Paper: none are named; those of the released fine-tuning. Its box of HumanM3 knows the joints
+    # the paper names no augmentations; these are of the released fine-tuning, whose HumanM3 box is made from the joints
     "paper": Augmentation(released=True, turn=0.5, scale=0.1, flip=0.3, jitter=0.005, drop=0.5),
-    # LiDAR-HMR's, of PRN and LPFormer; its shift of people and their center alike changes nothing about the center
+    # LiDAR-HMR's for PRN and LPFormer; its shift is omitted: it moves points and center together, so it has no effect
+    # on points about the center
     "lidarhmr": Augmentation(refined=0.0, turn=1.0, angle=np.pi / 4, scale=0.2),
     "default": Augmentation(box=0.9, cut=0.15, turn=1.0, scale=0.1, flip=0.5, jitter=0.005, drop=0.5, strays=0.15),
 }
@@ -138,10 +140,10 @@ def augmentation(name: str) -> Augmentation:
 
 
 def example(sample: Sample, rng: np.random.Generator, *, refined: float = REFINED) -> Example:
-    """A synthetic sample, pose and parts known, as a training step shows it.
+    """A training example of a synthetic sample with known pose and parts.
 
-    The center is that of the points or a guess of the pelvis (refined: how often), the sensor, at the origin of the
-    sample's frame, is known or not.
+    The center is that of the points, or an estimated pelvis with probability `refined`. The sensor, at the origin of
+    the sample's frame, is withheld with probability `BLIND`.
     """
     assert sample.pose is not None and sample.part is not None
     center = sample.center
@@ -154,19 +156,19 @@ def example(sample: Sample, rng: np.random.Generator, *, refined: float = REFINE
 
 
 def people_in(sample: Sample) -> np.ndarray:
-    """`Example.person` of a synthetic sample. A second person of a few points is neither there nor not."""
+    """`Example.person` of a synthetic sample. A second person with only a few points is labeled unknown."""
     return np.array([1, second_person_label(sample.second_person_points or 0, len(sample.points))], np.float32)
 
 
 def second_person_label(others: int, count: int) -> float:
-    """Whether a crop of so many points shows a second person, on whom `others` of them are: 0, 1 or NaN for unclear."""
+    """Whether a crop of `count` points, `others` of them on other people, shows a second person: 0, 1 or NaN."""
     is_clear = not 0 < others < max(FEWEST_OF_SECOND, 0.1 * count)
     return float(others > 0) if is_clear else np.nan
 
 
 def object_example(sample: Sample, rng: np.random.Generator, *, refined: float = REFINED) -> Example:
-    """A crop in which nobody is, as a training step shows it: about the points' center or about one that a pelvis was
-    taken to be at (refined: how often)."""
+    """A training example of a crop without a person: about the points' center, or with probability `refined` about a
+    point where a pelvis might have been estimated."""
     center = sample.center
     if rng.random() < refined:
         center = center + rng.normal(0, _OBJECT_ERROR, 3)
@@ -183,7 +185,7 @@ def object_example(sample: Sample, rng: np.random.Generator, *, refined: float =
 
 
 def augmented(sample: LabeledSample, kind: Augmentation, rng: np.random.Generator) -> Example:
-    """A stored sample, with the joints of body26, as a training step shows it. Missing labels stay missing."""
+    """A training example of a stored sample with the joints of body26. Missing labels stay missing."""
     sample, center = _view(sample, kind, rng)
     origin = np.zeros(3) if sample.sensor_known and rng.random() >= BLIND else None
     view = view_features(center, origin)
@@ -218,10 +220,10 @@ def clip_example(
     refined: float = REFINED,
     turn: bool = False,
 ) -> ClipExample:
-    """Frames of one person, with rotations and the joints of body26, as a training step shows them.
+    """A training example of a clip: frames of one person, with rotations and the joints of body26.
 
-    The centers are those of the points, or guesses of the pelvis (refined: how often); trans_center: SMPL's trans;
-    turn: all frames are turned about z by one angle.
+    The centers are those of the points, or with probability `refined` estimated pelvises; trans_center: they are SMPL's
+    trans, if known; turn: all frames are turned about z by one random angle.
     """
     is_about_pelvis = rng.random() < refined
     R = rotation_about("z", rng.uniform(-np.pi, np.pi)) if turn else np.eye(3)
@@ -259,11 +261,11 @@ def make_example(rng: np.random.Generator, points: np.ndarray, joints: np.ndarra
 
 
 def add_disturbances(sample: _Sample, *, strays: float, noise: float, rng: np.random.Generator) -> _Sample:
-    """A synthetic sample whose points are worse than a sensor's: with probability `strays` clusters of clutter points,
-    which no box has cut, and with probability `noise` normal steps of 0.5 to 8 cm on every coordinate.
+    """A corrupted synthetic sample: with probability `strays` clusters of clutter points, which no box has cropped, and
+    with probability `noise` Gaussian noise with a standard deviation of 0.5 to 8 cm on every coordinate.
 
-    Paper: the disturbances of its stability study, of any size. The center is that of what is there now, except
-    where it says which of two people is meant.
+    Paper: the corruptions of its stability study, with random magnitudes. The center is recomputed from the new points,
+    except in a crop of two people, where it tells which of them is the sample's.
     """
     points, part = sample.points, sample.part
     assert part is not None
@@ -277,12 +279,12 @@ def add_disturbances(sample: _Sample, *, strays: float, noise: float, rng: np.ra
         points = jitter(points, sigma=sigma, clip=2 * sigma, rng=rng).astype(np.float32)
     if points is sample.points:
         return sample
-    # clutter comes from no ring
+    # clutter points have no ring
     return replace(sample, points=points, part=part, ring=None, center=_own_center(sample, points))
 
 
 def _own_center(sample: Sample, points: np.ndarray) -> np.ndarray:
-    """The center (3,) m of points of a sample; of two people the one that says who is meant."""
+    """The center (3,) m of points of a sample; in a crop of two people the sample's center, which tells whose it is."""
     return sample.center if "crowded" in sample.conditions else center_of(points)
 
 
@@ -294,7 +296,7 @@ def _with_clutter(
 
 
 def visible_joints(joints: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """joints (J, 3) m, points (n, 3) m on the body -> (J,) bool: some point lies within `VISIBLE_RADIUS` of it."""
+    """joints (J, 3) m, points (n, 3) m on the body -> (J,) bool: a point is within `VISIBLE_RADIUS` of the joint."""
     if not len(points):
         return np.zeros(len(joints), bool)
     square_distance = (joints**2).sum(1)[:, None] + (points**2).sum(1) - 2 * joints @ points.T
@@ -302,7 +304,7 @@ def visible_joints(joints: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _view(sample: LabeledSample, kind: Augmentation, rng: np.random.Generator) -> tuple[LabeledSample, np.ndarray]:
-    """The sample's crop and its center (3,) m."""
+    """The cropped sample and its center (3,) m."""
     if kind.released:
         keep_mask, center = released_view(sample.points, sample.joints, sample.centers, sample.box)
         return _cropped(sample, keep_mask), sample.center if center is None else center
@@ -313,7 +315,7 @@ def _view(sample: LabeledSample, kind: Augmentation, rng: np.random.Generator) -
         keep_mask &= half_space_keep(sample.points, most=0.4, rng=rng)
     sample = _cropped(sample, keep_mask)
     center = _own_center(sample, sample.points)
-    # where the pelvis is not labeled, half way between the hips: what a second pass centers on
+    # if the pelvis is not labeled, the midpoint of the hips, which a second pass centers on
     pelvis = sample.joints[_PELVIS]
     root = sample.joints[_HIPS].mean(0) if np.isnan(pelvis).any() else pelvis
     if not np.isnan(root).any() and rng.random() < kind.refined:
@@ -325,7 +327,7 @@ def _cropped(sample: LabeledSample, keep_mask: np.ndarray) -> LabeledSample:
     if keep_mask.all() or keep_mask.sum() < LEAST_POINTS:
         return sample
     part, visible = part_and_visible(sample)
-    # a joint whose points are all gone is not seen any more; points whose part is unknown count as body
+    # a joint that lost all its nearby points is no longer visible; points of unknown part count as body
     is_body = part != 0
     was_visible = visible_joints(sample.joints, sample.points[is_body])
     is_lost = was_visible & ~visible_joints(sample.joints, sample.points[keep_mask & is_body])

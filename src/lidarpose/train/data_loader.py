@@ -1,10 +1,10 @@
 """A run's examples: their sources (synthetic, stored, mixed), and the loader of batches.
 
-A source is a function of an example's number in the run alone, so any process makes any example, in any order. Chunk c
-holds the examples of steps c * BATCHES ... whatever the number of workers and processes, so a run can resume at any
-chunk. A chunk is sorted by size (voxels) before it is cut into batches: padding is what a small network spends its time
-on. It is sorted in lanes, and a process takes whole lanes: no process makes examples for another, and the batches of
-all of them together are the same however many there are.
+An example depends only on its source and its number in the run, so any process can make any example, in any order.
+Chunk c holds the examples of the `BATCHES` steps from c * BATCHES on, whatever the number of workers and processes, so
+a run can resume at any chunk. A chunk is sorted by size (voxels) before it is cut into batches, since a small network
+spends most of its time on padding. It is sorted in lanes, and each process takes whole lanes: no process makes examples
+for another, and all batches together are the same for any number of processes.
 """
 
 import gc
@@ -49,21 +49,21 @@ from lidarpose.train.augment import (
 from lidarpose.train.objectives.objective import Objective
 from lidarpose.train.torch_dataset import InMemoryDataset
 
-# batches a chunk
+# batches per chunk
 BATCHES = 8
-# lanes at most, and so processes
+# maximum number of lanes, and so of processes
 LANES = 8
 # where Linux keeps shared memory, and how much a worker may need, bytes
 _SHARED_MEMORY, _SHARED_OF_WORKER = Path("/dev/shm"), 2**30
-# bytes to whose multiples arrays are aligned in it
+# alignment of arrays in it, bytes
 _ALIGNED = 64
 
 
 class Source(Protocol):
-    """Examples by their number in a run. May be pickled."""
+    """Examples by their number in a run. Must be picklable."""
 
     def example(self, index: int) -> Any:
-        """What the run's objective collates; has `size`, by which examples that cost alike share a batch."""
+        """An example for the objective's `collate`; its `size` puts examples of similar cost into the same batch."""
         ...
 
 
@@ -71,10 +71,10 @@ class Source(Protocol):
 class SyntheticSource:
     """Synthetic samples of a scene, of rising difficulty.
 
-    easy: how many samples it takes to rise from nothing to full; below the ceiling every difficulty is still sampled,
-    harder ones more often, except in the paper's scenes, which have one difficulty; motion, subjects, captured,
-    body, strays, noise, objects, set: see `recipes.Pretrain`; refined: see `example`. Raises InputError, at once, for
-    an unknown scene and for clips that cannot be read.
+    easy: number of samples in which the maximum difficulty rises from zero to full. All difficulties below the maximum
+    are sampled, harder ones more often; the paper's scenes use the maximum itself. motion, subjects, captured, body,
+    strays, noise, objects, set: see `recipes.Pretrain`; refined: see `example`. Raises InputError, when built, for an
+    unknown scene and for clips that cannot be read.
     """
 
     scene: str
@@ -91,7 +91,7 @@ class SyntheticSource:
     refined: float = REFINED
 
     def __post_init__(self):
-        # here, not in a worker, whose errors come wrapped in a traceback
+        # errors are raised here, not in a worker, whose errors come wrapped in a traceback
         self._generator  # noqa: B018
 
     def __getstate__(self) -> dict:
@@ -110,7 +110,7 @@ class SyntheticSource:
         rng = np.random.default_rng([self.seed, RandomStream.SYNTHETIC_AUGMENTATION, index])
         scene = self._generator.config
         if self.objects and rng.random() < self.objects:
-            # several scans are as frequent as of people, of whom they depend on the difficulty
+            # crops of several scans are as frequent as among people, where their frequency depends on the difficulty
             difficulty = self._difficulty(index, rng) if scene.varied else None
             object_sample, _ = draw_object(scene, self.seed, index, hard=difficulty)
             return object_example(object_sample, rng, refined=self.refined)
@@ -122,13 +122,13 @@ class SyntheticSource:
         return replace(result, person=people_in(sample)) if self.objects else result
 
     def _difficulty(self, index: int, rng: np.random.Generator) -> float:
-        """Of example `index`, in [0, 1]."""
+        """The difficulty of example `index`, in [0, 1]."""
         config = self._generator.config
         ceiling = config.hard * (min(index / self.easy, 1.0) if self.easy else 1.0)
         return ceiling if config.follows_paper else ceiling * np.sqrt(rng.random())
 
     def clip(self, index: int, *, trans_center: bool) -> ClipExample:
-        """A clip of somebody as difficult as the scene is."""
+        """A clip of a person at the scene's difficulty."""
         rng = np.random.default_rng([self.seed, RandomStream.SYNTHETIC_AUGMENTATION, index])
         samples = [person.sample for person in self._generator.clip(self.seed, index)]
         return clip_example(samples, rng, trans_center=trans_center, refined=self.refined)
@@ -136,7 +136,7 @@ class SyntheticSource:
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetSource:
-    """What is shown of datasets: all once an epoch, in an order of its own, each time changed anew.
+    """Samples or clips of datasets: each once per epoch, in a new random order, each time with a new augmentation.
 
     dataset: see `InMemoryDataset.load`; strays, noise: see `add_disturbances`.
     """
@@ -147,7 +147,7 @@ class DatasetSource:
     noise: float = 0.0
 
     def _drawn(self, index: int, count: int) -> tuple[int, np.random.Generator]:
-        """Which of `count` things example `index` shows, and what it draws from."""
+        """Which of `count` items example `index` shows, and its random generator."""
         epoch, place = divmod(index, count)
         rng = np.random.default_rng([self.seed, RandomStream.STORED_AUGMENTATION, index])
         return int(_order(self.seed, epoch, count)[place]), rng
@@ -172,8 +172,9 @@ class StoredSource(DatasetSource):
 
 @dataclass(frozen=True, kw_only=True)
 class ClipSource(DatasetSource):
-    """The clips of datasets. clips, skipped: see `InMemoryDataset.clips`; trans_center, turn: see `clip_example`. Where
-    rows follow the clips, all of an epoch begin some frames later, as many as they may without leaving their run."""
+    """The clips of datasets. clips, skipped: see `InMemoryDataset.clips`; trans_center, turn: see `clip_example`. If
+    the clips have following rows, all clips of an epoch are shifted by the same random number of frames, limited so
+    that each stays within its run."""
 
     clips: np.ndarray
     trans_center: bool
@@ -185,14 +186,14 @@ class ClipSource(DatasetSource):
         rows = self.clips[clip]
         if following := len(rows) - CLIP_FRAMES:
             epoch_rng = np.random.default_rng([self.seed, RandomStream.EPOCH_ORDER, index // len(self.clips), 1])
-            # what lies behind a run is its last row again
+            # beyond the end of a run, its last row is repeated
             start = min(int(epoch_rng.integers(following + 1)), max(len(np.unique(rows)) - CLIP_FRAMES, 0))
             rows = rows[start : start + CLIP_FRAMES]
         samples = [self._sample(row, rng) for row in rows]
         return clip_example(samples, rng, trans_center=self.trans_center, turn=self.turn)
 
     def validation_clips(self, count: int) -> list[ClipExample]:
-        """So many clips at most, evenly spread, to validate on: centered on their points."""
+        """At most `count` clips, evenly spread, for validation: centered on their points."""
         rng = np.random.default_rng(self.seed)
         clip_rows = self.clips[evenly_spaced(len(self.clips), count), :CLIP_FRAMES]
         clips = [[self.dataset.sample(row) for row in rows] for rows in clip_rows]
@@ -201,13 +202,13 @@ class ClipSource(DatasetSource):
 
 @lru_cache(maxsize=2)
 def _order(seed: int, epoch: int, count: int) -> np.ndarray:
-    """(count,) int: the rows of an epoch in its order."""
+    """(count,) int: the rows in the order of an epoch."""
     return np.random.default_rng([seed, RandomStream.EPOCH_ORDER, epoch]).permutation(count)
 
 
 @dataclass(frozen=True, kw_only=True)
 class MixedSource:
-    """Examples of `main` in their order, and evenly spread among them those of `other`, a `share` in [0, 1) of all."""
+    """Examples of `main` in order, with examples of `other` evenly spread among them: a `share` in [0, 1) of all."""
 
     main: Source
     other: Source
@@ -220,10 +221,10 @@ class MixedSource:
 
 @dataclass(frozen=True, kw_only=True)
 class Chunks(IterableDataset):
-    """The chunks of a run of so many `steps` from chunk `start` on, each a list of `BATCHES` batches as the
-    objective collates them, the last one perhaps shorter.
+    """The chunks of a run of `steps` steps from chunk `start` on, each a list of `BATCHES` batches collated by the
+    objective; the last chunk may be shorter.
 
-    batch: samples of a step in all processes; rank, ranks: which process this is, of how many.
+    batch: samples per step, in all processes together; rank, ranks: index of this process, number of processes.
     """
 
     source: Source
@@ -242,12 +243,12 @@ class Chunks(IterableDataset):
             yield self.batches_of(chunk)
 
     def batches_of(self, chunk: int) -> list[Any]:
-        """The batches of one chunk of the run, those before `start` too."""
+        """The batches of a chunk of the run, which may be before `start`."""
         first_number, batch_count = chunk * BATCHES * self.batch, min(self.steps - chunk * BATCHES, BATCHES)
         lane_count = lanes_of(self.batch, self.ranks)
         share = self.batch // lane_count
         order = np.random.default_rng([self.seed, RandomStream.BATCH_ORDER, chunk]).permutation(batch_count)
-        # products of a few thousand numbers: threads of BLAS only get in each other's way
+        # matrix products have only a few thousand numbers: BLAS threads slow each other down
         with threadpool_limits(limits=1, user_api="blas"):
             lanes = []
             for offset in range(self.rank, lane_count, self.ranks):
@@ -258,13 +259,13 @@ class Chunks(IterableDataset):
 
 
 def chunks_of(steps: int) -> int:
-    """How many chunks so many steps are."""
+    """Number of chunks for a number of steps."""
     return -(-steps // BATCHES)
 
 
 def lanes_of(batch: int, ranks: int = 1) -> int:
-    """How many lanes a chunk has, whatever the number of processes. Raises InputError where they cannot be shared out
-    evenly among so many."""
+    """Number of lanes of a chunk, the same for any number of processes. Raises InputError if they cannot be distributed
+    evenly over `ranks` processes."""
     lane_count = gcd(batch, LANES)
     if lane_count % ranks:
         counts = ", ".join(str(n) for n in range(1, lane_count + 1) if lane_count % n == 0)
@@ -287,21 +288,21 @@ def loader(chunks: Chunks, *, workers: int) -> Iterator[list[Any]]:
 
 
 def _unchanged(batches: list[Any]) -> list[Any]:
-    # torch would turn arrays into tensors; the objective does so, on its device
+    # prevents torch's conversion of arrays to tensors; the objective does it, on its device
     return batches
 
 
-# ---- between processes a chunk's arrays lie in one block of shared memory: through a pipe, hundreds of megabytes take
+# ---- a chunk's arrays go between processes in one block of shared memory: hundreds of megabytes through a pipe take
 # longer than a GPU's steps
 
 
 def _has_shared_memory(workers: int) -> bool:
-    """Whether there is room for the chunks of so many workers; containers have 64 MB unless they are given more."""
+    """Whether shared memory can hold the chunks of all workers; containers have 64 MB unless configured otherwise."""
     return _SHARED_MEMORY.is_dir() and shutil.disk_usage(_SHARED_MEMORY).free > workers * _SHARED_OF_WORKER
 
 
 def _packed(batches: list[Any]) -> tuple[bytes, list[tuple[int, int]], torch.Tensor]:
-    """A chunk: all but its arrays; where each of them begins and ends; and the block of them, (n,) uint8."""
+    """A chunk as a pickle without its arrays, the start and end of each array in a block, and the block (n,) uint8."""
     buffers: list[pickle.PickleBuffer] = []
     rest = pickle.dumps(batches, protocol=5, buffer_callback=buffers.append)
     arrays = [np.frombuffer(buffer.raw(), np.uint8) for buffer in buffers]
@@ -320,10 +321,10 @@ def _unpacked(chunk: tuple[bytes, list[tuple[int, int]], torch.Tensor]) -> list[
 
 
 def _begin_worker(worker: int) -> None:
-    # Ctrl-C, and the SIGTERM of a batch system, reach workers too, and the parent still needs them for the batches that
+    # Ctrl-C and the SIGTERM of a batch system also reach workers, but the parent still needs them for the batches that
     # it finishes
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     end_with_parent()
-    # what was made before this process is not looked through for garbage again: 5 % of the time of making people
+    # objects inherited from the parent are excluded from garbage collection: 5 % of the time of making people
     gc.freeze()

@@ -1,7 +1,7 @@
-"""The training loop: examples in, a run folder out (see `run_dir`), on one process or many.
+"""The training loop: examples in, a run folder out (see `run_dir`), in one process or several.
 
-A run killed at any moment goes on with `resume`, to the same losses. Processes are those of Accelerate's or torch's
-launcher; each makes its share of every batch, and together they take the same steps as one.
+A run that is killed at any moment can be resumed and reaches the same losses. Processes are started by Accelerate's or
+torch's launcher; each makes its share of every batch, and together they take the same steps as a single one.
 """
 
 import json
@@ -40,27 +40,27 @@ from lidarpose.train.run_dir import BEST, LOG, MODEL, STATE
 from lidarpose.train.setup import TrainSetup, make_setup
 from lidarpose.train.validation import Draw, batch_norms, update_batch_norms
 
-# of Accelerate's, those that are known to work with a run's folder
+# Accelerate's trackers that are known to work with a run's folder
 TRACKERS = ("tensorboard", "wandb")
 # seconds between two saved states
 SAVE_EVERY = 120
-# validations in a run whose recipe does not say how many
+# number of validations in a run if the recipe sets no interval
 _VALIDATIONS = 20
 
 
 class Interrupted(KeyboardInterrupt):
-    """A run that was asked to stop and has saved its state. `status` is the exit status of a shell."""
+    """Raised when a run was asked to stop and has saved its state. `status` is the exit status for a shell."""
 
     def __init__(self, message: str, number: int):
         super().__init__(message)
-        # another process may have got the signal
+        # 0: another process received the signal
         self.status = 128 + (number or signal.SIGTERM)
 
 
 class StopRequest:
-    """Notes the first SIGINT or SIGTERM inside its `with` block; a second one stops at once, as without this class.
+    """Records the first SIGINT or SIGTERM inside its `with` block; a second one stops at once, as without this class.
 
-    Python delivers signals to the main thread alone: in any other thread nothing is noted.
+    Python delivers signals to the main thread only: in any other thread nothing is recorded.
     """
 
     number: int = 0
@@ -93,15 +93,15 @@ def train(
     tracker: str | None = None,
     draw: Draw | None = None,
 ) -> Path:
-    """Trains as the recipe says and returns the path of model.safetensors.
+    """Trains according to a recipe and returns the path of model.safetensors.
 
-    setup: samples or a network of your own instead of the recipe's (`setup.make_setup`); the run is as long as it says.
+    setup: samples or a network of your own instead of the recipe's (`setup.make_setup`); it also sets the run's length.
     job: the old name of `setup`. folder: a new one (None: the next number in `runs`), or with `resume` that of a run
-    with the same recipe (its length and what of `recipes.FREE` may differ; of data, shards, motion, body and init
-    the last names are compared, not what is there). device: "cpu", or None for what Accelerate finds; tracker:
-    "tensorboard" or "wandb", which must be installed; draw: what makes pictures of validation people, None for none.
-    Raises InputError where the folder or the recipe does not fit, or where the loss stops being finite: the last good
-    state then stays. Raises `Interrupted` after SIGINT or SIGTERM, once the state is saved.
+    with the same recipe. Its length and the settings in `recipes.FREE` may differ; of data, shards, motion, body and
+    init only the last part of each path is compared, not the contents. device: "cpu", or None for what Accelerate
+    finds; tracker: "tensorboard" or "wandb", which must be installed; draw: draws pictures of validation people, None
+    for none. Raises InputError if the folder or the recipe does not fit, or if the loss stops being finite: the last
+    good state is then kept. Raises `Interrupted` after SIGINT or SIGTERM, once the state is saved.
     """
     _check(device, tracker)
     if resume:
@@ -119,7 +119,7 @@ def train(
     if recipe.batch % setup.frames:
         raise InputError(f"batch counts frames, so a clip counts {setup.frames}: give a multiple, got {recipe.batch}")
     lanes_of(recipe.batch // setup.frames, accelerator.num_processes)
-    # every process has looked before the first one writes
+    # every process must have checked the folder before the first one writes
     accelerator.wait_for_everyone()
     folder = run_dir.numbered(recipe.kind) if folder is None else Path(folder)
     accelerator.project_configuration.set_directories(str(folder))
@@ -152,13 +152,13 @@ def _accelerator(recipe: Recipe, on_cpu: bool, tracker: str | None) -> Accelerat
     try:
         return Accelerator(cpu=on_cpu, mixed_precision="bf16" if is_bf16 else "no", log_with=tracker)
     except ValueError as error:
-        # of a machine that has no bf16, or a launcher that asks for what is not there
+        # the machine has no bf16, or the launcher asks for something that is not available
         reason = str(error).partition("\n")[0]
         raise InputError(f"cannot train so ({reason}): choose another --precision or --device") from None
 
 
 def _check(device: str | None, tracker: str | None) -> None:
-    """Raises InputError for a device or a tracker that is not there."""
+    """Raises InputError for an unknown device or a tracker that is not installed."""
     if device is not None:
         check_name("device to train on", device, ("cpu",))
     if tracker is not None:
@@ -168,9 +168,9 @@ def _check(device: str | None, tracker: str | None) -> None:
 
 
 class _Run:
-    """A run that goes on: the network, the mean of its weights, its optimizers, how far it is.
+    """A run in progress: the network, the running mean of its weights, its optimizers and its progress.
 
-    best, error: of the best and of the last validation, in the setup's unit; infinite and None before.
+    best, error: errors of the best and of the last validation, in the setup's unit; infinite and None before the first.
     """
 
     def __init__(
@@ -186,11 +186,11 @@ class _Run:
         self.steps = -(-setup.people // recipe.batch)
         self.chunks = chunks_of(self.steps)
         self.chunk, self.seconds = 0, 0.0
-        # this process's batches of the chunk that was done last
+        # this process's batches of the last completed chunk
         self._trained_on: list = []
         self.best = float("inf")
         self.error: float | None = None
-        # of each chunk that is done the samples seen at its end, and its loss
+        # for each completed chunk, the number of samples seen at its end, and its loss
         self._losses: list[tuple[int, float]] = []
 
     @cached_property
@@ -199,7 +199,7 @@ class _Run:
         return self.setup.validation()
 
     def resume(self) -> None:
-        """Loads the state of the run that was stopped; stays at the beginning, where none was saved yet."""
+        """Loads the state of the stopped run; starts from the beginning if none was saved yet."""
         if (self.folder / STATE).is_file():
             progress = run_dir.load_state(self.folder / STATE, self.network, self.mean, self.optimizers)
             steps, self.seconds = progress["steps"], progress["seconds"]
@@ -208,7 +208,7 @@ class _Run:
                 raise InputError(
                     f"{self.folder}: the run has seen {people_seen:,} people already, got {self.setup.people:,} in all"
                 )
-            # a longer run makes the last chunk of a shorter one anew, whole
+            # a longer run repeats the last, partial chunk of a shorter one as a whole chunk
             self.chunk = self.chunks if steps == self.steps else steps // BATCHES
             self.best = float("inf") if progress["best"] is None else progress["best"]
             self.error = progress["validation"]
@@ -221,16 +221,16 @@ class _Run:
 
     @property
     def steps_done(self) -> int:
-        """Steps of all chunks that are done."""
+        """Number of steps of all completed chunks."""
         return min(self.chunk * BATCHES, self.steps)
 
     @property
     def seen(self) -> int:
-        """Samples of all chunks that are done."""
+        """Number of samples of all completed chunks."""
         return self.steps_done * self.recipe.batch
 
     def steps_until(self, stop: StopRequest) -> None:
-        """All that is left of the run, or until `stop` is asked for. Raises `Interrupted` in the latter case."""
+        """Trains to the end of the run, or until `stop` is requested. Raises `Interrupted` in the latter case."""
         people, recipe = self.setup.people, self.recipe
         validate_every = recipe.validate or max(people // _VALIDATIONS, 1)
         start_time = save_time = time.monotonic()
@@ -256,19 +256,19 @@ class _Run:
                     log.write(json.dumps(entry) + "\n")
                     log.flush()
                     if is_last or is_stopping or time.monotonic() - save_time > SAVE_EVERY:
-                        # the state must not be on the disk before the log
+                        # the log must be on disk before the state is
                         os.fsync(log.fileno())
                         self._save()
                         save_time = time.monotonic()
                 if is_stopping and not is_last:
-                    # all processes take this branch: the request was shared with the losses
+                    # all processes take this branch: the request was reduced together with the losses
                     folder_option = ("--out " if recipe.kind == "finetune" else "") + shlex.quote(str(self.folder))
                     remedy = f"go on with lidarpose {recipe.kind} {folder_option} --resume"
                     raise Interrupted(f"stopped after {self.seen:,} samples, saved: {remedy}", stop.number)
         self.accelerator.wait_for_everyone()
 
     def _chunks(self, rank: int = 0, ranks: int = 1) -> Chunks:
-        """What is left of the run for one of so many processes."""
+        """The remaining chunks of the run for process `rank` of `ranks`."""
         return Chunks(
             source=self.setup.source,
             objective=self.setup.objective,
@@ -281,14 +281,14 @@ class _Run:
         )
 
     def _note(self, terms: dict[str, float]) -> str:
-        """What the progress bar shows."""
+        """The text of the progress bar."""
         metric = f"mpjpe {terms['mpjpe'] * 1e3:.0f} mm" if "mpjpe" in terms else f"AP {terms['ap']:.3f}"
         note = f"loss {_loss(terms):.3f}, {metric}"
         return note if self.error is None else f"{note}, validation {self.error:.0f} {self.setup.error_unit}"
 
     def _chunk(self, batches: list, stop: StopRequest) -> tuple[dict[str, float], bool]:
-        """Takes the steps of a chunk; returns the mean of each term and of the gradient's norm over them, and whether
-        any process was asked to stop. Raises InputError where a term is not finite."""
+        """Takes the steps of a chunk. Returns the means over them of each term and of the gradient's norm, and whether
+        any process was asked to stop. Raises InputError if a term is not finite."""
         plateau = self._plateau_factor()
         terms = [self._step(arrays, k, plateau) for k, arrays in enumerate(batches)]
         names = list(terms[0])
@@ -308,12 +308,12 @@ class _Run:
         return means, bool(flags.any())
 
     def _plateau_factor(self) -> float:
-        """Share of the rate that is left by the losses of all epochs that are over."""
+        """Share of the peak rate, given the losses of all completed epochs."""
         if self.recipe.schedule != "reduce-on-plateau":
             return 1.0
         losses: list[list[float]] = [[] for _ in range(self.seen // self.setup.epoch)]
         for seen, loss in self._losses:
-            # of a chunk that ends in the next epoch most may be of this one
+            # a chunk that ends in the next epoch may mostly lie in this one
             epoch = (seen - 1) // self.setup.epoch
             if epoch < len(losses):
                 losses[epoch].append(loss)
@@ -321,7 +321,7 @@ class _Run:
 
     def _step(self, arrays: object, k: int, plateau: float) -> dict[str, Tensor]:
         step, recipe, accelerator = self.chunk * BATCHES + k, self.recipe, self.accelerator
-        # what a network drops at random follows from the step alone
+        # random draws in the network (dropout) depend only on the step
         torch.manual_seed(_seed(recipe.seed, RandomStream.TRAINING_STEP, step, accelerator.process_index))
         set_rates(self.optimizers, recipe, plateau * rate_factor(step / self.steps, recipe))
         for optimizer in self.optimizers:
@@ -339,24 +339,24 @@ class _Run:
         return self.accelerator.reduce(count.detach().float(), "mean") if self.wrapped is not self.network else count
 
     def _averaged(self) -> nn.Module:
-        """A network with the mean weights and the batch statistics that belong to them, in evaluation mode."""
+        """A network with the mean weights and batch statistics estimated for them, in evaluation mode."""
         network = self.setup.objective.network().to(self.accelerator.device)
         network.load_state_dict(self.network.state_dict() | self.mean)
         if batch_norms(network):
-            # networks of poses alone have them
+            # only pose networks have batch norms
             update_batch_norms(network, cast(PoseObjective, self.setup.objective), self._recent_batches())
         return network.eval()
 
     def _recent_batches(self) -> list:
-        """All processes' batches of the last whole chunk: they follow from the step alone."""
+        """All processes' batches of the last whole chunk; they depend only on the step."""
         chunk = max(self.steps_done // BATCHES, 1) - 1
         if chunk == self.chunk - 1 and self.accelerator.num_processes == 1:
             return self._trained_on
-        # the last chunk may be a single batch, and other processes' batches are not here: made anew
+        # the last chunk may be a single batch, and other processes' batches are not available here: they are made again
         return self._chunks().batches_of(chunk)
 
     def _validated(self) -> dict[str, float]:
-        """On the main process; the weights of the best validation are kept."""
+        """Validates, on the main process, and returns the log entries; saves the weights of the best validation."""
         if not self._watched:
             return {}
         network = self._averaged()
@@ -375,11 +375,11 @@ class _Run:
         return self._error_entry(self.error)
 
     def _error_entry(self, error: float) -> dict[str, float]:
-        """What the log and the card say of a validation."""
+        """The entry of the log and the card for a validation error."""
         return {f"validation_{self.setup.error_unit}": round(error, 2)}
 
     def _save(self) -> None:
-        # the state last: killed between the two, a run goes on from the older one and writes both again
+        # the state is written last: a run that is killed in between resumes from the older state and writes both again
         self._save_weights(MODEL, self._averaged())
         best = self.best if np.isfinite(self.best) else None
         progress = {"steps": self.steps_done, "seconds": self.seconds, "best": best, "validation": self.error}
@@ -389,7 +389,7 @@ class _Run:
         recipe = self.recipe.to_dict()
         for field in run_dir.PATHS:
             if value := recipe.get(field):
-                # names of files, not where they lie
+                # file names without their folders
                 recipe[field] = Path(value).name if isinstance(value, str) else run_dir.folder_names(value)
         card: dict[str, Any] = {"command": self.command or "lidarpose.train.loop.train", "recipe": recipe}
         card |= {f"{self.setup.unit}_seen": self.seen, "hours": round(self.seconds / 3600, 3)}
@@ -399,19 +399,19 @@ class _Run:
 
 
 def _loss(entry: dict[str, float]) -> float:
-    """The sum of the terms of a chunk, of an entry of the log too."""
+    """The sum of the loss terms of a chunk, given its terms or its log entry."""
     others = ("people", "seconds", "gradient", *LOGGED)
     return sum(value for name, value in entry.items() if name not in others and not name.startswith("validation_"))
 
 
 def _seed(*words: int) -> int:
-    """A seed of torch's from words."""
+    """A seed for torch derived from integers."""
     return int(np.random.SeedSequence(words).generate_state(1)[0])
 
 
 @contextmanager
 def _dead_worker_named() -> Iterator[None]:
-    """Raises InputError where a process that makes people was killed, which PyTorch notices at any moment of a step."""
+    """Raises InputError if a loader worker was killed, which PyTorch may notice at any point of a step."""
     try:
         yield
     except RuntimeError as error:

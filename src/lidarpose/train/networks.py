@@ -1,4 +1,4 @@
-"""What a recipe means for the network: its configuration, and the weights that it begins with."""
+"""The network of a recipe: its configuration and its initial weights."""
 
 import json
 from collections.abc import Callable
@@ -32,7 +32,7 @@ from lidarpose.train.recipes import MODELS, PAPER, RANDOM, Finetune, Pretrain
 
 Config = NetworkConfig | DaptConfig | BaselineConfig
 
-# by size: the configuration of a network before fine-tuning, and the skeleton in which its people are drawn
+# by size: the configuration of a network before fine-tuning, and the skeleton in which validation people are drawn
 PRETRAINED: dict[str, tuple[Any, Skeleton]] = {
     **{size: (config, SMPL24) for size, config in SIZES.items()},
     PAPER: (pretraining_config(), HUMAN15),
@@ -41,7 +41,7 @@ PRETRAINED: dict[str, tuple[Any, Skeleton]] = {
     "lpformer": (LpformerConfig(), HUMAN15),
     "lidarcap": (LidarcapConfig(), SMPL24),
     "ne": (NeConfig(), SMPL24),
-    # each sees 200,000 people within one or two hours of one core, of the tiny ones within one
+    # each trains on 200,000 people within one to two hours on one core, the tiny ones within one hour
     "prn-small": (PrnConfig(width_divisor=4, most_points=128), HUMAN15),
     "prn-tiny": (PrnConfig(width_divisor=8, most_points=128, attention_dropout=0.0), HUMAN15),
     "lpformer-small": (LpformerConfig(width_divisor=4, most_points=128, grid=16, attention_dropout=0.0), HUMAN15),
@@ -54,7 +54,8 @@ PRETRAINED: dict[str, tuple[Any, Skeleton]] = {
 
 
 def networks() -> list[dict[str, Any]]:
-    """name, size, joints, frames and parameters of every network, without its weights, a model's by parameters."""
+    """Name, size, joints, frames and number of parameters of every network, by model, then by parameters; no weights
+    are loaded."""
     rows = []
     for name, sizes in MODELS.items():
         for size in sizes:
@@ -68,7 +69,7 @@ def networks() -> list[dict[str, Any]]:
 
 
 def pretraining_network(recipe: Pretrain) -> tuple[Any, Skeleton]:
-    """The configuration of a network to pre-train, and the skeleton in which its people are drawn."""
+    """The configuration of a network to pre-train, and the skeleton in which validation people are drawn."""
     check_name("network size", recipe.size, PRETRAINED)
     config, joints = PRETRAINED[recipe.size]
     if recipe.objects:
@@ -90,7 +91,7 @@ def pretraining_network(recipe: Pretrain) -> tuple[Any, Skeleton]:
 
 
 def expanded_network(init: str, config: Config) -> tuple[Callable[[], nn.Module], dict]:
-    """What makes a network of this configuration that begins as the weights named, and their card."""
+    """A factory for networks of `config` initialized with the weights `init`, and the card of these weights."""
     if not isinstance(config, NetworkConfig):
         raise InputError(f"init is for the package's own networks: {config.kind} begins at random")
     path = weights_path(init)
@@ -99,13 +100,13 @@ def expanded_network(init: str, config: Config) -> tuple[Callable[[], nn.Module]
         raise file_error(
             path, f"holds the network {header.config.name}: --init names one of the package's own that poses"
         )
-    # tried at once, so that an error comes before a folder is made
+    # tried now, so that an error is raised before a run folder is made
     expand_weights(small_network, config)
     return partial(expand_weights, small_network, config), header.card
 
 
 def initial_network(recipe: Finetune) -> tuple[Any, dict]:
-    """The network that fine-tuning goes on from, None for random weights, and what the card says of it."""
+    """The network that fine-tuning starts from, None for random weights, and its entries for the card."""
     if recipe.init == RANDOM:
         check_name("network size", recipe.size, PRETRAINED)
         return None, {"init": RANDOM, "init_card": {}}
@@ -121,10 +122,12 @@ def initial_network(recipe: Finetune) -> tuple[Any, dict]:
 def finetuned_network(
     recipe: Finetune, trained: Any, joints: Skeleton, dataset: str
 ) -> tuple[Config, Callable[[], nn.Module]]:
-    """The configuration for a dataset's joints, and what makes the network with the weights that it begins with.
-    trained: None for random weights."""
+    """The configuration for a dataset's joints, and a factory for the network with its initial weights.
+
+    trained: the network to start from, None for random weights.
+    """
     base_config = PRETRAINED[recipe.size][0] if trained is None else trained.config
-    # of anchors the package's own networks say below what to do instead
+    # keep_anchors for the package's own networks has its own error below, which says what to do instead
     dapt_settings = ("neck", "head", "keep_anchors") if isinstance(base_config, BaselineConfig) else ("neck", "head")
     for name in () if isinstance(base_config, DaptConfig) else dapt_settings:
         if getattr(recipe, name) != getattr(Finetune, name):
@@ -150,7 +153,7 @@ def finetuned_network(
             )
         return base_config, partial(PoseNet, base_config) if trained is None else lambda: trained
     if not dataset:
-        # synthesized people have every joint; the paper's network those that it is pre-trained on
+        # synthesized people have every joint; the paper's network keeps the joints of its pre-training
         joints = HUMAN15
     candidates = [c for c in CONFIGS.values() if c.bins and set(c.joints) == set(joints.joints)]
     if not candidates:
@@ -158,12 +161,12 @@ def finetuned_network(
     template = next((c for c in candidates if c.name == dataset), candidates[0])
     if trained is None:
         base_config = _with_neck(replace(base_config, bins=(), ranges=(), coordinates=True), recipe.neck)
-    # the paper fine-tunes by heatmaps alone, Table 3 by coordinates too; the neck prn knows no others
+    # the paper fine-tunes with heatmaps only, in Table 3 also with coordinates; the neck prn has only coordinates
     coordinates = recipe.head == "coordinates" or base_config.neck == "prn"
     bins, ranges = ((), ()) if coordinates else (template.bins, template.ranges)
     is_same = (base_config.joints, base_config.bins, base_config.ranges) == (template.joints, bins, ranges)
     if trained is not None and recipe.keep_anchors and is_same and not (coordinates and base_config.parts):
-        # a network of this dataset already, as released ones are
+        # the network already fits this dataset, as released ones do
         return base_config, lambda: trained
     heads: dict[str, Any] = {"parts": 0, "coordinates": coordinates, "auxiliary": False}
     config = replace(base_config, name=template.name, joints=template.joints, bins=bins, ranges=ranges, **heads)
@@ -173,8 +176,11 @@ def finetuned_network(
 
 
 def _with_options(config: Any, options: tuple[str, ...]) -> Any:
-    """A configuration with options NAME=VALUE (JSON or text), or NAME for true: of a baseline, or the paper's network
-    with faults of the released code. Raises InputError for unknown ones."""
+    """A configuration with options NAME=VALUE (JSON or text), or NAME for true.
+
+    Options are fields of a baseline's configuration, or faults of the released code for the paper's network. Raises
+    InputError for unknown ones.
+    """
     if not options:
         return config
     if isinstance(config, NetworkConfig):
@@ -192,7 +198,7 @@ def _with_options(config: Any, options: tuple[str, ...]) -> Any:
 
 
 def _with_neck_and_head(recipe: Pretrain, config: NetworkConfig | DaptConfig) -> DaptConfig:
-    """The paper's network with the neck and the head that the recipe names."""
+    """The paper's network with the recipe's neck, head and drop_path."""
     if not isinstance(config, DaptConfig):
         raise InputError(
             f"neck, head and drop_path are of the paper's network: add --size {' or '.join(MODELS['dapt'])}"

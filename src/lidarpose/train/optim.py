@@ -11,28 +11,28 @@ from lidarpose.models.dapt.dapt_net import DaptNet
 from lidarpose.models.posenet import PoseNet
 from lidarpose.train.recipes import PoseRecipe, Recipe
 
-# the released schedule begins at a tenth of its peak and ends at a thousandth
+# the released schedule begins at a tenth of its peak rate and ends at a thousandth
 _FIRST, _LAST = 0.1, 1e-3
-# a rate that is reduced on plateaus falls no lower
+# lower bound of a rate that is reduced on plateaus
 _LEAST_RATE = 3e-8
-# vectors, embeddings and the layers of a `PoseNet` that end in meters or logits
+# parameters of a `PoseNet` that Muon does not step: vectors, embeddings, and layers that output meters or logits
 _ENDS = (
     *("anchors", "stem.voxel", "stem.view", "place", "anchor_view", "level_joints", "vote.residual", "part"),
     *("joint.heatmap", "joint.certainty", "person"),
 )
-# the layers of the paper's network that end in heatmaps, an axis each
+# the layers of the paper's network that output heatmaps, one per axis
 _HEATMAPS = tuple(f"heads.query.fcs.{axis}.fc2." for axis in range(3))
-# Newton-Schulz iteration of Muon
+# Muon's Newton-Schulz iteration
 _COEFFICIENTS, _ITERATIONS, _EPS = (3.4445, -4.775, 2.0315), 5, 1e-7
 
 
 def optimizers(network: nn.Module, recipe: Recipe) -> list[torch.optim.Optimizer]:
-    """AdamW or Adam; with a muon_rate AdamW, and Muon for the hidden matrices of a `PoseNet`."""
+    """The recipe's AdamW or Adam; for a `PoseNet` and a nonzero muon_rate AdamW, and Muon for the hidden matrices."""
     betas: Any = recipe.betas
     settings: dict[str, Any] = {"lr": recipe.rate, "weight_decay": recipe.decay, "fused": True}
     if not (isinstance(network, PoseNet) and isinstance(recipe, PoseRecipe) and recipe.muon_rate):
         optimizer_class = torch.optim.Adam if recipe.optimizer == "adam" else torch.optim.AdamW
-        # the paper's: torch's own settings
+        # the paper uses torch's default betas
         return [optimizer_class(_groups(network, recipe), betas=betas or (0.9, 0.999), **settings)]
     hidden_matrices: list[nn.Parameter] = []
     other_parameters: list[nn.Parameter] = []
@@ -45,7 +45,7 @@ def optimizers(network: nn.Module, recipe: Recipe) -> list[torch.optim.Optimizer
 
 
 def _groups(network: nn.Module, recipe: Recipe) -> list[dict[str, Any]]:
-    """All parameters, those with a rate of their own apart, which is `times` the recipe's."""
+    """Parameter groups; heatmap layers form their own group if their rate differs: `times` the recipe's rate."""
     times = recipe.heatmap_rate if isinstance(recipe, PoseRecipe) and isinstance(network, DaptNet) else 1.0
     if times == 1:
         return [{"params": list(network.parameters())}]
@@ -57,7 +57,7 @@ def _groups(network: nn.Module, recipe: Recipe) -> list[dict[str, Any]]:
 
 
 def rate_factor(done: float, recipe: Recipe) -> float:
-    """Share of the peak rate when `done` in [0, 1] of the run is over."""
+    """Share of the peak rate after the fraction `done` in [0, 1] of the run."""
     if recipe.schedule in ("constant", "reduce-on-plateau"):
         return 1.0
     if recipe.schedule == "cosine":
@@ -72,8 +72,8 @@ def rate_factor(done: float, recipe: Recipe) -> float:
 
 
 def plateau_factor(losses: Sequence[float], rate: float) -> float:
-    """Share of the peak rate after epochs of these mean losses: a tenth less after two in a row that gain less than
-    1 %, down to 3e-8. Source: LiDARCap's ReduceLROnPlateau."""
+    """Share of the peak rate after epochs with these mean losses: it falls by a tenth after two consecutive epochs that
+    each improve the loss by less than 1 %; the rate stays at 3e-8 or more. Source: LiDARCap's ReduceLROnPlateau."""
     optimizer = torch.optim.SGD([torch.zeros(1)], lr=rate)
     scheduler = torch.optim.lr_scheduler.ReduceLROnPlateau(
         optimizer, factor=0.9, patience=1, threshold=0.01, min_lr=min(_LEAST_RATE, rate)
@@ -84,7 +84,7 @@ def plateau_factor(losses: Sequence[float], rate: float) -> float:
 
 
 def set_rates(optimizers: list[torch.optim.Optimizer], recipe: Recipe, factor: float) -> None:
-    """Rates of all optimizers, as a share of their peaks."""
+    """Sets the rates of all optimizers to a share `factor` of their peaks."""
     for optimizer in optimizers:
         rate = recipe.muon_rate if isinstance(optimizer, Muon) and isinstance(recipe, PoseRecipe) else recipe.rate
         for group in optimizer.param_groups:
@@ -93,18 +93,18 @@ def set_rates(optimizers: list[torch.optim.Optimizer], recipe: Recipe, factor: f
 
 @torch.no_grad()
 def average(mean: dict[str, Tensor], network: nn.Module, step: int, ema: float) -> None:
-    """Moves the running mean of the weights towards the network's, faster while the run is young. In place."""
+    """Moves the running mean of the weights toward the network's weights, faster early in the run. In place."""
     decay = min(ema, (1 + step) / (10 + step))
     parameters = dict(network.named_parameters())
     torch._foreach_lerp_(list(mean.values()), [parameters[name] for name in mean], 1 - decay)
 
 
 class Muon(torch.optim.Optimizer):
-    """Momentum whose update is orthogonalized, for matrices (2-D parameters) alone, those of one shape together.
+    """Momentum with an orthogonalized update, for matrices (2-D parameters) only; equal shapes are batched.
 
     The optimizer and its constants are those of `torch.optim.Muon` (Jordan et al. 2024, as in torch 2.9), which steps
-    matrices one by one in bfloat16: on a CPU a tenth of a small network's step. Here matrices of one shape are stacked
-    and orthogonalized in one batch, in their own type. A test holds the two together.
+    matrices one by one in bfloat16: on a CPU that takes a tenth of a small network's step. Here matrices of equal shape
+    are stacked and orthogonalized in one batch, in their own dtype. A test checks that the two agree.
     """
 
     def __init__(self, matrices: Iterable[Tensor], *, lr: float, weight_decay: float = 0.1, momentum: float = 0.95):
@@ -116,7 +116,7 @@ class Muon(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:  # type: ignore[override]  # torch's takes closures and floats
-        """One step of every matrix that has a gradient."""
+        """Steps every matrix that has a gradient."""
         if closure is not None:
             raise ValueError("Muon takes no closure")
         for group in self.param_groups:

@@ -1,6 +1,6 @@
-"""A run is a function that returns a complete configuration; the command line only overrides its fields.
+"""Recipes: complete configurations of training runs, by name; the command line only overrides their fields.
 
-A field's help is what the command line says of it; this module stays light for that.
+A field's help is its help text on the command line, so this module imports nothing heavy.
 """
 
 from dataclasses import Field, asdict, dataclass, field, fields
@@ -12,26 +12,26 @@ from lidarpose.errors import InputError, check_finite, check_name
 from lidarpose.io.files import listed
 from lidarpose.models import DEFAULT
 
-# rises, stays, falls to nothing; rises and falls as a cosine; or never changes
+# rise, stay, fall to zero; rise and fall along a cosine; constant; or reduced when the loss stops improving
 SCHEDULES = ("plateau", "cosine", "constant", "reduce-on-plateau")
 OPTIMIZERS = ("adamw", "adam")
 PRECISIONS = ("auto", "float32", "bf16")
-# the paper's network, and two of the same design for CPUs, besides the sizes of the package's own
+# the paper's network, and two smaller ones of the same design for CPUs
 PAPER, SMALL_PAPER, TINY_PAPER = "paper", "paper-small", "paper-tiny"
-# the networks of --model, and their sizes, the first one by default
+# the networks of --model and their sizes; the first size is the default
 MODELS: dict[str, tuple[str, ...]] = {
     "ours": ("tiny", "small", "base"),
     "dapt": (PAPER, SMALL_PAPER, TINY_PAPER),
     # as published, and narrower ones for CPUs
     **{name: (name, f"{name}-small", f"{name}-tiny") for name in ("prn", "lpformer", "lidarcap", "ne")},
 }
-# instead of weights: fine-tuning begins with none
+# value of --init for random initial weights
 RANDOM = "random"
-# what it learns: coordinates of joints (in pre-training parts too), or heatmaps
+# what the paper's network learns: coordinates of joints (in pre-training parts, too), or heatmaps
 HEADS = ("coordinates", "heatmaps")
-# what changes no sample: a resumed run may have others
+# settings that change no sample: a resumed run may change them
 FREE = ("workers", "validate", "pictures", "precision")
-# shares of a whole that cannot be all of it
+# shares that must be below 1
 _BELOW_ONE = ("ema", "mix", "hold_out", "objects", "whole_scans")
 _MODEL = "ours, dapt, prn, lpformer, lidarcap or ne"
 _OPTIONS = "options of a baseline or the paper's network: grid=32, stale_convolution=true, ... (docs/train.md)"
@@ -39,14 +39,14 @@ _LEAST = {"batch": 1, "people": 1, "scenes": 1, "uses": 1}
 
 
 def _to_bool(value: Any) -> bool:
-    # by name: numpy's is one too, and is not loaded for that
+    # checked by name: numpy's bool is accepted without importing numpy
     if type(value).__name__ not in ("bool", "bool_"):
         raise TypeError
     return bool(value)
 
 
-# by type of a setting: what makes one of a value, so that numpy's numbers and paths are as good as Python's and can be
-# stored; what is expected; and what stands for the value in the command's help
+# by type of a setting: a converter, so that numpy's numbers and path objects are accepted and can be stored; the
+# expected value, for errors; and the placeholder of the value in the command's help
 TYPES: dict[Any, tuple] = {
     int: (index, "a whole number", "N"),
     float: (float, "a number", "X"),
@@ -60,12 +60,12 @@ TYPES: dict[Any, tuple] = {
 
 
 def _setting(default: Any, help_text: str, metavar: str = "") -> Any:
-    """A field with its help and what stands for its value there, by default that of its type; SHARE: from 0 to 1."""
+    """A field with its help text and the placeholder of its value, by default that of its type; SHARE: from 0 to 1."""
     return field(default=default, metadata={"help": help_text, "metavar": metavar})
 
 
 def _checked(f: Field, value: Any) -> Any:
-    """A setting as its field declares it. Raises InputError for what is none."""
+    """A value converted to the type of its field. Raises InputError for an invalid value."""
     convert, expected, _ = TYPES[f.type]
     try:
         value = convert(value)
@@ -83,7 +83,7 @@ def _checked(f: Field, value: Any) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """What all training has in common. Raises InputError for a value that cannot be.
+    """Settings that all kinds of training share. Raises InputError for an invalid value.
 
     kind: the command.
     """
@@ -126,7 +126,7 @@ class Recipe:
 
 @dataclass(frozen=True, kw_only=True)
 class PoseRecipe(Recipe):
-    """What pre-training and fine-tuning have in common."""
+    """Settings that pre-training and fine-tuning share."""
 
     muon_rate: float = _setting(0.02, "peak learning rate of Muon for hidden matrices; 0: AdamW for all", "RATE")
     heatmap_rate: float = _setting(
@@ -138,7 +138,7 @@ class PoseRecipe(Recipe):
 
 
 def _size_of(model: str, size: str) -> str:
-    """The size of a model that a recipe means. Raises InputError for an unknown model or another's size."""
+    """The size of a model, by default its first. Raises InputError for an unknown model or another model's size."""
     check_name("model", model, MODELS)
     if size and size not in MODELS[model]:
         raise InputError(f"the model {model} has the size {' or '.join(MODELS[model])}, got {size}")
@@ -147,7 +147,7 @@ def _size_of(model: str, size: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Pretrain(PoseRecipe):
-    """Pre-training on synthesized people, made while the network learns, or read from shards."""
+    """Pre-training on synthesized people, made during training or read from shards."""
 
     kind: ClassVar[str] = "pretrain"
 
@@ -253,7 +253,7 @@ class Finetune(PoseRecipe):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainDetector(Recipe):
-    """Training of the network that finds people, on synthesized scans."""
+    """Training of the detector on synthesized scans."""
 
     kind: ClassVar[str] = "train-detector"
 
@@ -268,7 +268,7 @@ class TrainDetector(Recipe):
 
 @dataclass(frozen=True, kw_only=True)
 class TrainVerifier(Recipe):
-    """Training of the network that tells people from the detector's mistakes, on what it finds in synthesized scans."""
+    """Training of the verifier, which tells people from false positives, on detections in synthesized scans."""
 
     kind: ClassVar[str] = "train-verifier"
 
@@ -283,37 +283,37 @@ class TrainVerifier(Recipe):
     init: str = _setting("tiny", "initial weights", "NAME|FILE")
 
 
-# the released OneCycle schedule, AdamW on everything, neither mean of weights nor clipping
+# the released OneCycle schedule, AdamW for all parameters, no mean of weights, no clipping
 _RELEASED = {"muon_rate": 0.0, "decay": 0.005, "schedule": "cosine", "warmup": 0.04, "ema": 0.0, "clip": 0.0}
-# LiDAR-HMR's, of PRN and of its LPFormer: a constant rate, neither mean of weights nor clipping
+# LiDAR-HMR's recipe of PRN and of its LPFormer: a constant rate, no mean of weights, no clipping
 _LIDARHMR = {"muon_rate": 0.0, "rate": 5e-4, "schedule": "constant", "warmup": 0.0, "ema": 0.0, "clip": 0.0}
 _PRN = _LIDARHMR | {"model": "prn", "optimizer": "adam", "decay": 0.0}
-# the decay is torch's
+# the weight decay is torch's default
 _LPFORMER = _LIDARHMR | {"model": "lpformer", "betas": (0.85, 0.95), "batch": 16}
-# 50 epochs on all training sequences and no others, from random weights
+# 50 epochs on all training sequences only, from random weights
 _LIDARHMR_DATA = {"init": RANDOM, "epochs": 50.0, "augment": "lidarhmr", "mix": 0.0, "hold_out": 0.0}
-# AdamW on everything in one cycle at a rate at which the small network learns within 100,000 people
+# AdamW for all parameters in one cycle, at a rate at which the small network learns within 100,000 people
 _ONE_CYCLE = {"rate": 2e-3, "muon_rate": 0.0, "schedule": "cosine", "warmup": 0.1, "ema": 0.0, "clip": 35.0}
-# LiDARCap's and NE's
+# LiDARCap's and NE's recipe
 _CLIPS = {"muon_rate": 0.0, "rate": 1e-4, "schedule": "constant", "warmup": 0.0, "ema": 0.0, "clip": 0.0}
-# 8 clips
+# a batch of 128 frames is 8 clips
 _CLIPS |= {"optimizer": "adam", "decay": 1e-4, "batch": 128}
 _CLIPS_SHARDS = _CLIPS | {"easy": 0.0, "strays": 0.0, "noise": 0.0}
 _CLIPS_DATA = _CLIPS | {"init": RANDOM, "epochs": 200.0, "augment": "none", "mix": 0.0, "hold_out": 0.0}
 _CLIPS_DATA |= {"schedule": "reduce-on-plateau"}
-# by kind and name, what differs from the recipe of the bundled weights. Paper: implementation details
+# by kind and name, differences from the recipe of the bundled weights. Paper: implementation details
 RECIPES: dict[type[Recipe], dict[str, dict[str, Any]]] = {
     Pretrain: {
         "default": {},
-        # 50 epochs; an epoch is here 50,000 people, since the paper's follow frames of LiDARHuman26M, and every pose is
-        # new. Its law of noise is the scene's
+        # 50 epochs; an epoch is 50,000 people here: the paper's follow frames of LiDARHuman26M, whereas every pose is
+        # new here. The paper's noise model is part of the scene
         "paper": _RELEASED
         | {"size": PAPER, "scene": "paper", "rate": 3e-4, "people": 2_500_000, "easy": 0.0}
         | {"strays": 0.0, "noise": 0.0},
-        # people as for our own: the published ones are not pre-trained
+        # people as for our own network: the published baselines are not pre-trained
         "prn": _PRN,
         "lpformer": _LPFORMER,
-        # one stage of heatmaps: see docs/log.md for what it reached
+        # heatmaps in a single stage: see docs/log.md for its accuracy
         "paper-one-stage": _ONE_CYCLE
         | {"size": SMALL_PAPER, "head": "heatmaps", "drop_path": 0.05, "scene": "paper", "people": 100_000}
         | {"easy": 0.0, "strays": 0.0, "noise": 0.0},
@@ -321,14 +321,14 @@ RECIPES: dict[type[Recipe], dict[str, dict[str, Any]]] = {
         "ne": _CLIPS_SHARDS | {"model": "ne"},
     },
     Finetune: {
-        # anchors and heads stay, every joint has its name, synthesized people are mixed in
+        # anchors and heads are kept, joint by joint of the same name, and synthesized people are mixed in
         "default": {},
-        # 50 epochs on all training sequences and no others; anchors and heads anew
+        # 50 epochs on all training sequences only; anchors and heads are new
         "paper": _RELEASED
         | {"init": "", "epochs": 50.0, "augment": "paper", "mix": 0.0, "hold_out": 0.0, "keep_anchors": False},
         "prn": _PRN | _LIDARHMR_DATA,
         "lpformer": _LPFORMER | _LIDARHMR_DATA,
-        # goes on from a network of that recipe, heads and all
+        # starts from a network of the pre-training recipe of that name, including its heads
         "paper-one-stage": _ONE_CYCLE | {"init": "", "rate": 5e-4, "mix": 0.0},
         "lidarcap": _CLIPS_DATA | {"model": "lidarcap"},
         "ne": _CLIPS_DATA | {"model": "ne"},
@@ -336,23 +336,23 @@ RECIPES: dict[type[Recipe], dict[str, dict[str, Any]]] = {
     TrainDetector: {"default": {}},
     TrainVerifier: {"default": {}},
 }
-# of a network named by --model whose recipe has another name
+# networks of --model whose recipe has another name
 _RECIPE_OF_MODEL = {"dapt": PAPER}
 AnyRecipe = TypeVar("AnyRecipe", bound=Recipe)
 
 
 def model_of_size(size: str) -> str:
-    """The network of `MODELS` that has a size of this name, "" for none."""
+    """The network of `MODELS` with a size of this name, "" if none."""
     return next((model for model, sizes in MODELS.items() if size in sizes), "")
 
 
 def recipe_of_model(kind: type[Recipe], model: str) -> str:
-    """The name of the recipe by which a network of `MODELS` is trained as published; else "default"."""
+    """The name of the recipe that trains a network of `MODELS` as published, else "default"."""
     name = _RECIPE_OF_MODEL.get(model, model)
     return name if name in RECIPES[kind] else "default"
 
 
 def recipe(kind: type[AnyRecipe], name: str = "default", **changes: Any) -> AnyRecipe:
-    """A named recipe of a kind of training, some of its fields changed."""
+    """A named recipe of a kind of training, with changes of its fields."""
     check_name("recipe", name, RECIPES[kind])
     return kind(**(RECIPES[kind][name] | changes))

@@ -1,8 +1,8 @@
 """Run folders: numbered, never overwritten, and the state that a run resumes from.
 
-A run folder holds config.json (the recipe and the command), log.jsonl (a line a chunk and a line a validation),
-state.safetensors (to resume from), model.safetensors (the mean weights, to use), best.safetensors (those of the best
-validation) and pictures/.
+A run folder holds config.json (the recipe and the command), log.jsonl (one line per chunk, with the validation error if
+there was one), state.safetensors (to resume from), model.safetensors (the mean weights, for inference),
+best.safetensors (those of the best validation) and pictures/.
 """
 
 import json
@@ -26,30 +26,30 @@ from lidarpose.models.checkpoint import SafetensorsFile, with_digest
 from lidarpose.train.optim import Muon
 from lidarpose.train.recipes import FREE, AnyRecipe, Recipe
 
-# where numbered runs go
+# folder of numbered runs
 RUNS = Path("runs")
 STATE, MODEL, BEST = "state.safetensors", "model.safetensors", "best.safetensors"
 CONFIG, LOG, PICTURES = "config.json", "log.jsonl", "pictures"
-# of the files in a run's folder, the last part of a long name
+# pattern of the names of a run's files; names of temporary files end with it
 _NAMES = r"(?:config\.json|log\.jsonl|\w+\.safetensors|people-\d+\.png)"
-# seconds that the workers of a killed process, who hold the lock too, may take to end
+# seconds to wait for the workers of a killed process to end, since they hold the lock, too
 LOCK_WAIT = 10.0
 SCHEMA = "lidarpose.run/2"
-# settings that are files or folders, which may have been moved
+# settings that are paths of files or folders, which may have been moved
 PATHS = ("data", "shards", "motion", "body", "init")
-# how a run's length is called: a run may become longer, its schedule follows
+# settings of a run's length: a resumed run may be longer, and its schedule is stretched
 LENGTHS = ("people", "epochs", "scenes")
-# progress of a run besides tensors: steps taken, seconds, error of the best and of the last validation in mm (of a
-# detector %) or None
+# progress of a run besides tensors, with types: steps taken, seconds, errors of the best and of the last validation in
+# mm (detector and verifier: %) or None
 _ERROR = (int, float, NoneType)
 _PROGRESS = {"steps": (int,), "seconds": (int, float), "best": _ERROR, "validation": _ERROR}
-# entries that an optimizer cannot go on without
+# state entries that an optimizer needs to resume
 _MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 MEMORY = {torch.optim.AdamW: _MOMENTS, torch.optim.Adam: _MOMENTS, Muon: ("momentum_buffer",)}
 
 
 def numbered(kind: str) -> Path:
-    """A new folder KIND-001, -002, ... in `RUNS`, made here and now, so that two runs never share one."""
+    """A new folder KIND-001, -002, ... in `RUNS`, created immediately, so that two runs never share one."""
     number = max([0, *_numbers(kind)])
     while True:
         number += 1
@@ -64,7 +64,7 @@ def numbered(kind: str) -> Path:
 
 
 def latest(kind: str) -> Path:
-    """The numbered folder of the run that was started last. Raises InputError where there is none."""
+    """The numbered folder of the run that was started last. Raises InputError if there is none."""
     folders = [RUNS / f"{kind}-{number:03d}" for number in sorted(_numbers(kind))]
     runs = [folder for folder in folders if (folder / CONFIG).is_file()]
     if not runs:
@@ -78,30 +78,30 @@ def _numbers(kind: str) -> list[int]:
 
 
 def check_new(folder: Path) -> None:
-    """Raises InputError where the folder holds anything but what a killed run left of a file."""
+    """Raises InputError if the folder holds anything but partly written files of a killed run."""
     if not is_unused(folder, _NAMES):
         hint = "; add --resume to go on with what is there" if (folder / CONFIG).is_file() else ""
         raise InputError(f"{folder}: expected a new or empty folder for the run{hint}")
 
 
 def lock(folder: Path) -> AbstractContextManager[None]:
-    """Keeps other processes out of the run's folder, see `files.locked`."""
+    """Locks the run's folder against other processes, see `files.locked`."""
     return locked(folder, _NAMES, busy="another process trains there: stop it, or wait for its end", wait=LOCK_WAIT)
 
 
 def begin(folder: Path, recipe: Recipe, command: str) -> None:
-    """Writes the config of a new run. Raises InputError as `check_new`."""
+    """Writes the config of a new run. Raises InputError like `check_new`."""
     check_new(folder)
     config = {"schema": SCHEMA, "version": __version__, "kind": recipe.kind, "command": command}
     write_atomic(folder / CONFIG, json.dumps(config | {"recipe": recipe.to_dict()}, indent=1) + "\n")
 
 
 def read_config(folder: Path, kind: type[AnyRecipe]) -> tuple[AnyRecipe, str]:
-    """The recipe of a run, and the command that began it. Raises InputError where the folder is no run of this kind."""
+    """The recipe of a run and the command that started it. Raises InputError if the folder is no run of this kind."""
     path = folder / CONFIG
     if not path.is_file():
         raise InputError(f"{folder}: nothing to resume, it has no {CONFIG}: leave --resume away to start a run")
-    # as bytes, of which json knows every Unicode encoding
+    # as bytes: json then detects the Unicode encoding
     content = read_bytes(path, expected="the configuration of a run")
     try:
         config = json.loads(content)
@@ -118,7 +118,8 @@ def read_config(folder: Path, kind: type[AnyRecipe]) -> tuple[AnyRecipe, str]:
 
 
 def check_resumable(folder: Path, stored: Recipe, wanted: Recipe) -> None:
-    """Raises InputError unless a run may go on with the wanted recipe: as it began, or longer."""
+    """Raises InputError unless a run can be resumed with the wanted recipe: unchanged except for its length, the
+    settings in `recipes.FREE` and the folders of its paths."""
     settings = stored.to_dict()
     for name, value in wanted.to_dict().items():
         if name in PATHS and _file_names(value) == _file_names(settings[name]):
@@ -134,12 +135,12 @@ def _file_names(value: str | tuple[str, ...] | None) -> list[str] | None:
 
 
 def folder_names(folders: Iterable[str]) -> list[str]:
-    """The names by which an evaluation knows folders, be they given by a link or as "."."""
+    """The names by which an evaluation identifies folders; links and "." are resolved."""
     return [Path(folder).resolve().name for folder in folders]
 
 
 def read_log(folder: Path) -> list[dict]:
-    """The whole lines of a run's log; a kill or a power cut may leave others."""
+    """The complete lines of a run's log; a kill or a power cut may leave incomplete ones, which are skipped."""
     path = folder / LOG
     lines = [_line(line) for line in path.read_text("utf-8", "replace").splitlines()] if path.exists() else []
     return [line for line in lines if line is not None]
@@ -154,7 +155,7 @@ def _line(text: str) -> dict | None:
 
 
 def cut_log(folder: Path, people: int) -> None:
-    """Lines behind the saved state belong to steps that will be taken again."""
+    """Removes log lines after the saved state, with more than `people` samples: their steps will be taken again."""
     if (folder / LOG).exists():
         lines = [line for line in read_log(folder) if line["people"] <= people]
         write_atomic(folder / LOG, "".join(json.dumps(line) + "\n" for line in lines))
@@ -163,7 +164,7 @@ def cut_log(folder: Path, people: int) -> None:
 def save_state(
     path: Path, network: nn.Module, mean: dict[str, Tensor], optimizers: list[torch.optim.Optimizer], progress: dict
 ) -> None:
-    """Writes all of it whole or not at all; the last state stays until the new one is complete."""
+    """Writes the state atomically; the previous one is kept until the new one is complete."""
     tensors = {f"network.{name}": value for name, value in network.state_dict().items()}
     tensors |= {f"mean.{name}": value for name, value in mean.items()}
     for k, optimizer in enumerate(optimizers):
@@ -176,15 +177,15 @@ def save_state(
 def load_state(
     path: Path, network: nn.Module, mean: dict[str, Tensor], optimizers: list[torch.optim.Optimizer]
 ) -> dict:
-    """Fills network, mean and optimizers in place and returns the progress. Raises InputError where it does not fit."""
+    """Fills network, mean and optimizers in place and returns the progress. Raises InputError if they do not fit."""
     problem = "expected the state of a run, but it is damaged"
     try:
-        # read, not mapped: a mapped file that is cut off meanwhile would end the process
+        # read, not memory-mapped: truncation of a mapped file would kill the process
         content = path.read_bytes()
         tensors = load(content)
         header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
         SafetensorsFile(path=path, header=header, content=content).check_digest()
-        # states of 0.1 lack the last validation
+        # states of version 0.1 lack the last validation
         progress = {"validation": None} | json.loads(header["__metadata__"]["progress"])
         for entry, types in _PROGRESS.items():
             value = progress[entry]
@@ -206,14 +207,14 @@ def load_state(
 
 
 def _memory(tensors: dict[str, Tensor], optimizer: torch.optim.Optimizer) -> dict[int, dict[str, Tensor]]:
-    """The state of an optimizer by parameter. Raises KeyError or ValueError where an entry lacks or has another
+    """The state of an optimizer by parameter. Raises KeyError or ValueError if an entry is missing or has the wrong
     shape."""
     memory: dict[int, dict[str, Tensor]] = {}
     for name, value in tensors.items():
         number, _, entry = name.partition(".")
         memory.setdefault(int(number), {})[entry] = value
     for index, parameter in enumerate(p for group in optimizer.param_groups for p in group["params"]):
-        # a parameter without a gradient so far has no memory
+        # a parameter that has had no gradient yet has no state
         for kind in MEMORY[type(optimizer)] if index in memory else ():
             value = memory[index][kind]
             if value.shape != (() if kind == "step" else parameter.shape):

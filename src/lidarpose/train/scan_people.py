@@ -1,6 +1,7 @@
-"""People of whole synthesized scans, cut out as people are who were detected: with whoever and whatever is near.
+"""People of whole synthesized scans, cropped like detected people, together with nearby people and things.
 
-People of `synth.generator` stand alone or beside one other; these stand in crowds, at walls, in rooms, among things.
+People of `synth.generator` stand alone or beside one other person; these stand in crowds, at walls, in rooms, among
+things.
 
 Legend: P people of a scan, n points.
 """
@@ -27,19 +28,19 @@ from lidarpose.train.augment import (
 )
 from lidarpose.train.detector.candidate_source import scene_to_search
 
-# how a person is cut out: by a box about a pose, by the column about a detection, or by a labeled box
+# how a person is cropped: by a box about a pose, by the column about a detection, or by a labeled box; probabilities
 _CUTS, _CHANCES = ("pose box", "column", "labeled box"), (0.6, 0.15, 0.25)
-# of boxes about poses, standard deviations: of the center along x, y and z, m, and how often it is off by three times
-# that; of the logarithm of edges, whose mean is below zero since poses that are not certain are narrow
+# errors of boxes about poses: standard deviation of the center along x, y and z, m, and how often it is three times
+# that; standard deviation and mean of the logarithm of the edges (below zero: poses with low confidence are narrow)
 _CENTER, _FAR, _EDGE, _MEAN_EDGE = np.array([0.06, 0.06, 0.03]), 0.15, 0.15, np.array([-0.12, -0.1, -0.03])
-# of a detection's center in x and y, m
+# standard deviation of a detection's center in x and y, m
 _DETECTION = 0.12
-# each time a person is shown: how often points are lost, and the least share that stays; the largest change of size;
+# augmentation of a person: how often points are dropped, and the minimum share that stays; the largest change of scale;
 # the standard deviation of each point, m
 _LOSS, _LEAST_KEPT, _SCALE, _NOISE = 0.5, 0.3, 0.08, 0.004
-# who has fewer points in a scan, or in what a crop leaves, is not shown; points about a person that are kept
+# minimum number of a person's own points, in a scan and in a crop; maximum number of points kept about a person
 LEAST_POINTS, _MOST_POINTS = 10, 6000
-# scans tried for one with somebody in it, and what lies between their numbers
+# number of scans that are tried until one has people, and the distance between their numbers
 _TRIES, _STRIDE = 16, 2**24
 _PELVIS = BODY26.index("pelvis")
 _FLIP = list(BODY26.flip)
@@ -47,11 +48,11 @@ _FLIP = list(BODY26.flip)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ScanPeople:
-    """Who has at least `LEAST_POINTS` points in a scan, z up.
+    """The people with at least `LEAST_POINTS` points in a scan, z up.
 
-    clouds: P arrays (n, 3) float32 m, the points about each person; owners: of each cloud's points, (n,) int8: 1 the
-    person's, 0 of a thing, -1 another person's; boxes: labeled ones; joints (P, 26, 3) m; neighbors (P,) m: how far
-    the next person's pelvis is; origin (3,) m or None.
+    clouds: P arrays (n, 3) float32 m, the points about each person; owners: P arrays (n,) int8, 1 for the person's own
+    points, 0 for those of things, -1 for those of other people; boxes: labeled ones; joints (P, 26, 3) m; neighbors
+    (P,) m: horizontal distance to the nearest other pelvis; origin (3,) m: the sensor, None if unknown.
     """
 
     clouds: list[np.ndarray]
@@ -63,7 +64,7 @@ class ScanPeople:
 
 
 def populated_scan(seed: int, number: int) -> ScanPeople:
-    """The people of a scene; of another one where that has nobody."""
+    """The people of a scene, or of another scene if it has none."""
     for attempt in range(_TRIES):
         people = scan_people(seed, number + attempt * _STRIDE)
         if people.boxes:
@@ -72,12 +73,12 @@ def populated_scan(seed: int, number: int) -> ScanPeople:
 
 
 def draw_person(scan: ScanPeople, rng: np.random.Generator) -> Example:
-    """Somebody of a scan, changed a little."""
+    """A random person of a scan, with a random augmentation."""
     return person_example(scan, int(rng.integers(len(scan.boxes))), rng)
 
 
 def scan_people(seed: int, number: int) -> ScanPeople:
-    """The people of scene `number` of `synth.detection_scene`, leveled as it is when people are searched for."""
+    """The people of scene `number` of `synth.detection_scene`, leveled as for the detector."""
     scene, origin = scene_to_search(seed, number, "train")
     pelvises = scene.joints[:, _PELVIS, :2].astype(float)
     rng = np.random.default_rng([seed, number])
@@ -105,8 +106,8 @@ def scan_people(seed: int, number: int) -> ScanPeople:
 
 
 def person_example(scan: ScanPeople, person: int, rng: np.random.Generator) -> Example:
-    """A person of a scan as a training step shows them. The center is that of the crop's points, or, where others are
-    in the crop, of the box; or a guess of the pelvis."""
+    """A person of a scan as a training example. The center is that of the crop's points, or that of the box if other
+    people are in the crop, or a perturbed pelvis."""
     joints = scan.joints[person].astype(float)
     is_inside, box_center = _cut(scan, person, rng)
     points, owner = scan.clouds[person][is_inside].astype(float), scan.owners[person][is_inside]
@@ -133,7 +134,8 @@ def person_example(scan: ScanPeople, person: int, rng: np.random.Generator) -> E
 
 
 def _cut(scan: ScanPeople, person: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Which points about a person are in the crop, (n,) bool, and the center (3,) m that says who is meant."""
+    """Which points about a person are in the crop, (n,) bool, and the crop's center (3,) m, which tells the network
+    which person to pose."""
     cloud, owner, box = scan.clouds[person], scan.owners[person], scan.boxes[person]
     cut = rng.choice(_CUTS, p=_CHANCES)
     if cut == "pose box":
@@ -152,6 +154,6 @@ def _cut(scan: ScanPeople, person: int, rng: np.random.Generator) -> tuple[np.nd
         cut_box = jittered(box, rng)
         is_inside, center = cut_box.contains(cloud), cut_box.center
     if (owner[is_inside] == 1).sum() < LEAST_POINTS:
-        # next to nothing of the person is in it
+        # the crop holds too few of the person's points
         is_inside, center = (owner == 1) | box.contains(cloud), box.center
     return is_inside, center

@@ -1,7 +1,7 @@
-"""What a recipe means: the objective, the source of samples, the network, and the validation samples.
+"""From a recipe to the objective, the source of samples, the network, and the validation samples.
 
-To train a further kind of network of `models.NETWORKS`: its sizes in `networks.PRETRAINED`, its objective's settings in
-`objective_of`, its recipes in `recipes.RECIPES`.
+To train another kind of network of `models.NETWORKS`, add its sizes to `networks.PRETRAINED`, its objective's settings
+to `objective_of`, and its recipes to `recipes.RECIPES`.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,30 +43,33 @@ from lidarpose.train.scan_people import draw_person, populated_scan
 from lidarpose.train.torch_dataset import InMemoryDataset
 from lidarpose.train.validation import validate
 
-# samples to validate on; synthetic ones are of a seed that no run learns from
+# number of validation samples; synthetic ones use a seed that no run trains on
 VALIDATION = 256
 _VALIDATION_SEED = 2**31 - 7
 _NO_VALIDATION = (
     "nobody is left to validate on: no split val, and no sequence is held out (--hold-out, or too few of them)"
 )
-# of fewer sequences none is held out
+# no sequence is held out from fewer sequences than this
 _LEAST_SEQUENCES = 3
-# chunks of a run between two times that a scan is shown: divides by the usual numbers of workers
+# chunks between two uses of a scan: divisible by the usual numbers of workers
 _LAG = 12
-# how often a whole scan is shown in pre-training, each time one of its people
+# how often a whole scan is used in pre-training, each time for one of its people
 _SCAN_USES = 12
-# share of objects among the synthesized people of fine-tuning, for a network that says whether somebody is there
+# share of crops without a person among the synthesized samples of fine-tuning, for networks with a person head
 _OBJECTS = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainSetup:
-    """people: how many samples are seen in all; validation: makes those to validate on, once, none for no validation;
-    joints: the skeleton to draw them in, None for no pictures; card: what the checkpoint says besides the recipe;
-    warnings: for the user; frames: of an example, each of which counts as one of `people`; unit: what these are; epoch:
-    how many of `people` are seen until all of a dataset were, 0 where they never repeat;
-    validate: called with (objective, network, examples, batch), the error of a network in evaluation mode, in
-    `error_unit`, and the joints to draw, if any."""
+    """All that the training loop needs for a run.
+
+    people: total number of samples seen; validation: makes the validation samples, called once, empty for no
+    validation; joints: the skeleton to draw them in, None for no pictures; card: entries of the checkpoint's card
+    besides the recipe; warnings: for the user; frames: per example, each counts as one of `people`; unit: what `people`
+    counts; epoch: how many of `people` make an epoch of the dataset, 0 if samples never repeat; validate: called with
+    (objective, network, examples, batch), returns the error of a network in evaluation mode, in `error_unit`, and the
+    joints to draw, if any.
+    """
 
     objective: Objective
     source: Source
@@ -84,7 +87,7 @@ class TrainSetup:
 
     @property
     def task(self) -> Objective:
-        """The name of `objective` in 0.2."""
+        """`objective` by its name in 0.2."""
         return self.objective
 
 
@@ -94,8 +97,10 @@ def Job(*, task: Objective, **settings: Any) -> TrainSetup:  # noqa: N802
 
 
 def objective_of(config: Config, recipe: PoseRecipe, layout: str = "ragged") -> Objective:
-    """What a network of a configuration minimizes: its entry in `models.NETWORKS`, by its settings of a recipe.
-    layout: of the paper's tables."""
+    """The objective of a network: its entry in `models.NETWORKS`, with the settings of a recipe.
+
+    layout: of the tables of the paper's network.
+    """
     bone_weights = {"bone": recipe.bone, "symmetry": recipe.symmetry}
     # heatmaps are learned the same way in both stages
     stage = "finetune" if isinstance(config, DaptConfig) and config.bins else recipe.kind
@@ -109,8 +114,11 @@ def objective_of(config: Config, recipe: PoseRecipe, layout: str = "ragged") -> 
 
 
 def make_setup(recipe: Recipe, *, on_cpu: bool = True) -> TrainSetup:
-    """on_cpu: where the network will run, which decides the layout of the paper's tables. Raises InputError, one line,
-    where the recipe names what is not there."""
+    """The setup of a recipe's run.
+
+    on_cpu: whether the network will run on a CPU, which decides the layout of the paper's tables. Raises InputError,
+    one line, if the recipe names something that does not exist.
+    """
     layout = "ragged" if on_cpu else "padded"
     if isinstance(recipe, TrainDetector):
         return _detection(recipe)
@@ -147,7 +155,7 @@ def _detection(recipe: TrainDetector) -> TrainSetup:
     )
 
 
-# parameters of a `PoseNet` that its answer whether somebody is there does not depend on
+# parameters of a `PoseNet` that the output of its person head does not depend on
 _OF_POSES = ("part.", "level_joints.", "joint.heatmap.", "vote.residual.", "vote.offset")
 
 
@@ -161,8 +169,8 @@ def _verification(recipe: TrainVerifier) -> TrainSetup:
     def network() -> nn.Module:
         verifier = expand_weights(trained, config)
         assert verifier.person is not None
-        # whether somebody is there is all that it is to tell: the whole network learns by it, and what only poses read
-        # learns nothing, of which processes that average gradients would wait for
+        # the person head is the only output used: its loss trains the whole network. Parameters that only poses need
+        # are frozen; otherwise gradient averaging across processes would wait for their gradients
         verifier.person.detach_inputs = False
         for name, parameter in verifier.named_parameters():
             parameter.requires_grad_(not name.startswith(_OF_POSES))
@@ -183,8 +191,8 @@ def _verification(recipe: TrainVerifier) -> TrainSetup:
 
 
 def _scene_source(seed: int, uses: int, batch: float, load_scene: Callable, draw_example: Callable) -> SceneSource:
-    """Of scans, for so many examples a step: a worker shows each scan again that it has made, for all usual numbers of
-    workers."""
+    """A source of scans for `batch` examples per step. Its lag is such that, for all usual numbers of workers, the
+    worker that made a scan also makes the later examples of it."""
     lag = max(int(_LAG * BATCHES * batch) // uses, 1)
     return SceneSource(seed=seed, uses=uses, lag=lag, load_scene=load_scene, draw_example=draw_example)
 
@@ -200,14 +208,14 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     synthetic_settings: dict[str, Any] = {name: getattr(recipe, name) for name in names}
 
     def validation() -> Sequence[Example | ClipExample]:
-        # as a user's cloud: centered on its points
+        # centered on the points, like a user's cloud
         held_out_source = SyntheticSource(seed=_VALIDATION_SEED, refined=0.0, **(synthetic_settings | {"objects": 0.0}))
         if isinstance(config, LidarcapConfig):
             clips = range(VALIDATION // config.frames)
             return [held_out_source.clip(index, trans_center=config.trans_center) for index in clips]
         return [held_out_source.example(index) for index in range(VALIDATION)]
 
-    # of the people who come from this source alone
+    # counts only the people of this source
     easy_people = recipe.easy * recipe.people * (1 - recipe.whole_scans)
     source: Source = SyntheticSource(seed=recipe.seed, easy=easy_people, **synthetic_settings)
     if recipe.whole_scans:
@@ -238,13 +246,13 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     if is_clip:
         return _of_clips(setup, replace(_clips(dataset, config, recipe), strays=recipe.strays, noise=recipe.noise))
     source = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=turn_augmentation, **noise)
-    # PRN and LPFormer take a point's part from the nearest joint
+    # PRN and LPFormer derive a point's part from the nearest joint
     has_parts = config.neck != "prn" if isinstance(config, DaptConfig) else not isinstance(config, BaselineConfig)
     return replace(setup, source=source, warnings=_damage(dataset) + (_no_parts(dataset) if has_parts else ()))
 
 
 def _check_no_test(folder: str) -> None:
-    """Raises InputError for a dataset of which a part is kept for testing: pre-training takes every sample."""
+    """Raises InputError for a dataset that contains test samples: pre-training uses every sample."""
     settings = read_card(folder).settings
     if settings.get("split_by") and settings.get("split") != "train":
         raise file_error(
@@ -255,7 +263,7 @@ def _check_no_test(folder: str) -> None:
 
 
 def _damage(dataset: InMemoryDataset) -> tuple[str, ...]:
-    """What is left out of a dataset, in a line."""
+    """A warning about damaged shards that are left out, in one line."""
     if not dataset.damaged:
         return ()
     problem, count = dataset.damaged[0], len(dataset.damaged) - 1
@@ -263,7 +271,7 @@ def _damage(dataset: InMemoryDataset) -> tuple[str, ...]:
 
 
 def _no_parts(dataset: InMemoryDataset) -> tuple[str, ...]:
-    """A warning where a dataset's points have no body parts, of which half of the loss of pre-training is."""
+    """A warning if a dataset's points have no body parts, which half of the loss of pre-training needs."""
     folders = dict.fromkeys(str(reader.folder) for reader, _, _ in dataset.parts)
     with_parts = {str(r.folder) for r, rows, _ in dataset.parts if rows["part"].null_count < rows.num_rows}
     names = ", ".join(folder_names(folder for folder in folders if folder not in with_parts))
@@ -292,7 +300,7 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
     def validation() -> list[Example]:
         if held_out_dataset is None:
             return []
-        # a box with a detector's errors where there is one, centered on the points
+        # cropped by a box with a detector's errors, if there is a box, and centered on the points
         cropping = Augmentation(released=kind.released, box=kind.box, refined=0.0)
         rows = evenly_spaced(len(held_out_dataset), VALIDATION)
         return [augmented(held_out_dataset.sample(k), cropping, np.random.default_rng([recipe.seed, k])) for k in rows]
@@ -300,7 +308,7 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
     setup = TrainSetup(
         objective=objective_of(config, recipe, layout),
         source=source,
-        # those that are mixed in come on top
+        # synthesized samples that are mixed in come on top
         people=max(round(recipe.epochs * len(dataset) / (1 - recipe.mix)), 1),
         epoch=max(round(len(dataset) / (1 - recipe.mix)), 1),
         network=network,
@@ -326,7 +334,7 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
 
 
 def _clips(dataset: InMemoryDataset, config: LidarcapConfig, recipe: Pretrain | Finetune) -> ClipSource:
-    """The clips of a dataset. Raises InputError where it has none."""
+    """The clips of a dataset. Raises InputError if it has none."""
     shift = isinstance(recipe, Finetune) and recipe.shift_windows
     clips, skipped = dataset.clips(following=CLIP_FRAMES - 1 if shift else 0)
     if not len(clips):
@@ -346,7 +354,7 @@ def _clips(dataset: InMemoryDataset, config: LidarcapConfig, recipe: Pretrain | 
 
 
 def _of_clips(setup: TrainSetup, source: ClipSource) -> TrainSetup:
-    """The setup that learns from clips instead."""
+    """The setup changed to learn from clips."""
     config = setup.objective.config
     warnings = [f"left out {count:,} {reason}" for reason, count in source.skipped.items()]
     parts = source.dataset.parts
@@ -358,9 +366,9 @@ def _of_clips(setup: TrainSetup, source: ClipSource) -> TrainSetup:
 def _held_out(
     recipe: Finetune, split: str | None, dataset: InMemoryDataset
 ) -> tuple[tuple[str, ...], InMemoryDataset | None]:
-    """Sequences not to learn from, and what to validate on: the split val where there is one, else those sequences."""
+    """Held-out sequences, and the validation dataset: the split val if it exists, else those sequences."""
     if split not in (None, "val"):
-        # there may be no such split
+        # the dataset may have no split val
         with suppress(InputError):
             return (), InMemoryDataset.load(recipe.data, split="val", interval=recipe.interval)
     if not recipe.hold_out or len(dataset.sequences) < _LEAST_SEQUENCES:

@@ -1,11 +1,11 @@
-"""Datasets to learn from: labeled samples in memory, and samples for a torch DataLoader.
+"""Datasets for training: labeled samples in memory, and synthesized samples for a torch DataLoader.
 
-`SyntheticPeople` yields the same samples whatever the number of workers. Worker w of W makes the runs of `batch`
-samples whose number is w modulo W, so a DataLoader gives them in order where its batch_size is `batch` (1, as by
-default, also goes with batch_size=None); with other sizes they are the same samples, batched differently. A Sample is
-no tensor: give the DataLoader a collate_fn, `list` if nothing else.
+`SyntheticPeople` yields the same samples whatever the number of workers. Samples are made in runs of `batch`; worker w
+of W makes the runs whose index is w modulo W. A DataLoader therefore yields them in order if its batch_size is `batch`
+(the default 1 also works with batch_size=None); with other sizes they are the same samples, batched differently. A
+Sample is not a tensor: give the DataLoader a collate_fn, for example `list`.
 
-Legend: N samples, M points of all of them.
+Legend: N samples.
 """
 
 from collections import Counter
@@ -34,10 +34,10 @@ from lidarpose.train.augment import UNKNOWN_PART, visible_joints
 class InMemoryDataset:
     """Labeled samples of one or more datasets, each with the joints of body26.
 
-    They stay what shards hold, in Arrow's memory, which worker processes share. parts: of each shard its dataset, its
-    rows, and whether the dataset ever says that a joint is hidden; place (N, 2): a sample's part and row; sequence
-    (N,): of `sequences`; skeleton: name of the datasets'; dataset: name of the first one, "" if synthetic; damaged:
-    shards that cannot be read.
+    They are stored as in the shards, in Arrow memory, which worker processes share. parts: for each shard its dataset,
+    its rows, and whether any joint of the dataset is labeled as hidden; place (N, 2): each sample's part and row;
+    sequence (N,): index into `sequences`; skeleton: name of the datasets' skeleton; dataset: name of the first dataset,
+    "" if synthetic; damaged: shards that cannot be read.
     """
 
     parts: list[tuple[DatasetReader, Any, bool]]
@@ -50,11 +50,11 @@ class InMemoryDataset:
 
     @classmethod
     def load(cls, folders: Sequence[str | Path], *, split: str | None = None, interval: int = 1) -> "InMemoryDataset":
-        """All samples with points and a label of datasets that `lidarpose prepare` or `synth` wrote.
+        """All samples with points and a label, from datasets that `lidarpose prepare` or `synth` wrote.
 
-        split: of real datasets, None for all; interval: only every so many of a person's frames in a sequence, as
-        published recipes thin out. A shard that is damaged is left out and named in `damaged`.
-        Raises InputError where no sample is left, for a folder that is no dataset, and for different skeletons.
+        split: of real datasets, None for all; interval: keeps only every `interval`th frame of a person in a sequence,
+        like published recipes. A damaged shard is left out and named in `damaged`. Raises InputError if no sample is
+        left, for a folder that is not a dataset, and for different skeletons.
         """
         datasets = [open_dataset(Path(folder)) for folder in listed(folders)]
         parts: list[tuple[DatasetReader, Any, bool]] = []
@@ -91,20 +91,20 @@ class InMemoryDataset:
         return len(self.place)
 
     def sample(self, row: int) -> LabeledSample:
-        """A sample in the sensor's frame; its pose says which joints are visible: 1, 0 or NaN where unknown."""
+        """A sample in the sensor's frame; its pose has the visibility of each joint: 1, 0, or NaN if unknown."""
         part, place = self.place[row]
         dataset, rows, has_hidden = self.parts[part]
         cells = zip(rows.column_names, rows.columns, strict=True)
         sample = _to_body26(dataset.sample({name: _value(column[int(place)]) for name, column in cells}))
         if has_hidden:
             return sample
-        # a dataset that never says hidden says nothing of what is seen
+        # if a dataset labels no joint as hidden, its labels tell nothing about visibility
         visible = np.full(len(BODY26), np.nan, np.float32)
         return replace(sample, pose=replace(sample.pose, visible=visible))
 
     def clips(self, *, following: int = 0) -> tuple[np.ndarray, Counter[str]]:
-        """Rows (C, `CLIP_FRAMES`) of the clips that consecutive frames with rotations make, each with so many rows
-        that follow, and how many frames are left out, by reason."""
+        """Rows (C, `CLIP_FRAMES` + following) of clips of consecutive frames with rotations, each with the `following`
+        rows after it, and the numbers of frames left out, by reason."""
         tracks, frames, has_rotations = [], [], []
         for dataset, rows, _ in self.parts:
             name = "sequence" if "sequence" in rows.column_names else "index"
@@ -113,7 +113,7 @@ class InMemoryDataset:
                 tracks.append((dataset.folder, sequence, track))
                 frames.append(frame)
             has_rotations += rows.column("rotations").is_valid().to_pylist()
-        # of all rows of the parts those of this dataset
+        # indices of this dataset's samples among the rows of all parts
         start = np.cumsum([0, *(rows.num_rows for _, rows, _ in self.parts)])
         part_rows = start[self.place[:, 0]] + self.place[:, 1]
         usable_rows = np.flatnonzero(np.array(has_rotations, bool)[part_rows])
@@ -126,7 +126,7 @@ class InMemoryDataset:
         return np.concatenate([np.zeros((0, CLIP_FRAMES + following), int), *clips]), +skipped
 
     def without(self, sequences: Sequence[str]) -> "InMemoryDataset":
-        """The samples that are not of some sequences; the points are shared."""
+        """The dataset without some sequences; the points are shared."""
         names = np.array(self.sequences)
         is_kept = ~np.isin(names, sequences)
         rows = is_kept[self.sequence]
@@ -135,7 +135,7 @@ class InMemoryDataset:
 
 
 def _value(cell: Any) -> Any:
-    """What `rows_of` gives for a cell of its own types: twice as fast, since nothing is to be cast."""
+    """The value of a cell, as `rows_of` gives it for its own types, but twice as fast, since nothing is cast."""
     if not cell.is_valid:
         return None
     return cell.values.to_numpy() if hasattr(cell, "values") else cell.as_py()
@@ -144,9 +144,11 @@ def _value(cell: Any) -> Any:
 def _shards(
     dataset: DatasetReader, split: str | None, interval: int, damaged: list[str]
 ) -> Iterator[tuple[Any, list[str], bool]]:
-    """The rows of each shard that have points and a label, their sequences, and whether any joint is hidden; every
-    `interval`th frame of a person, however frames are numbered: time stamps too. Raises InputError where a shard is
-    missing: the dataset is not finished."""
+    """For each shard its rows with points and a label, their sequences, and whether any joint is labeled as hidden.
+
+    Frames of a person are counted for `interval`, so frame numbers may also be time stamps. Raises InputError if a
+    shard is missing: the dataset is incomplete.
+    """
     frames: Counter[tuple[str, str]] = Counter()
     for shard in range(dataset.card.shards):
         is_present = dataset.path(shard).is_file()
@@ -173,8 +175,8 @@ def _shards(
 
 
 def _to_body26(sample: LabeledSample) -> LabeledSample:
-    """The sample with body26's joints, NaN where its skeleton lacks them, and their visibility; a joint of which
-    nothing says whether it is visible counts as seen."""
+    """The sample with body26's joints, NaN if its skeleton lacks them, and their visibility; a labeled joint of unknown
+    visibility gets the label `SEEN`."""
     columns = [BODY26.index(joint) for joint in sample.skeleton.joints]
     joints = np.full((len(BODY26), 3), np.nan, np.float32)
     visible = np.full(len(BODY26), np.nan, np.float32)
@@ -183,7 +185,7 @@ def _to_body26(sample: LabeledSample) -> LabeledSample:
     if sample.info is None:
         visible[columns] = np.select([sample.joint_labels == SEEN, sample.joint_labels == HIDDEN], [1.0, 0.0], np.nan)
     elif sample.part is not None:
-        # from the parts, as of samples made during training
+        # computed from the parts, as for samples made during training
         visible[columns] = visible_joints(joints[columns], sample.points[part > 0])
     labels = np.where(np.isnan(joints).any(-1), UNLABELED, np.where(visible == 0, HIDDEN, SEEN))
     return replace(
@@ -198,10 +200,10 @@ def _to_body26(sample: LabeledSample) -> LabeledSample:
 
 @dataclass(frozen=True, kw_only=True)
 class SyntheticPeople(IterableDataset):
-    """Samples `start` ... `stop` - 1 of `seed`, without end where `stop` is None, see `Generator.person`.
+    """Samples `start` ... `stop` - 1 of `seed`, endless if `stop` is None, see `Generator.person`.
 
-    scene, bank and captured are the generator's; hard in [0, 1] replaces the scene's difficulty. With a `batch` of
-    many samples workers draw fewer bodies twice (see `generator.BLOCK`). Raises InputError for settings out of range.
+    scene, bank and captured are the generator's; hard in [0, 1] replaces the scene's difficulty. With a large `batch`,
+    fewer bodies are drawn by two workers (see `generator.BLOCK`). Raises InputError for settings out of range.
     """
 
     scene: SceneConfig
@@ -219,7 +221,7 @@ class SyntheticPeople(IterableDataset):
                 f"SyntheticPeople needs a seed >= 0 and 0 <= start <= stop, got {self.seed}, {self.start}, {self.stop}"
             )
         check_int("batch", self.batch, least=1)
-        # errors come here, not in a worker
+        # built once so that errors are raised here, not in a worker
         self._generator()
         if self.hard is not None:
             self.scene.eased(self.hard)
@@ -240,6 +242,6 @@ class SyntheticPeople(IterableDataset):
 
 
 def _worker() -> tuple[int, int]:
-    """The number of this DataLoader's worker, and of how many."""
+    """The index of this DataLoader worker, and the number of workers."""
     info = get_worker_info()
     return (0, 1) if info is None else (info.id, info.num_workers)

@@ -1,4 +1,4 @@
-"""A run's validation: the mean error of samples, and a picture of some of them."""
+"""Validation during training: the mean error over samples, and a picture of some of them."""
 
 from collections.abc import Callable, Sequence
 
@@ -18,13 +18,13 @@ Draw = Callable[[list[Example], np.ndarray, Skeleton, str], bytes]
 def validate(
     objective: PoseObjective, network: nn.Module, examples: Sequence[Example | ClipExample], batch: int
 ) -> tuple[float, np.ndarray]:
-    """MPJPE in mm of a network in evaluation mode over the labeled joints that it has, and its joints (N, 26, 3) m, of
-    all N frames. batch: of examples."""
+    """MPJPE in mm of a network in evaluation mode over the labeled joints that it predicts, and its joints (N, 26, 3) m
+    of all N frames. batch: number of examples per batch."""
     device = next(network.parameters()).device
     batches = [objective.collate(list(examples[k : k + batch])) for k in range(0, len(examples), batch)]
     joints = np.concatenate([objective.joints(network, arrays, device=device) for arrays in batches])
     true_joints = np.stack([frame.joints for example in examples for frame in example.frames])
-    # labeled, and of a joint that the network has; what is not finite though it should be, must be seen
+    # labeled joints that the network predicts; a prediction that is unexpectedly not finite must show in the error
     is_counted = ~np.isnan(true_joints).any(-1) & ~np.isnan(joints).all((0, 2))
     return float(np.linalg.norm(joints - true_joints, axis=-1)[is_counted].mean() * 1e3), joints
 
@@ -34,17 +34,17 @@ def batch_norms(network: nn.Module) -> list[_BatchNorm]:
 
 
 def update_batch_norms(network: nn.Module, objective: PoseObjective, batches: list) -> None:
-    """Estimates the statistics of a network's batch norms anew, as their means over collated batches. In place.
+    """Re-estimates the statistics of a network's batch norms as their means over collated batches. In place.
 
-    As `torch.optim.swa_utils.update_bn`, but nothing is dropped, so that they are those of evaluation. Statistics that
-    run along with training are of weights some hundred steps old, and of no averaged weights at all.
+    Like `torch.optim.swa_utils.update_bn`, but without dropout, so that the statistics are those of evaluation. Running
+    statistics from training belong to weights of up to some hundred steps ago, and not to the averaged weights.
     """
     network.eval()
     norms = batch_norms(network)
     momenta = [norm.momentum for norm in norms]
     for norm in norms:
         norm.reset_running_stats()
-        # None: the cumulative mean
+        # None: cumulative mean
         norm.momentum = None
         norm.train()
     device = next(network.parameters()).device
@@ -60,7 +60,7 @@ def draw_examples(examples: list[Example], joints: np.ndarray, skeleton: Skeleto
     from lidarpose.viz.draw import Panel, draw_people
 
     def pose(joints: np.ndarray) -> Pose | None:
-        # none where the skeleton's joints are not all known
+        # None if any of the skeleton's joints is unknown
         skeleton_joints = joints[BODY26.map_to(skeleton)]
         return None if np.isnan(skeleton_joints).any() else Pose(joints=skeleton_joints, skeleton=skeleton)
 

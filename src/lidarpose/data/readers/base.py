@@ -1,7 +1,7 @@
-"""What every reader of a dataset yields and offers, and what readers of raw files share.
+"""The interface of dataset readers, and functions that readers of raw files share.
 
-A dataset's raw files fall into parts, each read on its own (a sequence, a segment, a file): that is what processes
-share out, and what is written as one shard. What is known of each dataset is in data/datasets.json.
+A dataset's raw files consist of parts that are read independently (a sequence, a segment, a file). Parts are
+distributed over processes, and each is written as one shard. Information about each dataset is in data/datasets.json.
 """
 
 import json
@@ -28,11 +28,11 @@ from lidarpose.io.point_cloud import read_points
 from lidarpose.sample import FARTHEST, SEEN, UNLABELED, Box, LabeledSample, Pose, center_of, within_reach
 from lidarpose.skeleton import SMPL24, Skeleton
 
-# of people without a labeled box, it is that of their joints, this much larger on each side, m
+# margin on each side of the box about the joints of people without a labeled box, m
 _BOX_MARGIN = 0.2
-# and their points are those in a box this much larger still, m: what a detector's box lets in
+# additional margin of the box that crops their points, m: as loose as a detector's box
 POINT_MARGIN = 0.3
-# what the published files are called: SMPL_MALE.pkl, basicmodel_m_lbs_10_207_0_v1.1.0.pkl, basicModel_f_lbs_...
+# names of the published files: SMPL_MALE.pkl, basicmodel_m_lbs_10_207_0_v1.1.0.pkl, basicModel_f_lbs_...
 _NAMES = {
     "neutral": r"smpl_neutral|basicmodel_neutral_lbs.*",
     "male": r"smpl_male|basicmodel_m_lbs.*",
@@ -42,21 +42,21 @@ _GET = (
     "register at smpl.is.tue.mpg.de, download SMPL for Python v1.1.0, which has the neutral body, "
     "and give --smpl with its .pkl or .npz, or with a folder of SMPL_NEUTRAL, SMPL_MALE and SMPL_FEMALE"
 )
-# why the people of a part after a fault in it are left out
+# reason for skipping the people of a part after an error in it
 BAD_REST = "the rest of a part cannot be read"
 
 
 @dataclass(frozen=True)
 class Skipped:
-    """What was left out: reason, the same words for the same reason, and where."""
+    """An item that was left out. reason: the same text for the same reason; where: its location."""
 
     reason: str
     where: str
 
 
 class Reader(ABC):
-    """Reads a dataset's raw files. about: what is recorded with a prepared dataset: the frame of its points, its
-    licence, its quirks, and the `settings` that decide its content."""
+    """Reads a dataset's raw files. about: information stored with a prepared dataset: the frame of its points, its
+    license, its quirks, and the `settings` that determine its content."""
 
     name: ClassVar[str]
     skeleton: ClassVar[str]
@@ -68,17 +68,17 @@ class Reader(ABC):
 
     @abstractmethod
     def parts(self, root: Path) -> list[str]:
-        """Names of what can be read on its own, sorted. Raises InputError, one line, where the root is incomplete."""
+        """Names of the parts, sorted. Raises InputError, one line, if the root is incomplete."""
 
     def check(self, root: Path, part: str) -> None:  # noqa: B027
-        """Raises InputError, one line, where a part cannot be read, before anything is written."""
+        """Raises InputError, one line, if a part cannot be read; called before anything is written."""
 
     @abstractmethod
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
-        """Everybody in one part, in an order that never changes."""
+        """All people of a part, in a fixed order."""
 
     def wrong_root(self, root: Path, got: str = "") -> InputError:
-        """The error for a folder that is not the dataset's root. got: by default what is in the folder."""
+        """The error for a folder that is not the dataset's root. got: what was found, by default the first entries."""
         info, got = _datasets()[self.name], got or f"got {entries(root)}"
         problem = f"is not the root of {info['title']}: expected {info['expected']}, {got}"
         return file_error(root, f"{problem}; get it at {info['get']}")
@@ -90,12 +90,12 @@ def _datasets() -> dict[str, dict[str, Any]]:
 
 
 def entries(folder: Path) -> str:
-    """The first names in a folder, for messages."""
+    """The first file names in a folder, for messages."""
     return ", ".join(sorted(path.name for path in folder.iterdir())[:6]) or "nothing"
 
 
 def numbered(folder: Path, suffix: str) -> dict[int, list[Path]]:
-    """The files of a folder that are numbered, whatever the number of digits: number -> its files, in order."""
+    """The numbered files of a folder, with any number of digits: number -> its files, in order."""
     files: dict[int, list[Path]] = {}
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         if path.suffix.lower() == suffix and FRAME_NUMBER.fullmatch(path.stem):
@@ -106,8 +106,8 @@ def numbered(folder: Path, suffix: str) -> dict[int, list[Path]]:
 def paired(
     labels: dict[int, list[Path]], clouds: dict[int, list[Path]], where: str
 ) -> Iterator[tuple[int, Path, Path | None] | Skipped]:
-    """The frames of numbered label files and clouds: number, labels, cloud or None. Skipped are clouds without labels
-    and frames of which a file is there twice. where: a format of the frame's number."""
+    """The frames of numbered label files and clouds: number, labels, cloud or None. Clouds without labels and frames
+    with duplicate files are skipped. where: a format string for the frame number."""
     for frame in sorted(labels.keys() | clouds.keys()):
         paths = labels.get(frame, []), clouds.get(frame, [])
         if not paths[0]:
@@ -120,7 +120,7 @@ def paired(
 
 
 def read_object(path: Path, expected: str) -> dict:
-    """A JSON file that holds an object. Raises InputError where it does not."""
+    """The object in a JSON file. Raises InputError if it holds something else."""
     content = read_json(path, expected=expected)
     if not isinstance(content, dict):
         raise file_error(path, f"expected {expected}, got {type(content).__name__}")
@@ -128,9 +128,9 @@ def read_object(path: Path, expected: str) -> dict:
 
 
 def numbers(path: object, value: object, shape: tuple[int, ...], what: str, *, finite: bool = True) -> np.ndarray:
-    """The value as float64 of a shape, -1 for any length; a flat list will do. Raises InputError otherwise.
+    """The value as a float64 array of a shape, -1 for any length; a flat list is reshaped. Raises InputError otherwise.
 
-    finite: refuse NaN and infinity. path and what: for the message.
+    finite: reject NaN and infinity. path, what: for the message.
     """
     if value is None:
         raise file_error(path, f"{what} is missing; expected numbers {shape}")
@@ -147,21 +147,21 @@ def numbers(path: object, value: object, shape: tuple[int, ...], what: str, *, f
 
 
 def read_cloud(path: Path) -> np.ndarray:
-    """x y z (n, 3) float64 of a file, without points out of reach; n = 0 where it says itself that it holds none.
-    Raises InputError."""
+    """x y z (n, 3) float64 of a file, without out-of-range points; n = 0 if its header states that it has no points.
+    Raises InputError if it cannot be read."""
     try:
         points = read_points(path).points
         return points[within_reach(points)]
     except InputError:
-        # written for a person who was not seen; a file that is cut off says more points than it has
+        # such files are written for people without points; a truncated file states more points than it has
         if _says_empty(path):
             return np.zeros((0, 3))
         raise
 
 
 def as_cloud(path: object, value: object) -> np.ndarray:
-    """x y z (n, 3) float64 of an array or a flat list, without points out of reach or that are no numbers. Raises
-    InputError, since rows of another length would be read shifted. path: for the message."""
+    """x y z (n, 3) float64 of an array or a flat list, without NaN and out-of-range points. Raises InputError for rows
+    of another length, which would be read shifted. path: for the message."""
     if isinstance(value, np.ndarray) and value.ndim > 2:
         raise file_error(path, f"a cloud must be (n, 3), got {value.shape}")
     points = numbers(path, value, (-1, 3), "a cloud", finite=False)
@@ -169,10 +169,10 @@ def as_cloud(path: object, value: object) -> np.ndarray:
 
 
 def find_below(root: Path, path: str) -> Path | None:
-    """The cloud that a path of another machine means: the longest end of it that is in the root."""
+    """The file in the root that matches the longest tail of a path from another machine, None if there is none."""
     names = [name for name in re.split(r"[/\\]", path) if name not in ("", ".", "..")]
     for k in range(len(names)):
-        # False, too, for a name that no disk can hold
+        # isfile is also False for a name that is invalid on disk
         if os.path.isfile(root / Path(*names[k:])):
             return root / Path(*names[k:])
     return None
@@ -180,22 +180,22 @@ def find_below(root: Path, path: str) -> Path | None:
 
 def _says_empty(path: Path) -> bool:
     with suppress(OSError):
-        # a pipe would be waited for
+        # opening a pipe would block
         if os.path.isfile(path):
             with open(path, "rb") as file:
                 return re.search(rb"^(element vertex|POINTS) +0\s*$", file.read(4096), re.MULTILINE) is not None
     return False
 
 
-# ---- datasets of SMPL parameters: their joints, by the user's own model files
+# ---- datasets of SMPL parameters: joints from the user's own model files
 
 
 class SmplJoints:
-    """The joints of SMPL bodies in any pose. The neutral model, or the only one, is read at once, others when needed.
+    """The joints of SMPL bodies in any pose. The neutral or only model is read immediately, others when needed.
 
-    path: the user's SMPL, one file for everybody, or a folder with a file for each gender, by their published names.
-    Raises InputError where it is None, missing, a folder without a neutral body, or where that is no SMPL; the
-    dataset's name is in the message.
+    path: the user's SMPL, one file for all people, or a folder with a file for each gender, by their published names.
+    Raises InputError if it is None, missing, a folder without a neutral body, or not SMPL; the dataset's name is in the
+    message.
     """
 
     def __init__(self, path: str | Path | None, dataset: str):
@@ -210,12 +210,12 @@ class SmplJoints:
             raise file_error(path, f"no such file; expected SMPL's own: {_GET}")
         else:
             self.files = {"any": path}
-        # what becomes joints at rest: the mean's (24, 3) and the shapes' (24, 3, betas)
+        # by kind, joints at rest: of the mean body (24, 3), and their shape directions (24, 3, betas)
         self._models: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         self._model(self.kind("neutral"))
 
     def kind(self, gender: str) -> str:
-        """Which model a gender gets: "any" where one file is for everybody, else its own, else the neutral one."""
+        """The model for a gender: "any" if one file is for all people, else the gender's own, else "neutral"."""
         return "any" if "any" in self.files else gender if gender in self.files else "neutral"
 
     def _model(self, kind: str) -> tuple[np.ndarray, np.ndarray]:
@@ -230,7 +230,7 @@ class SmplJoints:
 
     def __call__(self, betas: np.ndarray, pose: np.ndarray, trans: np.ndarray, gender: str = "neutral") -> np.ndarray:
         """Joints (n, 24, 3) float64 m. betas (n or 1, <= 300); pose (n, 72) axis-angles rad, the root first; trans
-        (n, 3) m, added to everything, so that the pelvis is at its rest position plus trans."""
+        (n, 3) m, added to all joints, so that the pelvis is at its rest position plus trans."""
         mean, shapes = self._model(self.kind(gender))
         if (count := betas.shape[-1]) > shapes.shape[-1]:
             path = self.files[self.kind(gender)]
@@ -241,28 +241,28 @@ class SmplJoints:
 
     @cached_property
     def digests(self) -> dict[str, str]:
-        """By kind, what tells one file from another."""
+        """By kind, a digest of the model file."""
         return {kind: content_digest(path, expected="SMPL")[:12] for kind, path in self.files.items()}
 
 
 def turned_pose(pose: np.ndarray, R_to_world: np.ndarray) -> np.ndarray:
-    """SMPL's pose (72,) rad in a world turned by R_to_world (3, 3), as `Sample.rotations` has it."""
+    """SMPL's pose (72,) rad in a world turned by R_to_world (3, 3), in the form of `Sample.rotations`."""
     rotations = pose.reshape(-1, 3).astype(np.float32)
     rotations[0] = rotation_vector(R_to_world @ axis_angle_to_matrix(pose[:3]))
     return rotations
 
 
 class SceneClouds:
-    """The whole scans of a sequence, where they are there, and the map of what stands still in them.
+    """The whole scans of a sequence, if available, and the map of their static points.
 
-    paths: frame -> its file; people: frame -> points (n, 3) m of the person, in the coordinates of the scans.
+    paths: frame -> its file; people: frame -> points (n, 3) m of the person, in the frame of the scans.
     """
 
     def __init__(self, paths: dict[int, Path], people: Callable[[int], np.ndarray]):
         self._paths, self._people = paths, people
 
     def _others(self, frame: int) -> np.ndarray | None:
-        """The scan without the person; None where it cannot be read."""
+        """The scan without the person; None if it cannot be read."""
         try:
             return without_person(read_cloud(self._paths[frame]), self._people(frame))
         except (KeyError, InputError):
@@ -275,8 +275,8 @@ class SceneClouds:
         return static_points(scan for k in indices if (scan := self._others(frames[k])) is not None)
 
     def around(self, frame: int, R_sensor_scan: np.ndarray, origin: np.ndarray | None = None) -> dict[str, Any]:
-        """The fields background and neighbors of a frame's sample, in a frame turned by R_sensor_scan (3, 3) about the
-        sensor at origin (3,), by default 0; none where there is no scan."""
+        """The fields background and neighbors of a frame's sample, turned by R_sensor_scan (3, 3) about the sensor at
+        origin (3,) m, by default 0; empty if there is no scan."""
         scan = self._others(frame)
         if scan is None:
             return {}
@@ -286,7 +286,7 @@ class SceneClouds:
 
 
 def box_of_joints(joints: np.ndarray, id: str) -> Box:
-    """The box of a person's labeled joints (n, 3) m, n >= 1. Raises InputError where they are out of reach."""
+    """The box of a person's labeled joints (n, 3) m, n >= 1. Raises InputError if they are out of range."""
     low, high = joints.min(0), joints.max(0)
     return Box(center=(low + high) / 2, size=high - low + 2 * _BOX_MARGIN, id=id)
 
@@ -294,9 +294,11 @@ def box_of_joints(joints: np.ndarray, id: str) -> Box:
 def labeled_sample(
     points: np.ndarray, joints: np.ndarray, tree: Skeleton = SMPL24, **labels: Any
 ) -> LabeledSample | Skipped:
-    """The sample of points (n, 3) m and joints (J, 3) m of a skeleton, NaN where not labeled; labels: the other fields
-    of `LabeledSample`, by default all joints that are there count as seen and the frame is SEQUENCE/FRAME. Skipped
-    where a joint is out of reach."""
+    """The sample of points (n, 3) m and joints (J, 3) m of a skeleton, NaN if not labeled; `Skipped` if a joint is out
+    of range.
+
+    labels: the other fields of `LabeledSample`; by default labeled joints are `SEEN` and frame_id is SEQUENCE/FRAME.
+    """
     labels.setdefault("frame_id", f"{labels['sequence']}/{labels['frame']}")
     is_labeled = ~np.isnan(joints).any(-1)
     if not within_reach(joints[is_labeled]).all():

@@ -1,10 +1,10 @@
 """Corpora of simulated and captured people that LiDAR pose papers pre-train on: LIPD, FreeMotion, NoiseMotion.
 
     lipd            *.pkl: a list of dicts seq_path, pc (n, 3) m or a path of float32, gt_joint (24, 3) m, trans
-    freemotion      *.pkl: a list of dicts motion_id or seq_path, gt (72) rad, shape (10), and of up to three LiDARs
+    freemotion      *.pkl: a list of dicts motion_id or seq_path, gt (72) rad, shape (10), and for up to three LiDARs
                     pc_1 ... (or pc) and T_1 ...: the points, m, and the pelvis in their frame
-    noisemotion     the .pkl that the authors' dataloader_NoiseMotion.py makes of it and of SURREAL's poses: as
-                    freemotion, with gt (3, 72) and shape (3, 10)
+    noisemotion     the .pkl that the authors' dataloader_NoiseMotion.py makes from the raw clouds and SURREAL's poses:
+                    like freemotion, with gt (3, 72) and shape (3, 10)
 
 Sources: 4DVLab/LIP dataset/LIP_dataset.py, 4DVLab/LiveHPS dataset/Livehps_dataset.py and test.py, 4DVLab/LiveHPS2.
 Pickles are read without running them.
@@ -26,14 +26,14 @@ from lidarpose.io.pickles import load_pickle
 from lidarpose.sample import LabeledSample
 from lidarpose.skeleton import SMPL24
 
-# points are this close to the nearest joint in the median where labels and clouds fit, m: a trunk is 0.2 m thick
+# if labels and cloud fit, the median distance of points to the nearest joint is below this, m: a trunk is 0.2 m thick
 _NEAR = 0.35
 _FPS = 10.0
 
 
 @dataclass(frozen=True)
 class _Entry:
-    """A dict of a corpus, where it is, for messages, and the sequence and frame that it is of."""
+    """A dict of a corpus, with its location for messages, its sequence and its frame."""
 
     content: dict
     root: Path
@@ -45,7 +45,7 @@ class _Entry:
         return base.numbers(self.where, self.content[name], shape, name)
 
     def points(self, name: str) -> np.ndarray:
-        """(n, 3) of an array or of a file's path."""
+        """Points (n, 3) of an array or of the file at a path."""
         value = self.content[name]
         if not isinstance(value, str):
             return base.as_cloud(self.where, value)
@@ -60,7 +60,7 @@ class _Entry:
             raise unreadable(path, error) from None
 
     def sample(self, points: np.ndarray, joints: np.ndarray, **labels: Any) -> LabeledSample | Skipped:
-        """labels: track, source and what else a `LabeledSample` has."""
+        """The entry's sample. labels: track, source and other fields of a `LabeledSample`."""
         if not len(points):
             return Skipped("empty cloud", self.where)
         if _apart(points, joints) > _NEAR:
@@ -70,19 +70,19 @@ class _Entry:
 
 
 class _Corpus(Reader):
-    """Pickles of lists of dicts. A part is a file."""
+    """Reads pickles of lists of dicts. A part is a file."""
 
     skeleton = SMPL24.name
 
     def parts(self, root: Path) -> list[str]:
-        """The pickles of the root. Raises InputError where there are none."""
+        """The pickles in the root. Raises InputError if there are none."""
         names = sorted(path.name for path in root.glob("*.pkl"))
         if not names:
             raise self.wrong_root(root)
         return names
 
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
-        """Everybody in a file, in its order."""
+        """All people of a file, in its order."""
         content = load_pickle(root / part)
         if not isinstance(content, list):
             raise file_error(root / part, f"expected {self.name}'s list of dicts, got {type(content).__name__}")
@@ -103,11 +103,11 @@ class _Corpus(Reader):
 
     @abstractmethod
     def _entry(self, entry: _Entry) -> Iterator[LabeledSample | Skipped]:
-        """Everybody in an entry. Raises KeyError and InputError where something is missing or of another form."""
+        """All people of an entry. Raises KeyError if something is missing, InputError if it has another form."""
 
 
 class Lipd(_Corpus):
-    """LIPD (LIP, Ren et al. 2023). Its joints are relative; where they go is found by which way fits the points."""
+    """LIPD (LIP, Ren et al. 2023). Its joints are relative; they are placed in the way that fits the points best."""
 
     name = "lipd"
 
@@ -123,10 +123,10 @@ class Lipd(_Corpus):
 
 
 class FreeMotion(_Corpus):
-    """FreeMotion (LiveHPS, Ren et al. 2024). Each person is seen by up to three LiDARs: a sample for each."""
+    """FreeMotion (LiveHPS, Ren et al. 2024). Up to three LiDARs see each person; each gives a sample."""
 
     name = "freemotion"
-    # frames of poses in an entry, and which one belongs to the points
+    # number of poses in an entry, and the index of the one that belongs to the points
     _poses, _which = 1, 0
 
     def __init__(self, *, smpl: str | Path | None = None):
@@ -153,14 +153,14 @@ class FreeMotion(_Corpus):
 
 
 class NoiseMotion(FreeMotion):
-    """NoiseMotion (LiveHPS++, Ren et al. 2024), made of SURREAL's poses: three frames of them to a cloud."""
+    """NoiseMotion (LiveHPS++, Ren et al. 2024), made from SURREAL's poses: three frames of poses per cloud."""
 
     name = "noisemotion"
-    # the files do not say which of the three the points belong to; the middle one is 33 ms off at most
+    # the files do not say which of the three poses belongs to the points; the middle one is off by at most 33 ms
     _poses, _which = 3, 1
 
     def parts(self, root: Path) -> list[str]:
-        """The pickles. Raises InputError where there are only the raw clouds, which have no poses."""
+        """The pickles. Raises InputError if there are only raw clouds, which have no poses."""
         if not any(root.glob("*.pkl")) and any(root.glob("pc_[123]")):
             problem = "has clouds without poses, those are SURREAL's: run the authors' dataloader_NoiseMotion.py over "
             raise file_error(root, f"{problem}both and give the folder of its .pkl; get them at {self.about['get']}")
@@ -168,5 +168,5 @@ class NoiseMotion(FreeMotion):
 
 
 def _apart(points: np.ndarray, joints: np.ndarray) -> float:
-    """The median distance of the points to the nearest joint, m."""
+    """The median distance of points to their nearest joint, m."""
     return float(np.median(np.linalg.norm(points[:, None] - joints, axis=-1).min(1)))

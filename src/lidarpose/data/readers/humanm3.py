@@ -1,13 +1,13 @@
 """HumanM3 (Fan et al. 2023): several people in outdoor scenes, seen by four LiDARs whose clouds were fused.
 
     ROOT/{train,test}/SEQUENCE/[one more folder/]
-        pointcloud/000012.pcd       everything around, world frame, z up, m
+        pointcloud/000012.pcd       whole scans, world frame, z up, m
         pose_calib/0012.json        {track: 15 x [x, y, z]}, or 12.json
         smpl_estimated/0012.json    fits to the joints, not read
-    or ROOT/{train,test}.pkl        the authors' database: {"db": [{"pcd": path, "info": [one a camera]}]}
+    or ROOT/{train,test}.pkl        the authors' database: {"db": [{"pcd": path, "info": [one per camera]}]}
 
-The joints are `human15`, in its order. The database has everybody once a camera; here once. There is no box: one is
-made from the labeled joints, which the center "joints_box" tells, and crops the points.
+The joints are `human15`, in its order. The database lists each person once per camera; duplicates are merged here.
+There is no box: one is made from the labeled joints and crops the points; its center is "joints_box".
 Sources: soullessrobot/Human-M3-Dataset lib/dataset/human_m3.py, guidodumont/SMPLify-3D datasets/humanm3.py.
 """
 
@@ -24,24 +24,24 @@ from lidarpose.io.pickles import load_pickle
 from lidarpose.sample import LabeledSample
 from lidarpose.skeleton import HUMAN15
 
-# frames a second of the fused clouds
+# frames per second of the fused clouds
 _FPS = 10.0
-# what lies at the root
+# folders or databases in the root
 _SPLITS = ("train", "test")
 _FOLDERS = ("pointcloud", "pose_calib")
-# how many folders below the root a sequence may lie
+# maximum depth of a sequence's folder below the root
 _DEEPEST = 3
 
 
 class HumanM3(Reader):
-    """Reads HumanM3's folders, or where there are none the authors' database. A part is a sequence or a database."""
+    """Reads HumanM3's folders, or without them the authors' database. A part is a sequence or a database."""
 
     name = "humanm3"
     skeleton = HUMAN15.name
 
     def parts(self, root: Path) -> list[str]:
-        """Sequences as paths below the root, or the databases where none is complete. Raises InputError where there
-        is neither, and where only some sequences have labels and clouds."""
+        """Sequences as paths below the root, or the databases if no sequence is complete. Raises InputError if there is
+        neither, and if only some sequences have both labels and clouds."""
         databases = [f"{name}.pkl" for name in sorted(_SPLITS) if (root / f"{name}.pkl").is_file()]
         nested_folders = [path.parent for name in _SPLITS for path in sorted(root.glob(f"*/{name}")) if path.is_dir()]
         if nested_folders and not databases and not any((root / name).is_dir() for name in _SPLITS):
@@ -55,7 +55,7 @@ class HumanM3(Reader):
                 folder != root and folder.parent.name in _SPLITS and not _has_sequence(folder)
             ):
                 incomplete_sequence = incomplete_sequence or f"{folder} without {' and '.join(missing_folders)}"
-        # of what lies below a split the split would be lost
+        # if the root were below the folder of a split, the split would be unknown
         split_folder = root.parent if sequences == ["."] else root
         if sequences and split_folder.name in _SPLITS and not any((root / name).is_dir() for name in _SPLITS):
             raise file_error(root, f"lies in HumanM3's root, which is likely {split_folder.parent}: name that")
@@ -66,7 +66,7 @@ class HumanM3(Reader):
         return sequences or databases
 
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
-        """Everybody in a sequence by frame, or in a database in its order."""
+        """All people of a sequence by frame, or of a database in its order."""
         return _read_database(root, part) if part.endswith(".pkl") else _read_sequence(root, part)
 
 
@@ -102,7 +102,7 @@ def _read_sequence(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         for track in sorted(bodies, key=lambda track: (int(track) if track.isdecimal() else -1, track)):
             try:
                 joints = base.numbers(path, bodies[track], (15, 3), f"joints of {track}", finite=False)
-                # one that is not labeled is null
+                # unlabeled joints are null
                 people[track] = np.where(np.isfinite(joints), joints, np.nan)
             except InputError as error:
                 yield Skipped("not 15 joints", str(error))
@@ -130,7 +130,8 @@ def _read_database(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
 
 
 def _without_copies(info: list[dict], where: str) -> dict[str, np.ndarray]:
-    """Joints (15, 3) of everybody in a frame, NaN where no camera says visible: each has copies of the same people."""
+    """Joints (15, 3) of each person in a frame, merged over cameras, which have copies of the same people; NaN if no
+    camera marks the joint as visible."""
     people: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
     for camera in info:
         joints = base.numbers(where, camera["joints_3d"], (-1, 15, 3), "joints_3d")
@@ -155,7 +156,7 @@ def _people(
     try:
         cloud = base.read_cloud(path)
     except InputError as error:
-        # everybody in it is lost
+        # all people of the frame are skipped
         yield from (Skipped("cloud cannot be read", f"{error} ({track})") for track in people)
         return
     for track, joints in people.items():

@@ -6,10 +6,11 @@
         real_world_coordinates (n, 15, 3)   joints, m
         visible_joints (n, 15)              1 where the camera sees the joint
     ROOT/ITOP_{side,top}_{train,test}_point_cloud.h5
-        id (n,); data (n, 76800, 3)         everything the camera sees, m
+        id (n,); data (n, 76800, 3)         all points of the depth image, m
 
-The axes are the camera's: x right, y up, z away from it. The side view's person is cut out of the room without labels
-(`person_of_room`); of the top view no such rule is published, so a box about the labeled joints crops the points.
+The axes are the camera's: x right, y up, z away from it. In the side view, the person is segmented from the room
+without labels (`person_of_room`); for the top view no such method is published, so a box about the labeled joints crops
+the points.
 Sources: iballester/spike const/skeleton_joints.py and utils/preprocess_itop.py.
 """
 
@@ -29,31 +30,32 @@ from lidarpose.sample import HIDDEN, SEEN, UNLABELED, LabeledSample
 from lidarpose.skeleton import ITOP14
 
 PARTS = ("side/test", "side/train", "top/test", "top/train")
-# a file's datasets, and their shape after the number of frames
+# the HDF5 datasets of a file, and their shapes without the first dimension, the number of frames
 _DATASETS: dict[str, dict[str, tuple[int, ...]]] = {
     "labels": {"id": (), "is_valid": (), "real_world_coordinates": (15, 3), "visible_joints": (15,)},
     "point_cloud": {"id": (), "data": (76800, 3)},
 }
-# the largest file has 39,795; more would be a damaged header
+# the largest file has 39,795; more than this means a damaged header
 _MOST_FRAMES = 1_000_000
-# which of the 15 joints is the torso
+# index of the torso among the 15 joints
 _TORSO = 8
-# from the camera's axes to the level frame's: a reflection, since x right, y up, z away is left-handed
+# from the camera's axes to those of the level frame: a reflection, since x right, y up, z away is left-handed
 _R_LEVEL_CAMERA = {
     "side": np.array([[0.0, 0, 1], [-1, 0, 0], [0, 1, 0]]),
     "top": np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, -1]]),
 }
-# fewer frames than this do not tell whether x is right or left
+# minimum number of frames to tell whether x is right or left
 _LEAST_FRAMES = 100
-# where the side view's people stand: low and high x, y, z in the camera's axes, m. Source: SPiKE, as the next ones
+# region of people in the side view: low and high x, y, z in the camera's axes, m. Source: SPiKE, as for the following
 _REGION = np.array([[-0.85, -1.7, 1.85], [0.95, 1.0, 3.7]])
-# the floor is among the lowest so many of so many equal steps of height
+# the floor is in the lowest 10 of 100 equal height bins
 _FLOOR_STEPS, _STEPS = 10, 100
-# points of neighboring cells belong together, m (SPiKE: 0.15 m by DBSCAN, whose cells' diagonals are about twice that)
+# cell size of clusters: points in neighboring cells are connected, m (SPiKE: DBSCAN with 0.15 m; here, connected points
+# can be about twice as far apart)
 _CELL = 0.075
-# a smaller cluster is noise
+# smaller clusters are noise
 _LEAST_POINTS = 10
-# other clusters count within so much of the largest one, m
+# other clusters are kept within this distance of the largest one, m
 _NEAR = 0.2
 
 
@@ -64,25 +66,25 @@ class Itop(Reader):
     skeleton = ITOP14.name
 
     def parts(self, root: Path) -> list[str]:
-        """The parts of which a file is there. Raises InputError where there is none."""
+        """The parts with at least one file. Raises InputError if there are none."""
         parts = [part for part in PARTS if any(_path(root, part, kind).is_file() for kind in _DATASETS)]
         if not parts:
             raise self.wrong_root(root)
         return parts
 
     def check(self, root: Path, part: str) -> None:
-        """Raises InputError where one of a pair is missing or damaged, and where the two are of different frames;
+        """Raises InputError if a file of the pair is missing or damaged, and if the two have different frames;
         MissingExtra without h5py."""
         with _opened(root, part):
             pass
 
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
-        """The person of each frame that was checked, in the order of the file."""
+        """The person of each frame whose labels were checked, in the order of the file."""
         view = part.split("/")[0]
         with _opened(root, part) as (labels, clouds):
             path = labels.filename
             joints = base.numbers(path, labels["real_world_coordinates"][:], (-1, 15, 3), "joints", finite=False)
-            # no arithmetic with what is infinite
+            # infinite values become NaN
             joints = np.where(np.isfinite(joints), joints, np.nan)
             is_valid, is_visible = labels["is_valid"][:] > 0, labels["visible_joints"][:] > 0
             R_level_camera, source = _R_LEVEL_CAMERA[view], f"itop/{view}"
@@ -116,7 +118,7 @@ class Itop(Reader):
 def _sample(
     cloud: np.ndarray, joints: np.ndarray, is_visible: np.ndarray, R_level_camera: np.ndarray, **fields: Any
 ) -> LabeledSample | Skipped:
-    """The person in a cloud (n, 3) m with joints (14, 3) m, both in the camera's axes; fields: those of the sample."""
+    """The person in a cloud (n, 3) m with joints (14, 3) m, both in the camera's axes; fields: others of the sample."""
     is_labeled, frame_id = np.isfinite(joints).all(-1), fields["frame_id"]
     if not is_labeled.any():
         return Skipped("no joint is labelled", frame_id)
@@ -140,8 +142,8 @@ def _sample(
 
 
 def is_mirrored(joints: np.ndarray) -> bool:
-    """joints (n, 14, 3) m of itop14 -> whether people are their own mirror images: their forearms point backwards on
-    average, by which side is called left. False for under 100 people with all the joints that tell."""
+    """joints (n, 14, 3) m of itop14 -> whether the data is mirrored: forearms point backward on average, given which
+    side is labeled left. False for fewer than 100 people with all joints."""
     joints = joints[np.isfinite(joints).all((1, 2))]
     if len(joints) < _LEAST_FRAMES:
         return False
@@ -150,7 +152,7 @@ def is_mirrored(joints: np.ndarray) -> bool:
         for side in ("left", "right")
     )
     middle = {name: (left[name] + right[name]) / 2 for name in left}
-    # a person's left times their up is forwards
+    # the cross product of a person's left and up directions points forward
     forward = np.cross(left["shoulder"] - right["shoulder"], middle["shoulder"] - middle["hip"])
     return bool(((middle["hand"] - middle["elbow"]) * forward).sum(-1).mean() < 0)
 
@@ -168,7 +170,7 @@ def _ids(file: Any) -> list[str]:
 
 @contextmanager
 def _opened(root: Path, part: str) -> Iterator[tuple[Any, Any]]:
-    """Labels and clouds of a part, checked but for their values. Raises InputError, MissingExtra without h5py."""
+    """Labels and clouds of a part, checked except for their values. Raises InputError, MissingExtra without h5py."""
     try:
         import h5py
     except ModuleNotFoundError as error:
@@ -187,7 +189,7 @@ def _opened(root: Path, part: str) -> Iterator[tuple[Any, Any]]:
                     if actual_shapes["id"] is not None and actual_shapes["id"] <= (_MOST_FRAMES,)
                     else []
                 )
-            # what h5py raises for damaged files
+            # the exceptions that h5py raises for damaged files
             except (OSError, KeyError, RuntimeError, TypeError, ValueError) as error:
                 problem = f"cannot be read as HDF5 ({one_line(str(error))}); was it downloaded and unpacked completely?"
                 raise file_error(path, problem) from None
@@ -203,10 +205,10 @@ def _opened(root: Path, part: str) -> Iterator[tuple[Any, Any]]:
 
 
 def person_of_room(points: np.ndarray) -> np.ndarray:
-    """points (n, 3) m in the camera's axes, y up -> those of the person (k, 3), k = 0 where nobody is found.
+    """points (n, 3) m in the camera's axes, y up -> those of the person (k, 3), k = 0 if no person is found.
 
-    Without labels, after SPiKE's preprocessing: a fixed region of the room, the floor taken off, the largest cluster,
-    and the clusters about it and in front of it. Clusters are of neighboring cells, where SPiKE's are DBSCAN's.
+    Uses no labels and follows SPiKE's preprocessing: crop a fixed region of the room, remove the floor, keep the
+    largest cluster and the clusters around and in front of it. Clusters are connected cells; SPiKE uses DBSCAN.
     """
     points = points[((points >= _REGION[0]) & (points <= _REGION[1])).all(1)]
     points = points[points[:, 1] >= _floor(points[:, 1])]
@@ -216,7 +218,7 @@ def person_of_room(points: np.ndarray) -> np.ndarray:
     counts = np.bincount(cluster)
     largest_cluster = points[cluster == counts.argmax()]
     low, high = largest_cluster.min(0) - _NEAR, largest_cluster.max(0) + _NEAR
-    # arms are raised and stretched towards the camera
+    # extended up and toward the camera, for raised and outstretched arms
     low[2], high[1] = _REGION[0, 2], high[1] + _NEAR
     is_outside = ((points < low) | (points > high)).any(1)
     is_person = (np.bincount(cluster, is_outside) == 0) & (counts >= _LEAST_POINTS)
@@ -224,8 +226,8 @@ def person_of_room(points: np.ndarray) -> np.ndarray:
 
 
 def _floor(heights: np.ndarray) -> float:
-    """The height m below which all is floor, -inf where none is seen: the lowest tenth of the heights then has no more
-    points than others have."""
+    """The height m below which points are floor, -inf if no floor is visible: then the lowest tenth of the height range
+    has no more points than the other tenths have on average."""
     counts, edges = np.histogram(heights, bins=_STEPS)
     lowest_counts = counts[:_FLOOR_STEPS]
     if lowest_counts.sum() <= _FLOOR_STEPS * counts.mean():
@@ -235,7 +237,7 @@ def _floor(heights: np.ndarray) -> float:
 
 
 def _clusters(points: np.ndarray) -> np.ndarray:
-    """points (n, 3) m, n >= 1 -> (n,) int, the same number for points whose cells are connected, also by a corner."""
+    """points (n, 3) m, n >= 1 -> (n,) int, equal for points whose cells are connected, including by a corner."""
     cells = np.floor((points - points.min(0)) / _CELL).astype(int) + 1
     shape = tuple(cells.max(0) + 2)
     code, cell = np.unique(np.ravel_multi_index(tuple(cells.T), shape), return_inverse=True)
@@ -245,7 +247,7 @@ def _clusters(points: np.ndarray) -> np.ndarray:
     neighbors = grid[code + steps[:, None]]
     number = np.arange(len(code))
     while True:
-        # the least number of a neighbor, then the least that this one knows of
+        # label propagation: the minimum label of all neighbors, then one step of pointer jumping
         least_number = np.where(neighbors >= 0, number[neighbors], len(code)).min(0)
         least_number = least_number[least_number]
         if (least_number == number).all():

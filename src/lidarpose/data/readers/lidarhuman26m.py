@@ -1,10 +1,10 @@
-"""LiDARHuman26M (LiDARCap, Li et al. 2022): one person, 12 to 24 m away, seen by a LiDAR that stands still.
+"""LiDARHuman26M (LiDARCap, Li et al. 2022): one person, 12 to 24 m away, scanned by a static LiDAR.
 
     ROOT/labels/3d/pose/7/000001.json       beta (10), pose (72) rad, trans (3) m: SMPL, neutral
-    ROOT/labels/3d/segment/7/000001.ply     the person's points, m, in the LiDAR's frame, as pose and trans
-    ROOT/pointclouds/7/000001.pcd           whole scans, which not everybody has: what stands about the person
+    ROOT/labels/3d/segment/7/000001.ply     the person's points, m, in the LiDAR's frame, like pose and trans
+    ROOT/pointclouds/7/000001.pcd           whole scans, for the person's surroundings; optional
 
-Joints are SMPL's, so the user's SMPL file is needed. The LiDAR looks down on the people, and its frame is as it was
+Joints are SMPL's, so the user's SMPL file is needed. The LiDAR looks down on the people, and its frame is tilted as
 mounted, so each sequence is turned level by one rotation. Source: the dataset's page, AutoCONFIG/Neighborhood-enhanced-
 LidarCap sample/gen_dataset.py; jingyi-zhang/ASC_Lidar_human process.py, which makes the labels in the raw frame.
 """
@@ -25,18 +25,18 @@ from lidarpose.sample import LabeledSample, within_reach
 from lidarpose.skeleton import SMPL24
 
 POSE_FOLDER, _SEGMENT, _SCANS = "labels/3d/pose", "labels/3d/segment", "pointclouds"
-# fewer frames say too little
+# minimum number of frames with upright people for an estimate of the up axis
 LEAST_FRAMES = 100
-# what the estimate may err by, rad: where people turn round, and where they all face about one way, so that leaning
-# forwards looks like a frame out of level (of captured clips at most 3 and 9 degrees)
+# error bounds of the estimate, rad: if people face different directions, and if all face about the same direction, so
+# that a forward lean cannot be told from a tilted frame (captured clips have errors of at most 3 and 9 degrees)
 _DOUBT, _MORE_DOUBT = np.radians(3.0), np.radians(10.0)
-# length of the mean of all that people face, beyond which they face one way
+# people face the same direction if the mean of their unit forward vectors is longer than this
 _ONE_WAY = 0.8
-# who bends further than this away from what is up so far is left out, cosine
+# frames in which the trunk deviates more than this from the current up estimate are left out, cosine
 _UPRIGHT = np.cos(np.radians(45.0))
+# number of iterations of the estimate
 _ROUNDS = 4
-# people lean forwards by about this much, as a tangent, where nobody turns round to show it; how many frames that is
-# worth, as a share of all
+# prior of the forward lean, as a tangent, for people who never turn around; its weight, as a share of all frames
 _LEAN, _TRUST = 0.1, 0.1
 
 
@@ -56,7 +56,7 @@ class LidarHuman26M(Reader):
             self.about["frame"] = f"the LiDAR's own, as in the release: {note}"
 
     def parts(self, root: Path) -> list[str]:
-        """The sequences, by number. Raises InputError where poses or clouds are missing altogether."""
+        """The sequences, by number. Raises InputError if poses or clouds are missing altogether."""
         for name in (POSE_FOLDER, _SEGMENT):
             if not (root / name).is_dir():
                 raise self.wrong_root(root, f"got no {name}")
@@ -79,7 +79,7 @@ class LidarHuman26M(Reader):
             betas, pose, trans = (np.stack(rows) for rows in zip(*labels.values(), strict=True))
             people = self._smpl(betas, pose, trans)
             joints = dict(zip(labels, people, strict=True))
-            # one out of reach will be skipped, and says nothing about the others
+            # out-of-range people are skipped later and must not affect the others
             turn = leveling(people[within_reach(people).all(-1)]) if self._level else None
         segments = base.numbered(root / _SEGMENT / part, ".ply")
         scans = {frame: paths[0] for frame, paths in base.numbered(root / _SCANS / part, ".pcd").items()}
@@ -115,7 +115,8 @@ def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _sample(
     path: Path, joints: np.ndarray, trans: np.ndarray, turn: np.ndarray | None, **fields: Any
 ) -> LabeledSample | Skipped:
-    """turn: R_level_sensor, None to stay in the sensor's frame; fields: others of the sample, turned already."""
+    """The sample of a frame. turn: R_level_sensor, None to keep the sensor's frame; fields: others of the sample,
+    already turned."""
     try:
         points = base.read_cloud(path)
     except InputError as error:
@@ -131,11 +132,10 @@ def _sample(
 
 
 def up_of_people(joints: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Which way is up, (3,) of length 1, in a frame in which people's smpl24 joints (n, 24, 3) m are given, and by what
-    angle, rad, that may be wrong.
+    """The up axis, a unit vector (3,), of the frame of people's smpl24 joints (n, 24, 3) m, and its error bound, rad.
 
-    The mean of the trunks, less what people lean forwards, which is found as the part that turns with them. None where
-    fewer than `LEAST_FRAMES` of the people stand upright.
+    It is the mean trunk direction without the forward lean, which is estimated as the component that turns with the
+    people. None if fewer than `LEAST_FRAMES` of the people stand upright.
     """
     positions = {
         name: joints[:, SMPL24.index(name)] for name in ("left_hip", "right_hip", "left_shoulder", "right_shoulder")
@@ -143,7 +143,7 @@ def up_of_people(joints: np.ndarray) -> tuple[np.ndarray, float] | None:
     trunk = unit(
         positions["left_shoulder"] + positions["right_shoulder"] - positions["left_hip"] - positions["right_hip"]
     )
-    # a person's left times their up is forwards
+    # the cross product of a person's left and up directions points forward
     forward = unit(np.cross(positions["left_hip"] - positions["right_hip"], trunk))
     up = unit(trunk.mean(0))
     for _ in range(_ROUNDS):
@@ -151,7 +151,7 @@ def up_of_people(joints: np.ndarray) -> tuple[np.ndarray, float] | None:
         if is_upright.sum() < LEAST_FRAMES:
             return None
         t, f = trunk[is_upright], forward[is_upright]
-        # t = up + lean * f: a line through both, drawn towards the usual lean where everybody faces one way
+        # least-squares fit of t = up + lean * f, with a prior on the lean that decides if all face the same direction
         f_centered = f - f.mean(0)
         trust = _TRUST * len(f)
         lean = (((t - t.mean(0)) * f_centered).sum() + trust * _LEAN) / ((f_centered**2).sum() + trust)
@@ -160,8 +160,8 @@ def up_of_people(joints: np.ndarray) -> tuple[np.ndarray, float] | None:
 
 
 def leveling(joints: np.ndarray) -> np.ndarray | None:
-    """R_level_sensor (3, 3), the smallest rotation that makes z up, from people's joints as `up_of_people` takes them;
-    None where the frame is as level as can be told, or too few people say what is up."""
+    """R_level_sensor (3, 3), the smallest rotation that makes z the up axis, from joints as in `up_of_people`; None if
+    the frame is level within the error bound, or if too few people are upright."""
     estimate = up_of_people(joints)
     if estimate is None or estimate[0][2] > np.cos(estimate[1]):
         return None

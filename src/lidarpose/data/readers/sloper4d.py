@@ -1,13 +1,13 @@
-"""SLOPER4D (Dai et al. 2023), release 1.0: one person followed by another who carries a LiDAR on the head.
+"""SLOPER4D (Dai et al. 2023), release 1.0: one person, followed by another with a head-mounted LiDAR.
 
     ROOT/SEQUENCE/SEQUENCE_labels.pkl
-        frame_num               (n,) the frames that are labeled; total_frames: those with pictures
+        frame_num               (n,) the labeled frames; total_frames: the number of frames with pictures
         first_person            lidar_traj (n, 9): frame, x y z m, quaternion x y z w, time s
         second_person           opt_pose or pose (n, 72) rad, opt_trans or trans (n, 3) m, beta (10), gender;
-                                point_clouds, a list of (k, 3) m in the world's frame, and point_frame, whose they are;
-                                rows that are no numbers are no points
+                                point_clouds, a list of (k, 3) m in the world frame, and point_frame, their frame
+                                numbers; NaN rows are dropped
     ROOT/SEQUENCE/lidar_data/lidar_frames_rot/1641234567_123.pcd
-                            whole scans in the world's frame, by time, which not everybody has
+                            whole scans in the world frame, by time; optional
 
 Joints are SMPL's, so the user's SMPL file is needed. Pickles are read without running them.
 Source: climbingdaily/SLOPER4D src/data_loader.py, guidodumont/SMPLify-3D datasets/sloper4d.py.
@@ -38,9 +38,9 @@ from lidarpose.skeleton import SMPL24
 
 _SUFFIX = "_labels.pkl"
 _SCANS = "lidar_data/lidar_frames_rot"
-# the LiDAR's frames are 50 ms apart, s
+# maximum time difference between a frame and its scan, s: the LiDAR's frames are 50 ms apart
 _SAME_TIME = 0.02
-# a quaternion is no rotation where its length is further from 1
+# a quaternion whose length differs from 1 by more than this is not a rotation
 _UNIT = 0.01
 
 
@@ -55,7 +55,7 @@ class Sloper4D(Reader):
         super().__init__(smpl=self._smpl.digests)
 
     def parts(self, root: Path) -> list[str]:
-        """The sequences. Raises InputError where there are no labels, or two of one name."""
+        """The sequences. Raises InputError if there are no labels, or two with the same name."""
         names = sorted(path.name.removesuffix(_SUFFIX) for path in _files(root))
         if not names:
             raise self.wrong_root(root)
@@ -125,12 +125,12 @@ class Sloper4D(Reader):
 
 
 def _files(root: Path) -> list[Path]:
-    """Label files in the root, its folders and theirs; the root may be a sequence itself."""
+    """Label files in the root and up to two folders below it; the root may be a sequence itself."""
     return sorted(path for depth in ("", "*/", "*/*/") for path in root.glob(f"{depth}*{_SUFFIX}"))
 
 
 def _content(path: Path) -> tuple[dict, dict, dict]:
-    """The labels, and of them those of the person who is seen and of the one with the LiDAR."""
+    """All labels, those of the scanned person, and those of the person who carries the LiDAR."""
     content = load_pickle(path)
     if not isinstance(content, dict) or not isinstance(content.get("second_person"), dict):
         is_old = isinstance(content, dict) and "SMPL_info" in content
@@ -142,7 +142,7 @@ def _content(path: Path) -> tuple[dict, dict, dict]:
 
 
 def _scans(folder: Path, times: dict[int, float]) -> dict[int, Path]:
-    """Frame -> its whole scan: files are named by times, s, with _ for the point."""
+    """Frame -> its whole scan: files are named by times in s, with _ instead of the decimal point."""
     files: dict[float, Path] = {}
     for path in sorted((folder / _SCANS).glob("*.pcd")):
         with suppress(ValueError):
@@ -155,7 +155,7 @@ def _scans(folder: Path, times: dict[int, float]) -> dict[int, Path]:
 
 
 def _poses(path: Path, person: dict) -> tuple[np.ndarray, np.ndarray, str]:
-    """pose (n, 72), trans (n, 3) and the name of the former; the refined ones where they are."""
+    """pose (n, 72), trans (n, 3) and the name of the pose entry; the refined ones if available."""
     for prefix in ("opt_", ""):
         names = [f"{prefix}pose", f"{prefix}trans"]
         if all(person.get(name) is not None for name in names):
@@ -170,7 +170,7 @@ def _poses(path: Path, person: dict) -> tuple[np.ndarray, np.ndarray, str]:
 
 
 def _clouds(path: Path, person: dict) -> dict[int, np.ndarray | str]:
-    """Frame -> its cloud (k, 3) m, or what is wrong with it."""
+    """Frame -> its cloud (k, 3) m, or a description of the error."""
     clouds, frames = person.get("point_clouds"), person.get("point_frame")
     if clouds is None or frames is None:
         raise file_error(path, "second_person has no point_clouds and point_frame: labels of another release?")
@@ -182,7 +182,7 @@ def _clouds(path: Path, person: dict) -> dict[int, np.ndarray | str]:
     by_frame: dict[int, np.ndarray | str] = {}
     for frame, cloud in zip(frames, clouds, strict=True):
         try:
-            # rows that are no numbers are left out, as the authors' loaders do
+            # NaN rows are dropped, as in the authors' loaders
             by_frame[frame] = as_cloud(path, cloud)
         except InputError as error:
             by_frame[frame] = str(error)
@@ -190,7 +190,7 @@ def _clouds(path: Path, person: dict) -> dict[int, np.ndarray | str]:
 
 
 def _heading(quaternion: np.ndarray) -> np.ndarray:
-    """quaternion (n, 4) x y z w -> (n,) rad: where the turned x axis points, seen from above; NaN for no rotation."""
+    """quaternion (n, 4) x y z w -> (n,) rad: yaw of the rotated x axis; NaN if the quaternion is not a rotation."""
     x, y, z, w = quaternion.T
     is_unit = np.abs(np.linalg.norm(quaternion, axis=1) - 1) < _UNIT
     return np.where(is_unit, np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)), np.nan)

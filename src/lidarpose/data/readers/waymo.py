@@ -3,7 +3,7 @@
     ROOT/{training,validation}/COMPONENT/SEGMENT.parquet
 
 Six of the components are read: lidar_hkp and lidar_box (keypoints and boxes), lidar and lidar_pose (range images of
-five lasers, two returns each, and where the car was when a pixel of the top laser was measured), lidar_calibration and
+five lasers, two returns each, and the vehicle's pose at the time of each pixel of the top laser), lidar_calibration and
 vehicle_pose. They are joined on their key columns. See docs/data.md for the frames of reference and the quirks.
 Source: waymo-research/waymo-open-dataset src/waymo_open_dataset/v2.
 """
@@ -31,13 +31,13 @@ _BUCKET = "gs://waymo_open_dataset_v_2_0_1"
 SEGMENT, TIME, LASER, OBJECT = (
     f"key.{name}" for name in ("segment_context_name", "frame_timestamp_micros", "laser_name", "laser_object_id")
 )
-# segment and timestamp; and the laser
+# segment and timestamp; the second with the laser
 FrameKey = tuple[str, int]
 LaserKey = tuple[str, int, int]
-# the values of the key columns, and the others by name
+# the values of the key columns, and all columns by name
 Row = tuple[tuple, dict[str, Any]]
 _IMAGE_KEYS = (SEGMENT, TIME, LASER)
-# column chunks are larger than what a machine's memory should have to hold: this much of a file is read at once
+# column chunks may be too large for memory, so files are read in pieces of this size
 _LITTLE_MEMORY = {"buffer_size": 1 << 20, "pre_buffer": False}
 _REMEDY = "fetch it again"
 
@@ -59,7 +59,7 @@ _PIXEL_POSES = "[LiDARPoseComponent].range_image_return1"
 
 
 class Waymo(Reader):
-    """Reads whichever version is there."""
+    """Reads either version, whichever the root holds."""
 
     name = "waymo"
     skeleton = WAYMO14.name
@@ -70,7 +70,7 @@ class Waymo(Reader):
 
     def parts(self, root: Path) -> list[str]:
         """Segments with keypoints of version 2 ("training/SEGMENT") or files of version 1 ("training/FILE.tfrecord").
-        Raises InputError where there are both, neither, or a component is missing."""
+        Raises InputError if there are both, neither, or if a component is missing."""
         files = waymo_v1.parts(root)
         folders = [f"{split}/{name}" for split in SPLITS for name in _components(root / split)]
         if files and folders:
@@ -86,8 +86,8 @@ class Waymo(Reader):
         raise self.wrong_root(root, actual)
 
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
-        """Everybody with keypoints in a part, in the order of time, then of track. Raises InputError where the labels
-        cannot be read; where the range images cannot, everybody is skipped."""
+        """All people with keypoints in a part, by time, then by track. Raises InputError if the labels cannot be read;
+        if the range images cannot be read, all people are skipped."""
         if part.endswith(".tfrecord"):
             return waymo_v1.read(root, part)
         return _read_segment(root, part)
@@ -98,7 +98,7 @@ def _components(folder: Path) -> list[str]:
 
 
 def _segments(root: Path) -> list[str]:
-    """The segments that have keypoints; others need no other files."""
+    """The segments that have keypoints; other segments need no further files."""
     parts = []
     for split in SPLITS:
         folder, url = root / split, f"{_BUCKET}/{split}"
@@ -109,7 +109,7 @@ def _segments(root: Path) -> list[str]:
             names = missing_components[0] if len(missing_components) == 1 else f"{{{','.join(missing_components)}}}"
             command = f"gcloud storage cp -r {url}/{names} {shlex.quote(f'{folder}/')}"
             raise file_error(folder, f"lacks {', '.join(missing_components)}; fetch with: {command}")
-        # a damaged file is a part too: reading it reports it
+        # a damaged file is also a part: reading it reports the error
         labels = sorted((folder / "lidar_hkp").glob("*.parquet"))
         segments = [path.stem for path in labels if rows_of_shard(path) != 0]
         for name in COMPONENTS:
@@ -212,7 +212,7 @@ def _add_images(files: dict[str, Path], frames_by_key: dict[FrameKey, frames.Fra
         return
     pose_keys = {key for key, _ in table(files["lidar_pose"], _IMAGE_KEYS)}
     poses = images(files["lidar_pose"], (_PIXEL_POSES,), needed_keys)
-    # both files usually have their frames in the same order, then there is never more than one in it
+    # both files usually have the same order of frames; then it never holds more than one image
     pending_poses: dict[LaserKey, np.ndarray | None] = {}
     for key, returns in images(files["lidar"], _RETURNS, needed_keys):
         while key in pose_keys and key not in pending_poses:
@@ -226,15 +226,15 @@ def _add_images(files: dict[str, Path], frames_by_key: dict[FrameKey, frames.Fra
                 frame.add(key[2], return_number, image[..., 0], pixel_poses)
 
 
-# ---- rows of Parquet files, with little memory: of range images one row at a time. Columns are picked by name and rows
-# by key, so that their order, row groups, the width of numbers, and further columns do not matter
+# ---- rows of Parquet files, read with little memory: range images one row at a time. Columns are selected by name and
+# rows by key, so that order, row groups, number types and extra columns do not matter
 
 
 def table(
     path: Path, keys: tuple[str, ...], columns: tuple[str, ...] = (), optional: tuple[str, ...] = ()
 ) -> list[Row]:
-    """All rows: the values of the key columns, and the others by name, None where an optional column is missing or a
-    value null. Raises InputError."""
+    """All rows: the values of the key columns, and all columns by name, None if an optional column is missing or a
+    value is null. Raises InputError for a damaged file and missing columns."""
     with open_parquet(path, _REMEDY, **_LITTLE_MEMORY) as file:
         _check(file, (*keys, *columns))
         names = [name for name in (*keys, *columns, *optional) if name in file.schema_arrow.names]
@@ -248,10 +248,10 @@ def table(
 def images(
     path: Path, columns: tuple[str, ...], wanted: Collection[FrameKey]
 ) -> Iterator[tuple[LaserKey, list[np.ndarray | None]]]:
-    """Range images (H, W, C) float32 of wanted frames, row by row in the file's order, one a column.
+    """Range images (H, W, C) float32 of wanted frames, row by row in the file's order, one image per column.
 
-    columns: what `.values` and `.shape` follow. An image is None where there is none, and empty where its values do not
-    fit its shape. Raises InputError for a damaged file and missing columns.
+    columns: names without the suffixes `.values` and `.shape`. An image is None if it is missing, and empty if its
+    values do not fit its shape. Raises InputError for a damaged file and missing columns.
     """
     names = tuple(f"{column}.{part}" for column in columns for part in ("values", "shape"))
     keys, first_row = [key for key, _ in table(path, _IMAGE_KEYS)], 0
@@ -261,7 +261,7 @@ def images(
             group_keys = keys[first_row : first_row + file.metadata.row_group(group).num_rows]
             first_row += len(group_keys)
             last_row = max((k for k, key in enumerate(group_keys) if key[:2] in wanted), default=-1)
-            # nothing is read of a group before the first batch is asked for
+            # lazy: a group is not read before its first batch is requested
             batches = file.iter_batches(batch_size=1, row_groups=[group], columns=names, use_threads=False)
             for key, batch in zip(group_keys[: last_row + 1], batches, strict=False):
                 if key[:2] in wanted:

@@ -1,4 +1,4 @@
-"""Waymo's frames, whatever files they come from: range images to points, keypoints and boxes to people.
+"""Waymo's frames, independent of the file format: range images to points, keypoints and boxes to people.
 
 Frames of reference: a laser's own (x along its azimuth 0, z up); the vehicle's (x forward, y left, z up) at the time of
 the frame's pose, in which boxes and keypoints are labeled; the world's. Lengths in meters, angles in radians. H rows
@@ -18,12 +18,12 @@ from lidarpose.geometry import from_spherical, is_rotation, transform_points
 from lidarpose.sample import HIDDEN, SEEN, UNLABELED, Box, LabeledSample, within_reach
 from lidarpose.skeleton import WAYMO14
 
-# the number of the laser on the roof
+# number of the laser on the roof
 TOP = 1
-# how far outside the labeled box points are still taken, m on each side
+# margin of the labeled box within which points are kept, m on each side
 MARGIN = 0.2
 
-# KeypointType -> the joint of WAYMO14; 19, the forehead, is of cameras
+# KeypointType -> the joint of WAYMO14; 19, the forehead, exists only in camera labels
 _JOINTS = {
     kind: WAYMO14.index(name)
     for first, side in ((5, "left"), (13, "right"))
@@ -31,21 +31,21 @@ _JOINTS = {
 } | {1: WAYMO14.index("nose"), 20: WAYMO14.index("head_center")}
 _KINDS = {1: "vehicle", 2: "pedestrian", 3: "sign", 4: "cyclist"}
 
-# why somebody is left out, of both versions of the dataset
+# reasons for skipping a person, in both versions of the dataset
 BAD_LABEL = "label of another form"
 BAD_IMAGE = "range image cannot be read"
 BAD_FRAME = "frame cannot be read"
 
 
 def is_image(sizes: Sequence[int | None], count: int) -> bool:
-    """Whether a range image of so many values may have these sizes: rows, columns, channels."""
-    # of Python's numbers: the product of damaged ones may be 0 in 64 bits
+    """Whether a range image of `count` values can have these sizes: rows, columns, channels."""
+    # with Python's integers: the product of damaged sizes may overflow to 0 in 64 bits
     known_sizes = [size for size in sizes if size is not None]
     return len(sizes) == len(known_sizes) == 3 and min(known_sizes) >= 1 and count == math.prod(known_sizes)
 
 
 def transform(values: Iterable[float] | None, what: str) -> np.ndarray:
-    """16 numbers, row by row -> T (4, 4), a rotation and a shift. Raises InputError for anything else."""
+    """16 numbers, row-major -> T (4, 4), a rigid transform. Raises InputError for anything else."""
     try:
         matrix = np.array([] if values is None else values, float)
     except (TypeError, ValueError):
@@ -60,8 +60,8 @@ def transform(values: Iterable[float] | None, what: str) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Calibration:
-    """A laser. T_vehicle_laser (4, 4); inclinations (H,) rad, the lowest beam first as on disk, or None: H beams that
-    divide low to high evenly."""
+    """A laser's calibration. T_vehicle_laser (4, 4); inclinations (H,) rad, lowest beam first as on disk, or None: H
+    beams evenly spaced from low to high, rad."""
 
     laser: int
     T_vehicle_laser: np.ndarray
@@ -74,8 +74,8 @@ class Calibration:
             raise InputError(f"has no beam inclinations of laser {self.laser}")
 
     def rows(self, height: int) -> np.ndarray:
-        """(H,) rad: the inclination of each row of a range image. Row 0 is the last beam of the table: its order is
-        reversed. Raises InputError where the table has another length."""
+        """(H,) rad: the inclination of each row of a range image. The table is reversed: row 0 is its last beam. Raises
+        InputError if the table has another length."""
         beams = self.inclinations
         if beams is None:
             low, high = float(self.low or 0), float(self.high or 0)
@@ -90,15 +90,15 @@ def points_of_image(
 ) -> tuple[np.ndarray, np.ndarray]:
     """A range image (H, W) m -> points (n, 3) float64 m in the vehicle's frame, and their rows (n,).
 
-    Pixels without a return are 0. pixel_poses (H, W, 6): roll, pitch, yaw, x, y, z of the vehicle in the world when the
-    pixel was measured, which moves points to where the vehicle's frame was at T_world_vehicle (4, 4). Both returns of a
-    laser share the poses. Raises InputError where sizes do not fit.
+    Pixels without a return are 0. pixel_poses (H, W, 6): roll, pitch, yaw, x, y, z of the vehicle in the world at the
+    time of each pixel, None for no motion compensation; with them, points are transformed to the vehicle's frame at
+    T_world_vehicle (4, 4). Both returns of a laser share the poses. Raises InputError if sizes do not fit.
     """
     height, width = image.shape
-    # NaN and infinity are no returns either
+    # NaN and infinity are not returns, either
     row, column = np.nonzero((image > 0) & (image < np.inf))
     T = calibration.T_vehicle_laser
-    # columns divide the turn of the vehicle's axes, not of the laser's own
+    # columns cover the azimuths of the vehicle's axes, not of the laser's own
     azimuth = ((width - column - 0.5) / width * 2 - 1) * np.pi - np.arctan2(T[1, 0], T[0, 0])
     points = from_spherical(image[row, column].astype(float), azimuth, calibration.rows(height)[row])
     points = transform_points(T, points)
@@ -123,8 +123,8 @@ def _turned(a: np.ndarray, b: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LabeledPerson:
-    """Somebody with keypoints in one frame, in the vehicle's frame. joints (14, 3) m, NaN where not labeled, and their
-    labels (14,); kind: Waymo's type of the box; counted: points in the box by the label."""
+    """A person with keypoints in one frame, in the vehicle's frame. joints (14, 3) m, NaN if not labeled, and their
+    labels (14,); kind: Waymo's type of the box; counted: number of points in the box according to the label."""
 
     track: str
     joints: np.ndarray
@@ -135,7 +135,7 @@ class LabeledPerson:
 
 
 class Problem(NamedTuple):
-    """Why somebody, or everybody in a frame, is left out, and what else to say of it."""
+    """The reason why a person, or all people of a frame, are left out, with details."""
 
     reason: str
     why: str = ""
@@ -149,8 +149,8 @@ def person(
     kind: int = 0,
     counted: int | None = None,
 ) -> LabeledPerson | Problem:
-    """Somebody by their labels. keypoints: (type, x y z, whether occluded) each, in any order, types that the skeleton
-    lacks ignored; box: center, size (length, width, height) and heading, 7 numbers."""
+    """A person from labels. keypoints: (type, x y z, whether occluded) each, in any order; types that the skeleton does
+    not have are ignored; box: center, size (length, width, height) and heading, 7 numbers."""
     joints, labels = np.full((len(WAYMO14), 3), np.nan), np.full(len(WAYMO14), UNLABELED, np.uint8)
     for keypoint, position, is_hidden in keypoints:
         if keypoint in _JOINTS and within_reach(np.asarray(position)):
@@ -171,8 +171,8 @@ def person(
 class Frame:
     """A frame and the people labeled in it, to which range images are added one by one, in any order.
 
-    sequence, timestamp (us) and start, that of the sequence's first frame; calibrations by laser; T_world_vehicle
-    (4, 4) or None where it is missing.
+    sequence; timestamp (us); start: timestamp of the sequence's first frame; calibrations by laser; T_world_vehicle
+    (4, 4), None if missing.
     """
 
     sequence: str
@@ -191,11 +191,11 @@ class Frame:
         return self._problem is None and any(isinstance(person, LabeledPerson) for person in self.people)
 
     def fail(self, reason: str, why: str = "") -> None:
-        """Leaves out everybody in the frame."""
+        """Leaves out all people of the frame; the first reason is kept."""
         self._problem = self._problem or Problem(reason, why)
 
     def add(self, laser: int, which: int, image: np.ndarray, pixel_poses: np.ndarray | None) -> None:
-        """A laser's return number `which`: range image (H, W) m and its pixels' poses (H, W, 6), None for none."""
+        """Adds return number `which` of a laser: range image (H, W) m and its pixel poses (H, W, 6), None for none."""
         if not self.wanted or (laser, which) in self._crops:
             return
         try:
@@ -216,7 +216,7 @@ class Frame:
             crops.append((points[selection], ring[selection]))
 
     def samples(self) -> Iterator[LabeledSample | Skipped]:
-        """Everybody, in the order of their tracks, once all images are there."""
+        """All people, in the order of their tracks; called after all images were added."""
         if self.wanted and not any(laser == TOP for laser, _ in self._crops):
             self.fail("no range image of the frame")
         for k, person in sorted(enumerate(self.people), key=lambda pair: pair[1].track):

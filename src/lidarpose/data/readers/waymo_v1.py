@@ -2,10 +2,10 @@
 
     ROOT/{training,validation}/segment-NAME_with_camera_labels.tfrecord
 
-Read without TensorFlow: the fields that are needed are declared here, protobuf skips the others. Source:
+Read without TensorFlow: the required fields are declared here, protobuf skips all others. Source:
 waymo-research/waymo-open-dataset dataset.proto, label.proto, protos/keypoint.proto, protos/vector.proto.
 
-A TFRecord file is a row of records: length (uint64, little-endian), its checksum (uint32), data, its checksum. A
+A TFRecord file is a sequence of records: length (uint64, little-endian), its checksum (uint32), data, its checksum. A
 checksum is the CRC-32C of the bytes, rotated right by 15 bits, plus a constant.
 """
 
@@ -32,14 +32,14 @@ except ImportError:
 
 SPLITS = ("training", "validation")
 
-# Protobuf holds a repeated field in up to twenty times its bytes: what no frame needs is refused before it is parsed.
-# Frames have about 5 MB; images of the top laser 64 x 2650 pixels of up to 6 values, and shapes 3 sizes.
+# Protobuf needs up to twenty times the bytes of a repeated field, so messages larger than any frame needs are rejected
+# before parsing. Frames have about 5 MB; images of the top laser 64 x 2650 pixels of up to 6 values; shapes 3 sizes.
 _LARGEST_FRAME = 1 << 25
 _LARGEST_IMAGE = 4 << 24
 _LARGEST_SHAPE = 1 << 16
 
-# message -> the fields that are read of it, as name:number:type; "*" marks a repeated one. The data of a matrix is
-# packed, as dataset.proto says: its bytes are the array
+# message -> its fields that are read, as name:number:type; "*" marks repeated fields. The data of a matrix is packed
+# according to dataset.proto: its bytes are the array
 _MESSAGES = {
     "Frame": "context:1:Context timestamp_micros:2:int64 pose:3:Transform lasers:5:*Laser laser_labels:6:*Label",
     "Context": "name:1:bytes laser_calibrations:3:*LaserCalibration",
@@ -62,7 +62,7 @@ _MESSAGES = {
 
 
 def _message_classes() -> dict[str, Any]:
-    """The class of each message, in a pool of its own: Waymo's generated code may be loaded too."""
+    """The class of each message, in a separate descriptor pool: Waymo's generated code may also be loaded."""
     file = descriptor_pb2.FileDescriptorProto(name="waymo.proto", package="waymo", syntax="proto2")
     field_proto = descriptor_pb2.FieldDescriptorProto
     for message, fields in _MESSAGES.items():
@@ -84,7 +84,7 @@ _CLASSES = _message_classes()
 
 
 def parse(message: str, data: bytes, largest: int) -> Any:
-    """A message of `_MESSAGES` of at most so many bytes. Raises InputError where it is larger, cut off or damaged."""
+    """Parses a message of `_MESSAGES`. Raises InputError if it has over `largest` bytes, is truncated or damaged."""
     if len(data) > largest:
         raise InputError(f"message {message} has {len(data):,} bytes, more than {largest:,}: damaged, or not Waymo's")
     try:
@@ -94,13 +94,13 @@ def parse(message: str, data: bytes, largest: int) -> Any:
 
 
 def parts(root: Path) -> list[str]:
-    """The files, as paths below the root, none where there are none."""
+    """The TFRecord files, as paths below the root; may be empty."""
     paths = (path for split in SPLITS for path in (root / split).glob("*.tfrecord"))
     return sorted(path.relative_to(root).as_posix() for path in paths)
 
 
 def read(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
-    """Everybody with keypoints in a file, frame by frame. After a damaged record the rest is given up."""
+    """All people with keypoints in a file, frame by frame. Everything after a damaged record is skipped."""
     start = None
     try:
         for number, data in enumerate(records(root / part)):
@@ -116,8 +116,8 @@ def read(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
 
 
 def records(path: Path) -> Iterator[bytes]:
-    """The records of a TFRecord file, one in memory at a time. Raises InputError where one is cut off or damaged: what
-    follows cannot be found, since only a record tells where the next begins."""
+    """The records of a TFRecord file, one in memory at a time. Raises InputError if one is truncated or damaged: the
+    following ones cannot be found, since each record determines where the next begins."""
     try:
         size = path.stat().st_size
         with open(path, "rb") as file:
@@ -146,9 +146,9 @@ def _masked_checksum(data: bytes) -> int:
 
 
 def _frame(message: Any, start: int | None) -> frames.Frame:
-    """A frame with its range images. start: timestamp of the segment's first frame, None where it is this one.
+    """A frame with its range images. start: timestamp of the segment's first frame, None if it is this one.
 
-    Raises InputError where its labels cannot be read.
+    Raises InputError if its labels cannot be read.
     """
     name = message.context.name.decode("utf-8", "replace")
     if not name or not message.HasField("timestamp_micros"):
@@ -166,7 +166,7 @@ def _frame(message: Any, start: int | None) -> frames.Frame:
             frame.T_world_vehicle = frames.transform(message.pose.transform, "the vehicle's pose")
     for laser in message.lasers if frame.wanted else ():
         try:
-            # the pixels' poses are beside the first return and are those of both
+            # pixel poses are stored with the first return and apply to both returns
             poses = _matrix(laser.ri_return1.range_image_pose_compressed)
             for return_number, image in enumerate((laser.ri_return1, laser.ri_return2), 1):
                 if (values := _matrix(image.range_image_compressed)) is not None:
@@ -204,7 +204,7 @@ def _calibration(laser: Any) -> frames.Calibration:
 
 
 def _matrix(compressed: bytes) -> np.ndarray | None:
-    """A zlib-compressed MatrixFloat -> (H, W, C) float32; None where there is none."""
+    """A zlib-compressed MatrixFloat -> (H, W, C) float32; None if it is missing."""
     if not compressed:
         return None
     inflate = zlib.decompressobj()

@@ -1,4 +1,4 @@
-"""What a trained detector's scores mean: fitted on scans of what training never shows, and written beside the network.
+"""Calibrates a trained detector's scores on held-out scans and stores the calibration with the network.
 
 Legend: D detections of a scan, F features.
 """
@@ -26,21 +26,22 @@ from lidarpose.train.detector.candidate_source import as_detected
 from lidarpose.train.run_dir import MODEL
 
 DETECTOR = "detector.onnx"
-# a seed of which neither a run nor a bench has scans
+# a seed that neither training runs nor benchmarks use
 _SEED = 2**31 - 11
-# false people a scan at the default score
+# false positives per scan at the default score
 FALSE_PER_SCAN = 1.0
-# who is less likely is not posed to learn what scores mean
+# score threshold of the detections that the calibration is fitted to
 _LEAST_SCORE = 0.01
-# of the logistic, on standardized features: its ridge, steps of Newton's method; knots of the curve at most
+# logistic regression on standardized features: ridge penalty, Newton steps; maximum number of knots of the curve
 _RIDGE, _NEWTON_STEPS, _KNOTS = 1e-3, 30, 16
 
 
 def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = None) -> Path:
-    """Writes the detector of a run, its scores calibrated on so many scans, and returns its path.
+    """Writes the detector of a run with scores calibrated on the given number of scans, and returns its path.
 
-    labeled: a folder of labeled real scans, see `labeled_scans`; there too the default score lets at most
-    `FALSE_PER_SCAN` false people a scan pass. Raises InputError where a folder holds no detector or no scans.
+    labeled: a folder of labeled real scans, see `labeled_scans`; the default score is then high enough that at most
+    `FALSE_PER_SCAN` false positives per scan pass on these, too. Raises InputError if a folder holds no detector or no
+    scans.
     """
     check_int("--calibrate", scans, least=1)
     path = Path(folder) / MODEL
@@ -77,8 +78,8 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ScanTable:
-    """D detections in a scan of P people: features (D, F), see `verification_features`; people (P, 2) m; verify: header
-    and least score -> the people among them, as `verified` finds them."""
+    """D detections in a scan of P people: features (D, F), see `verification_features`; people (P, 2) m; verify: maps
+    a header and a score threshold to the people among the detections, as `verified` finds them."""
 
     detections: Detections
     features: np.ndarray
@@ -86,21 +87,21 @@ class ScanTable:
     verify: Callable[[dict, float], VerifiedPeople]
 
     def is_near(self) -> np.ndarray:
-        """(D,): whether somebody is there, be it who another detection is of, too."""
+        """(D,): whether a person is near each detection; several detections may be of one person."""
         distance = np.linalg.norm(self.detections.centers[:, None, :2] - self.people[None], axis=-1)
         return (distance < MATCH_RADIUS).any(1)
 
     def is_first(self, scores: np.ndarray, centers: np.ndarray) -> np.ndarray:
-        """(K,): whether boxes with these scores (K,) and centers (K, 3) m are the surest of a person."""
+        """(K,): whether each box, with scores (K,) and centers (K, 3) m, is the highest-scoring one of a person."""
         return match(centers[:, :2], scores, self.people, np.ones(len(self.people), bool)) >= 0
 
 
 def fit(tables: Sequence[ScanTable]) -> dict:
     """The entries "calibration", "verification" and "default_score" of a header.
 
-    What is learned to be told from mistakes are all detections of people: of those of one person all but one go later,
-    and are no mistakes. What the score means, and the default score, which lets `FALSE_PER_SCAN` false people a scan
-    pass, is fitted to those that are left.
+    The logistic regression counts every detection near a person as a positive: duplicates are removed later and are
+    not false positives. The calibration of the score, and the default score, which lets `FALSE_PER_SCAN` false
+    positives per scan pass, are fitted to the detections that remain after verification.
     """
     features = np.concatenate([table.features for table in tables])
     is_near = np.concatenate([table.is_near() for table in tables])
@@ -123,15 +124,18 @@ def fit(tables: Sequence[ScanTable]) -> dict:
 
 
 def passing_score(false: np.ndarray, scans: int) -> float:
-    """The score that lets `FALSE_PER_SCAN` false people a scan pass. false (D,): scores of all in so many scans."""
+    """The score threshold at which `FALSE_PER_SCAN` false positives per scan pass.
+
+    false (D,): scores of all false positives in the given number of scans.
+    """
     false = np.sort(false)[::-1]
     last = min(round(FALSE_PER_SCAN * scans), len(false) - 1)
-    # between the last false one that passes and the first that does not
+    # midway between the last false positive that passes and the first that does not
     return float(false[last - 1 : last + 1].mean()) if last > 0 else 0.5
 
 
 def logistic(features: np.ndarray, labels: np.ndarray) -> tuple[float, np.ndarray]:
-    """The bias and weights (F,) of a logistic regression of labels (D,), by Newton's method, slightly shrunk."""
+    """The bias and weights (F,) of a logistic regression of labels (D,), by Newton's method, with a small ridge."""
     mean, scale = features.mean(0), features.std(0) + 1e-6
     x = np.column_stack([np.ones(len(features)), (features - mean) / scale])
     weights = np.zeros(x.shape[1])
@@ -146,10 +150,10 @@ def logistic(features: np.ndarray, labels: np.ndarray) -> tuple[float, np.ndarra
 
 
 def monotone(logit: np.ndarray, labels: np.ndarray) -> list[list[float]]:
-    """Knots [[logits], [probabilities]] of the share of true labels by logit, rising: groups of like logits, joined
-    until each has a larger share than the one before (pool adjacent violators)."""
+    """Knots [[logits], [probabilities]] of the share of true labels as a rising function of the logit: groups of
+    similar logits are merged until each has a larger share than the one before (pool adjacent violators)."""
     order = np.argsort(logit, kind="stable")
-    # half of the knots where people are, half where they are not
+    # half of the knots at quantiles of the positives, half at quantiles of the negatives
     quantiles = np.linspace(0, 1, _KNOTS // 2 + 1)[1:-1]
     pivots = np.unique(np.concatenate([np.quantile(logit[labels == label], quantiles) for label in np.unique(labels)]))
     groups = np.split(order, np.searchsorted(logit[order], pivots))
@@ -161,7 +165,7 @@ def monotone(logit: np.ndarray, labels: np.ndarray) -> list[list[float]]:
         while len(pools) > 1 and labels[pools[-2]].mean() >= labels[pools[-1]].mean():
             last_pool = pools.pop()
             pools[-1] = np.concatenate([pools[-1], last_pool])
-    # half a one of each kind more: nothing is certain
+    # half a positive and half a negative are added, so that no probability is 0 or 1
     shares = [(labels[pool].sum() + 0.5) / (len(pool) + 1) for pool in pools]
     middles = [float(logit[pool].mean()) for pool in pools]
     return [[round(value, 4) for value in middles], [round(float(value), 5) for value in np.maximum.accumulate(shares)]]

@@ -1,8 +1,8 @@
-"""What the detector learns from: candidates of synthesized scans, each scan shown several times.
+"""Training data of the detector: candidates of synthesized scans, each scan shown several times.
 
-Scans take longest to make, so a scan's candidates are kept for a while and shown `uses` times, each time drawn anew
-from its points with another augmentation. Everything is a function of an example's number: a process that lacks a scan,
-as after `--resume`, makes it again.
+Making scans is the slowest part, so a scan's candidates are cached for a while and shown `uses` times, each time drawn
+anew from its points with another augmentation. Everything is a function of an example's number: a process that does not
+have a scan, as after `--resume`, makes it again.
 
 Legend: K candidates, P people of a scan.
 """
@@ -24,20 +24,20 @@ from lidarpose.models.detector.render import CandidateAugmentation
 from lidarpose.synth.detection_scene import DetectionScene, detection_scene
 from lidarpose.synth.scene import RandomStream
 
-# of a candidate's distance to a person's center in x and y: one up to the first is the person's, and their nearest one
-# up to the second; one beyond the second is nobody's, and what lies between teaches nothing, m
+# thresholds of a candidate's distance in x and y to a person's center, m. Up to the first, a candidate is a positive;
+# up to the second, only the one nearest to the person is. Beyond the second it is a negative; others are ignored
 POSITIVE, IGNORED = 0.35, 0.5
-# who returned fewer points is neither to be found nor to be left alone
+# candidates of people with fewer points are ignored: neither positives nor negatives
 LEAST_POINTS = 5
-# how often a scan's sensor is unknown from the beginning, and how often a candidate is shown without it
+# how often a scan's sensor position is unknown from the beginning, and how often it is dropped for a candidate
 BLIND, DROP_ORIGIN = 0.08, 0.08
-# nobody's candidates of a scan that are shown at a time; the objective learns from the hardest of them
+# negatives of a scan that are shown at a time; the objective learns from the hardest of them
 NEGATIVES = 64
 # scans to validate on
 VALIDATION = 30
-# `Labels.person` of nobody's candidates and of those that teach nothing
+# `Labels.person` of negatives and of ignored candidates
 NOBODY, IGNORE = -1, -2
-# what boxes have beyond the body on each side, m
+# margin of boxes around the body on each side, m
 _MARGIN = 0.05
 
 SceneT = TypeVar("SceneT")
@@ -46,11 +46,11 @@ ExampleT = TypeVar("ExampleT")
 
 @dataclass(frozen=True, kw_only=True)
 class Labels:
-    """What is true of K candidates.
+    """Ground truth of K candidates.
 
-    person (K,) int: index into the scene's boxes, `NOBODY` or `IGNORE`; of people's candidates also center (K, 2): of
-    the person, x and y in the view frame about the candidate, m; foot (K,): lowest point above the ground
-    at the candidate; height (K,) m; mounted (K,) bool. All float32 but for those named.
+    person (K,) int: index into the scene's boxes, `NOBODY` or `IGNORE`. The rest holds for positives: center (K, 2):
+    the person's center, x and y in the view frame about the candidate, m; foot (K,): the person's lowest point above
+    the ground at the candidate, m; height (K,) m; mounted (K,) bool. Arrays are float32 unless stated.
     """
 
     person: np.ndarray
@@ -65,7 +65,7 @@ class Labels:
 
 @dataclass(frozen=True, kw_only=True)
 class DetectorExample:
-    """Candidates of a scan with their labels, as they are or as an augmentation changes them."""
+    """Candidates of a scan with their labels, and the augmentation applied to them, if any."""
 
     candidates: Candidates
     labels: Labels
@@ -77,7 +77,7 @@ class DetectorExample:
 
 
 def labels_of(candidates: Candidates, scene: DetectionScene) -> Labels:
-    """What is true of the candidates of a scene."""
+    """Ground truth of the candidates of a scene."""
     count, centers, yaw = len(candidates), candidates.centers, candidates.yaw
     center, foot, height = np.zeros((count, 2), np.float32), np.zeros(count, np.float32), np.zeros(count, np.float32)
     person, mounted = np.full(count, NOBODY), np.zeros(count, bool)
@@ -103,8 +103,8 @@ def labels_of(candidates: Candidates, scene: DetectionScene) -> Labels:
 
 
 def draw_augmentation(rng: np.random.Generator, count: int) -> CandidateAugmentation:
-    """A random one for each of `count` candidates; in a share `DROP_ORIGIN` the sensor is dropped, and the turn is any
-    instead of small."""
+    """A random augmentation for each of `count` candidates; in a share `DROP_ORIGIN` the sensor position is dropped and
+    the turn is arbitrary instead of small."""
     rows = []
     for _ in range(count):
         is_dropped = rng.random() < DROP_ORIGIN
@@ -119,7 +119,7 @@ def draw_augmentation(rng: np.random.Generator, count: int) -> CandidateAugmenta
 
 
 def transform_labels(labels: Labels, augmentation: CandidateAugmentation) -> Labels:
-    """The labels of candidates that are changed so."""
+    """The labels of candidates after an augmentation."""
     scale = np.asarray(augmentation.scale, np.float32)
     center = augmentation.apply(labels.center).astype(np.float32)
     return replace(labels, center=center, foot=labels.foot * scale, height=labels.height * scale)
@@ -127,10 +127,10 @@ def transform_labels(labels: Labels, augmentation: CandidateAugmentation) -> Lab
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSource(Generic[SceneT, ExampleT]):
-    """Each scene of `detection_scene` of a seed `uses` times, `lag` scenes between two times.
+    """Shows each scene of `detection_scene` of a seed `uses` times, with `lag` scenes between two uses.
 
-    Scene j is example uses * j the first time. Where no scene is old enough yet, a younger one stands in.
-    load_scene(seed, number): what is learned from in a scene; draw_example(scan, rng): an example of it, drawn anew.
+    Scene j is first shown as example uses * j. While no scene is old enough yet, a newer one is shown instead.
+    load_scene(seed, number): the training data of a scene; draw_example(scan, rng): draws an example from it.
     """
 
     seed: int
@@ -144,7 +144,7 @@ class SceneSource(Generic[SceneT, ExampleT]):
 
     @cached_property
     def _kept(self) -> dict[int, SceneT]:
-        """The scans of this process by their numbers."""
+        """The scans cached in this process by their numbers."""
         return {}
 
     def example(self, index: int) -> ExampleT:
@@ -163,7 +163,7 @@ class SceneSource(Generic[SceneT, ExampleT]):
 
 
 def draw_candidates(scan: DetectorExample, rng: np.random.Generator) -> DetectorExample:
-    """Candidates of a scan: all of people, and some of nobody."""
+    """Candidates of a scan: all positives and some negatives."""
     person = scan.labels.person
     negatives = np.flatnonzero(person == NOBODY)
     negatives = rng.choice(negatives, min(NEGATIVES, len(negatives)), replace=False)
@@ -174,7 +174,7 @@ def draw_candidates(scan: DetectorExample, rng: np.random.Generator) -> Detector
 
 
 def scan_example(seed: int, number: int, *, family: str = "train") -> DetectorExample:
-    """All candidates of a scene, found as in any scan: leveled first where it is tilted."""
+    """All candidates of a scene, found as in any scan: a tilted scene is leveled first."""
     scene, origin = scene_to_search(seed, number, family)
     points = scene.points[_distance(scene.points, scene) < MAX_RANGE + BEYOND]
     ground = estimate_ground(points, origin) or without_ground(points, origin)
@@ -186,7 +186,7 @@ def scan_example(seed: int, number: int, *, family: str = "train") -> DetectorEx
 
 
 def scene_to_search(seed: int, number: int, family: str) -> tuple[DetectionScene, np.ndarray | None]:
-    """A scene as people are looked for in it, and the place of its sensor (3,) m, None where it is not known."""
+    """A scene as the detector receives it, and its sensor position (3,) m, None if unknown."""
     scene = detection_scene(seed, number, family=family)
     rng = np.random.default_rng([seed, RandomStream.CANDIDATES, number, 0])
     is_blind = rng.random() < BLIND
@@ -200,13 +200,13 @@ def validation_scans(seed: int) -> list[DetectorExample]:
 
 
 def as_detected(scene: DetectionScene, origin: np.ndarray | None) -> DetectionScene:
-    """The scene as people are looked for in it: leveled where its sensor, at origin (3,) m or unknown, is tilted."""
+    """The scene as the detector receives it: leveled if it is tilted. origin (3,) m: the sensor, None if unknown."""
     up = estimate_up(scene.points, origin)
     return scene if up is None else leveled(scene, up)
 
 
 def leveled(scene: DetectionScene, up: np.ndarray) -> DetectionScene:
-    """The scene turned so that `up` (3,) points up; boxes exceed the turned joints as they did, below and above."""
+    """The scene turned so that `up` (3,) points up; boxes keep their margins below and above the turned joints."""
     R_level_scene = rotation_between(up, np.array([0.0, 0.0, 1.0]))
     joints = scene.joints @ R_level_scene.T.astype(np.float32)
     boxes = []
@@ -226,5 +226,5 @@ def leveled(scene: DetectionScene, up: np.ndarray) -> DetectionScene:
 
 
 def _distance(points: np.ndarray, scene: DetectionScene) -> np.ndarray:
-    """Level distances (n,) m of points (n, 3) from the sensor of a scene."""
+    """Horizontal distances (n,) m of points (n, 3) from the sensor of a scene."""
     return np.hypot(points[:, 0] - scene.origin[0], points[:, 1] - scene.origin[1])

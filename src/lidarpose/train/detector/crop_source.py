@@ -1,4 +1,5 @@
-"""What the verifier learns from: the bundled detector's detections in synthesized scans, people and its mistakes.
+"""Training data of the verifier: the bundled detector's detections in synthesized scans, both people and false
+positives.
 
 Legend: K detections of a scan.
 """
@@ -16,12 +17,12 @@ from lidarpose.models.detector.detector import MAX_RANGE, Detector
 from lidarpose.sample import MIN_POINTS
 from lidarpose.train.detector.candidate_source import IGNORE, NOBODY, scene_to_search
 
-# a detection nearer than this to a person is of that person; beyond the second distance, with at most this share of its
-# points on people, it is of nobody; others teach nothing, m
+# a detection nearer to a person than the first distance is a detection of that person; one farther than the second from
+# all people, with at most this share of its points on people, is a false positive; others are ignored. Distances in m
 _OWN, _OTHER, _NOBODYS = 0.35, 0.7, 0.02
 _MOST_POINTS = 1024
-# each time a crop is shown: the least share of its points that stay, the largest change of its size, and standard
-# deviations of each point and of the center, m
+# augmentation of a crop: minimum share of its points that stay, largest change of scale, and standard deviations of the
+# noise of each point and of the shift of the whole crop, m
 _KEPT, _SCALE, _NOISE, _SHIFT = 0.6, 0.07, 0.005, 0.05
 # scans to validate on
 VALIDATION = 60
@@ -32,8 +33,8 @@ class CropExample:
     """The points of detections of a scan.
 
     clouds: K arrays (n, 3) m about the detection's center; view (K, 5), see `VoxelPyramid`; person (K,) int: the
-    person's index in the scene, or `NOBODY`; mounted (K,) bool: who rides or sits in a wheelchair; num_others (K,) int:
-    points of other people; seed: of thinning voxels.
+    person's index in the scene, or `NOBODY`; mounted (K,) bool: the person rides or sits in a wheelchair; num_others
+    (K,) int: number of points on other people; seed: for thinning voxels.
     """
 
     clouds: list[np.ndarray]
@@ -49,7 +50,7 @@ class CropExample:
 
 
 def draw_crops(scan: CropExample, rng: np.random.Generator) -> CropExample:
-    """All crops of a scan, changed a little."""
+    """All crops of a scan, with a random augmentation."""
     seed, is_mirrored = int(rng.integers(2**31)), rng.random(scan.size) < 0.5
     mirror = np.where(is_mirrored, -1, 1)
     view = scan.view.copy()
@@ -69,7 +70,7 @@ def _detector() -> Detector:
 
 
 def scan_crops(seed: int, number: int, *, family: str = "train") -> CropExample:
-    """What people and the detector's mistakes in a scene look like to whatever verifies them."""
+    """The crops of a scene's detections as the verifier receives them, of people and of false positives."""
     scene, origin = scene_to_search(seed, number, family)
     detections = _detector().detect(scene.points, origin, max_range=MAX_RANGE, limit=MOST_POSED)
     counts = np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes))
@@ -107,7 +108,8 @@ def scan_crops(seed: int, number: int, *, family: str = "train") -> CropExample:
 
 
 def _label(distances: np.ndarray, visible_people: np.ndarray, owner: np.ndarray) -> int:
-    """distances (P,) m of a detection from people; owner (n,): of its points, -1 for none."""
+    """The person's index, `NOBODY` or `IGNORE`. distances (P,) m of a detection from people; owner (n,): the person
+    that each of its points is on, -1 for none."""
     if distances.min(initial=np.inf) < _OWN:
         return int(visible_people[distances.argmin()])
     is_nobody = distances.min(initial=np.inf) > _OTHER and (owner >= 0).mean() <= _NOBODYS
@@ -115,5 +117,5 @@ def _label(distances: np.ndarray, visible_people: np.ndarray, owner: np.ndarray)
 
 
 def validation_crops(seed: int) -> list[CropExample]:
-    """Of `VALIDATION` scans of the family "heldout"."""
+    """The crops of `VALIDATION` scans of the family "heldout"."""
     return list(map(partial(scan_crops, seed, family="heldout"), range(VALIDATION)))

@@ -1,6 +1,6 @@
-"""What the loop must know of the baselines, and what they minimize, as their authors' code does; all weights are 1.
+"""Training objectives and losses of the baselines, as in their authors' code; all loss weights are 1.
 
-`BaselineObjective`: those of single frames, PRN and LPFormer; `ClipObjective`: those of clips, LiDARCap and NE.
+`BaselineObjective`: single-frame baselines, PRN and LPFormer; `ClipObjective`: clip baselines, LiDARCap and NE.
 Legend: B people or clips, N points, J joints of the network, T frames of a clip.
 """
 
@@ -39,8 +39,8 @@ class BaselineObjective:
         return build(self.config)
 
     def collate(self, examples: list[Example]) -> dict[str, np.ndarray]:
-        """The arrays of `pad_clouds`; joints (B, J, 3) float32 m about the middle, NaN without a label; radius (B,)
-        float32 m within which points belong to a joint."""
+        """The arrays of `pad_clouds`; joints (B, J, 3) float32 m about "middle", NaN if unlabeled; radius (B,) float32
+        m within which points belong to a joint."""
         seeds = [example.seed for example in examples]
         view = np.stack([example.view for example in examples])
         arrays = pad_clouds([example.points for example in examples], view, self.config, seeds)
@@ -52,7 +52,7 @@ class BaselineObjective:
     def terms(
         self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = one_process
     ) -> dict[str, Tensor]:
-        """`frame_losses`; joints without a label teach nothing."""
+        """`frame_losses`; unlabeled joints have no effect."""
         tensors = on_device(arrays, device)
         points, valid = tensors["points"], tensors["valid"]
         is_labeled = tensors["joints"].isfinite().all(-1)
@@ -79,8 +79,8 @@ class ClipObjective:
         return build(self.config)
 
     def collate(self, examples: list[ClipExample]) -> dict[str, np.ndarray]:
-        """Of each cloud NAME points (B, T, N, 3) m about the frames' centers and NAME_valid (B, T, N); joints
-        (B, T, 24, 3) m about them, NaN without a label; rotations (B, T, 24, 3, 3), SMPL's."""
+        """For each cloud, NAME (B, T, N, 3): points in m about the frames' centers, and NAME_valid (B, T, N); joints
+        (B, T, 24, 3) m about the same centers, NaN if unlabeled; rotations (B, T, 24, 3, 3), SMPL's."""
         shape = len(examples), len(examples[0].frames)
         arrays: dict[str, np.ndarray] = {}
         for number, name in enumerate(self.config.clouds):
@@ -100,8 +100,8 @@ class ClipObjective:
     def terms(
         self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = one_process
     ) -> dict[str, Tensor]:
-        """`clip_losses`; clips all have as many frames and joints, so means of processes are means of
-        all."""
+        """`clip_losses`; all clips have the same numbers of frames and joints, so the mean of the processes' means is
+        the mean of all."""
         outputs = network(self._clouds(arrays, device))
         joints, rotations = (torch.as_tensor(arrays[name]).to(device) for name in ("joints", "rotations"))
         is_labeled = joints.isfinite().all(-1)
@@ -119,10 +119,10 @@ class ClipObjective:
 def point_labels(
     points: Tensor, valid: Tensor, joints: Tensor, known: Tensor, radius: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Labels (B, N): the number of the nearest joint with a label, J for background, -1 for padding; and the offsets
+    """Labels (B, N): the index of the nearest labeled joint, J for background, -1 for padding; and the offsets
     (B, N, 3) m from the points to those joints.
 
-    joints (B, J, 3) m, known (B, J); radius (B,) m, None for `LABEL_RADIUS`.
+    joints (B, J, 3) m; known (B, J): whether a joint is labeled; radius (B,) m, None for `LABEL_RADIUS`.
     """
     bound = LABEL_RADIUS if radius is None else radius[:, None]
     distance = torch.cdist(points, joints).masked_fill(~known[:, None], torch.inf)
@@ -141,7 +141,7 @@ def frame_losses(
     labels: tuple[Tensor, Tensor],
     share: Share,
 ) -> dict[str, Tensor]:
-    """Distances of joints and cross entropy of parts; of PRN also distances of voted joints and of points' offsets.
+    """Distances of joints and cross entropy of parts; for PRN also errors of voted joints and of points' offsets.
 
     labels: see `point_labels`.
     """
@@ -151,9 +151,9 @@ def frame_losses(
         assert isinstance(config, LpformerConfig)
         if config.divide_by_all_joints:
             distance = distance * at_least_one(share(known.sum())) / share(torch.ones_like(known).sum())
-        # of probabilities instead of logits, as published
+        # with `second_softmax`, the cross entropy is of probabilities instead of logits, as published
         parts = (outputs.parts.softmax(-1) if config.second_softmax else outputs.parts)[valid]
-        # zero, of the head without a loss: processes that average gradients wait for all heads
+        # adds zero times the head without a loss: gradient averaging across processes waits for all heads
         return {"joints": distance + 0 * outputs.visible.sum(), "part": _cross_entropy(parts, label, share)}
     is_body = label < joints.shape[1]
     offset_error = (outputs.offsets - offset[valid]).norm(dim=-1)[is_body]
@@ -166,11 +166,11 @@ def frame_losses(
 
 
 def clip_losses(outputs: ClipOutputs, rotations: Tensor, pelvis: Tensor, offsets: Tensor) -> dict[str, Tensor]:
-    """LiDARCap's and NE's: mean square errors of rotations, of the joints that they lead to, and of the first stage's.
+    """LiDARCap's and NE's losses: mean squared errors of rotations, of joints posed by them, and of first-stage joints.
 
     rotations (B, T, 24, 3, 3), SMPL's; pelvis (B, T, 1, 3) m about the frame's center; offsets (24, 3) m: the skeleton
-    at rest. Joints are of this one skeleton, prediction and truth alike, where the published code regresses them from
-    posed vertices. The first stage's are about the frame's center, those of the rotations about the pelvis.
+    at rest. Joints of both prediction and truth are of this one skeleton; the published code regresses them from posed
+    vertices. The first stage's joints are about the frame's center, posed joints about the pelvis.
     """
     true_joints = forward_kinematics(rotations, offsets, SMPL24.parents)
     posed_joints = forward_kinematics(outputs.rotations, offsets, SMPL24.parents)
@@ -182,7 +182,7 @@ def clip_losses(outputs: ClipOutputs, rotations: Tensor, pelvis: Tensor, offsets
 
 
 def mean_distance(joints: Tensor, true: Tensor, known: Tensor, share: Share = one_process) -> Tensor:
-    """m, over joints with a label."""
+    """Mean distance in m over labeled joints."""
     distance = (joints - torch.where(known[..., None], true, 0.0)).norm(dim=-1)
     return (distance * known).sum() / at_least_one(share(known.sum()))
 
@@ -191,17 +191,17 @@ def _cross_entropy(logits: Tensor, label: Tensor, share: Share) -> Tensor:
     return F.cross_entropy(logits.float(), label, reduction="sum") / at_least_one(share(label.new_tensor(len(label))))
 
 
-# ---- weights to go on from
+# ---- initial weights
 
 
 @torch.no_grad()
 def with_joints(trained: Any, config: PrnConfig | LpformerConfig) -> Any:
-    """A network of a configuration with the weights of a trained one of its kind; of joints that the trained one lacks
-    they are random."""
+    """A network of `config` with the weights of a trained network of the same kind; weights of joints that the trained
+    one lacks are random."""
     network: Any = build(config)
     old_joints = trained.config.joints
     state = trained.state_dict()
-    # background is the last row where there is one
+    # the last row is background, if the parameter has one
     rows = {name: row for row, name in enumerate((*old_joints, ""))}
     pairs = [(k, rows[name]) for k, name in enumerate((*config.joints, "")) if name in rows]
     for name, value in network.state_dict().items():

@@ -1,9 +1,9 @@
-"""What the paper's network minimizes, equation by equation. All in float32, whatever the network computes in.
+"""The losses of the paper's network, equation by equation. All in float32, whatever precision the network uses.
 
 Legend: B people, J joints of the network, M voxels of level 0, W heatmap bins, P parts.
 
-The paper's hats stand for the truth in Eq. 7 and for the prediction in Eq. 8 and 10, since a divergence from the
-prediction to the truth would ask for the logarithm of labels that are zero; the released code reads them so too.
+The paper's hats denote the ground truth in Eq. 7 and the prediction in Eq. 8 and 10: a divergence of the prediction
+from the truth would need the logarithm of labels that are zero. The released code reads them the same way.
 """
 
 from dataclasses import dataclass
@@ -23,10 +23,10 @@ REGRESSION, SEGMENTATION = 0.5, 1.0
 
 @dataclass(frozen=True, kw_only=True)
 class DaptTargets:
-    """What the losses compare with.
+    """Targets of the losses.
 
-    joints (B, J, 3) m in the network's order, numbers also where nothing is known; weight (B, J): v_i of the paper, 1
-    where a joint is labeled and else 0; part (M,) int64, -1 where it is not known, None where none is asked for.
+    joints (B, J, 3) m in the network's order, finite even if unlabeled; weight (B, J): v_i of the paper, 1 if a joint
+    is labeled, else 0; part (M,) int64, -1 if unknown, None if no loss needs parts.
     """
 
     joints: Tensor
@@ -35,7 +35,7 @@ class DaptTargets:
 
 
 def pretraining(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = one_process) -> dict[str, Tensor]:
-    """Paper: Eq. 9, L_pre = lambda_reg L_reg + lambda_seg L_seg, of the coordinate head and the part head.
+    """Paper: Eq. 9, L_pre = lambda_reg L_reg + lambda_seg L_seg, for the coordinate head and the part head.
 
     Terms "regression" and "segmentation", and "mpjpe" of the coordinates for the log; share: see `objective`.
     """
@@ -50,7 +50,7 @@ def pretraining(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = on
 
 
 def finetuning(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = one_process) -> dict[str, Tensor]:
-    """Paper: Eq. 10, L_ft = L_hm, of the heatmaps alone, where the released code adds a term of the auxiliary head.
+    """Paper: Eq. 10, L_ft = L_hm, for the heatmaps only; the released code adds a term for the auxiliary head.
 
     Terms "heatmap" or "regression", and "mpjpe" of the joints for the log; share: see `objective`.
     """
@@ -64,8 +64,8 @@ def finetuning(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = one
 
 
 def prn(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = one_process) -> dict[str, Tensor]:
-    """Of the neck prn in either stage: distances of refined and of voted joints, and the cross entropy of the joint
-    that a voxel is nearest to, background among them; weights of 1 are ours, none are published."""
+    """Losses of the neck prn in either stage: distances of refined and of voted joints, and the cross entropy of each
+    voxel's nearest joint, with background as a class. The weights of 1 are ours; none are published."""
     coordinates, voted, parts, part = outputs.coordinates, outputs.voted, outputs.parts, targets.part
     assert coordinates is not None and voted is not None and parts is not None and part is not None
     people, labels, voxels = _divisors(targets, share, (part >= 0).sum())
@@ -78,28 +78,30 @@ def prn(outputs: DaptOutputs, targets: DaptTargets, *, share: Share = one_proces
 
 
 def distance_loss(joints: Tensor, targets: DaptTargets, people: Tensor) -> Tensor:
-    """Paper: Eq. 7, sum_i ||J_i - J^_i||_2 v_i / sum_i v_i, its mean over `people`, those with a label. The released
-    code has the square of the distance. joints (B, J, 3) m."""
+    """Paper: Eq. 7, sum_i ||J_i - J^_i||_2 v_i / sum_i v_i, averaged over people with a label.
+
+    The released code squares the distance. joints (B, J, 3) m; people: the number of people with a label.
+    """
     distance, weight = (joints.float() - targets.joints).norm(dim=-1), targets.weight
     return ((distance * weight).sum(1) / at_least_one(weight.sum(1))).sum() / people
 
 
 def segmentation_loss(logits: Tensor, part: Tensor, voxels: Tensor) -> Tensor:
-    """Paper: Eq. 8, the cross entropy of P = K + 1 classes, 0 = background among them, a point a voxel.
+    """Paper: Eq. 8, the cross entropy of P = K + 1 classes, including 0 = background, with one point per voxel.
 
-    logits (M, P); part (M,), -1 where it is not known; voxels: how many are. The paper's sum over a cloud's points is a
-    mean over `voxels` here, as in the released code, so that its weight does not depend on how many points a person
-    has. The released code leaves points that are not of the body unsupervised.
+    logits (M, P); part (M,), -1 if unknown; voxels: the number of voxels with a known part. The paper's sum over a
+    cloud's points is a mean over `voxels` here, as in the released code, so that its weight does not depend on a
+    person's number of points. The released code does not supervise points that are not on the body.
     """
     return F.cross_entropy(logits, part, ignore_index=-1, reduction="sum") / voxels
 
 
 def heatmap_loss(outputs: DaptOutputs, targets: DaptTargets, people: Tensor) -> Tensor:
-    """Paper: Eq. 10, sum over x, y, z and joints of D_KL(h || h^), its mean over `people`, those with a label.
+    """Paper: Eq. 10, sum over x, y, z and joints of D_KL(h || h^), averaged over people with a label.
 
-    Labelled joints are summed (the K + 1 of the paper's sum counts a joint that does not exist). The released code's
-    targets do not sum to 1, and it takes the mean over bins and over joints, so that the finer or longer an axis is,
-    the less it weighs.
+    The sum is over labeled joints (the K + 1 of the paper's sum counts a joint that does not exist). The released
+    code's targets do not sum to 1, and it averages over bins and joints, so that the weight of an axis falls with its
+    number of bins. people: the number of people with a label.
     """
     loss = torch.zeros((), device=people.device)
     heatmaps = (outputs.logits_x, outputs.logits_y, outputs.logits_z)
@@ -112,10 +114,10 @@ def heatmap_loss(outputs: DaptOutputs, targets: DaptTargets, people: Tensor) -> 
 
 
 def log_gaussian(place: Tensor, bins: int) -> Tensor:
-    """place (...) in bins -> (..., W): logarithm of a Gaussian of `SIGMA` bins about it that sums to 1.
+    """place (...) in bins -> (..., W): logarithm of a Gaussian centered on it, `SIGMA` bins wide, that sums to 1.
 
-    A joint beyond the range counts as in the outermost bin, where decoding reports it as out of range
-    (`decode.out_of_range`); the released code's target for it fades to nothing.
+    A joint beyond the range is assigned to the outermost bin, where decoding reports it as out of range
+    (`decode.out_of_range`); in the released code its target fades to zero.
     """
     index = torch.arange(bins, device=place.device)
     distance = (index - place.clamp(0, bins - 1)[..., None]) / SIGMA
@@ -128,6 +130,6 @@ def _mpjpe(joints: Tensor, targets: DaptTargets, labels: Tensor) -> Tensor:
 
 
 def _divisors(targets: DaptTargets, share: Share, *extra_counts: Tensor) -> tuple[Tensor, ...]:
-    """How many people have a label, how many labels there are, and extra counts, shared all at once."""
+    """The number of people with a label, the number of labels, and extra counts, reduced by `share` in one call."""
     counts = ((targets.weight.sum(1) > 0).sum(), targets.weight.sum(), *extra_counts)
     return at_least_one(share(torch.stack([count.float() for count in counts]))).unbind()

@@ -1,4 +1,4 @@
-"""`DaptObjective`: what the loop must know of the paper's network, in either of its stages.
+"""`DaptObjective`: the training objective of the paper's network, in either of its stages.
 
 Legend: B people, J joints of the network, M voxels of level 0.
 """
@@ -21,9 +21,9 @@ from lidarpose.train.objectives.objective import Share, in_body26, majority_part
 from lidarpose.train.recipes import SMALL_PAPER, TINY_PAPER
 
 STAGES = ("pretrain", "finetune")
-# outputs of heads
+# names of the heads' outputs
 _HEADS = ("logits_x", "logits_y", "logits_z", "inter", "parts", "coordinates")
-# a voxel is a joint's within this distance of it, m: the released code's, for the neck prn
+# for the neck prn, a voxel belongs to a joint within this distance, m, as in the released code
 PRN_RADIUS = 0.1
 
 
@@ -31,9 +31,9 @@ PRN_RADIUS = 0.1
 class DaptArrays:
     """A batch of people.
 
-    tables: what the network reads; joints (B, J, 3) float32 m in the network's order, NaN where there is no label;
-    part (M,) int64: the part most of a voxel's points are of, -1 where none is known; for the neck prn 1 + the number
-    of the joint nearest to the voxel, 0 for background; None in fine-tuning with other necks.
+    tables: the network's inputs; joints (B, J, 3) float32 m in the network's order, NaN if unlabeled; part (M,) int64:
+    the part of most of a voxel's points, -1 if none is known; for the neck prn 1 + the index of the joint nearest to
+    the voxel, 0 for background; None in fine-tuning with other necks.
     """
 
     tables: Tables
@@ -53,9 +53,9 @@ class DaptArrays:
 class DaptObjective:
     """The `Objective` of a `DaptNet` with this configuration.
 
-    stage: "pretrain", which needs coordinates and parts, or "finetune", which learns heatmaps, or coordinates where
-    there are none; the neck prn learns the same in both; layout: of the tables, "ragged" for CPUs and "padded" for
-    accelerators. Heads that a stage does not use get a gradient of zero. Raises InputError where the configuration
+    stage: "pretrain", which needs coordinates and parts, or "finetune", which learns heatmaps, or coordinates if the
+    network has no heatmaps; the neck prn learns the same in both. layout: of the tables, "ragged" for CPUs and "padded"
+    for accelerators. Heads that a stage does not use get a gradient of zero. Raises InputError if the configuration
     lacks a head.
     """
 
@@ -77,11 +77,12 @@ class DaptObjective:
         return DaptNet(self.config)
 
     def collate(self, examples: list[Example]) -> DaptArrays:
-        """Of each voxel one random point is kept, as in the released code, drawn from the person's own seed.
+        """Collates a batch; one random point per voxel is kept, as in the released code, drawn with the sample's seed.
 
-        So no cloud depends on its batch mates, nor on the order of its points. The curves of people of more than
-        `config.patch` voxels are shuffled by all seeds of the batch; smaller people attend in full, whatever the curve.
-        A voxel's part is that of most of its points, where the released code takes the kept point's.
+        So no cloud depends on the other samples of its batch, nor on the order of its points. For clouds of more than
+        `config.patch` voxels, the space-filling curves are shuffled with all seeds of the batch; smaller clouds use
+        full attention, whatever the curve. A voxel's part is that of most of its points; the released code takes the
+        part of the point that is kept.
         """
         samples = [_thinned(example, self.config.grid) for example in examples]
         tables = build_tables(
@@ -90,7 +91,7 @@ class DaptObjective:
             layout=self.layout,
             rng=np.random.default_rng([example.seed for example in examples]),
         )
-        # the last entry: of the stand-in for an empty cloud
+        # the last entry is for the placeholder of an empty cloud
         part = np.concatenate([*(part for _, part in samples), [UNKNOWN_PART]])
         joints = np.stack([example.joints for example in examples])[:, self.config.columns].astype(np.float32)
         if self.config.neck == "prn":
@@ -103,12 +104,12 @@ class DaptObjective:
     def terms(
         self, network: Callable, arrays: DaptArrays, *, device: torch.device | str = "cpu", share: Share = one_process
     ) -> dict[str, Tensor]:
-        """`dapt_losses.pretraining`, `finetuning` or `prn`. A joint's weight is 1 where it is labeled, seen or not, as
+        """`dapt_losses.pretraining`, `finetuning` or `prn`. A labeled joint's weight is 1, whether visible or not, as
         in the released code."""
         outputs, targets = network(to_tensors(arrays.tables, device)), arrays.targets(device)
         losses = prn if self.config.neck == "prn" else pretraining if self.stage == "pretrain" else finetuning
         terms = losses(outputs, targets, share=share)
-        # zero, of all heads, used or not: processes that average gradients wait for all of them
+        # adds zero times every head's output: gradient averaging across processes waits for all heads, used or not
         first_term = next(iter(terms))
         heads = [value for name in _HEADS if (value := getattr(outputs, name)) is not None]
         terms[first_term] = sum((value.float().sum() * 0 for value in heads), terms[first_term])
@@ -116,7 +117,7 @@ class DaptObjective:
 
     @torch.no_grad()
     def joints(self, network: Callable, arrays: DaptArrays, *, device: torch.device | str = "cpu") -> np.ndarray:
-        """Of the heatmaps; in pre-training of the coordinates, which are what it teaches."""
+        """Joints decoded from the heatmaps; in pre-training, those of the coordinate head, which it trains."""
         outputs = network(to_tensors(arrays.tables, device))
         joints = outputs.coordinates if self.stage == "pretrain" else outputs.joints()
         return in_body26(joints, self.config.columns)
@@ -126,18 +127,20 @@ _MENDED: dict[str, Any] = dict.fromkeys(RELEASED_FAULTS, False)
 
 
 def pretraining_config() -> DaptConfig:
-    """The paper's network before fine-tuning, with the released code's faults mended."""
+    """The paper's network before fine-tuning, with the released code's faults fixed."""
     return replace(named_config("pretrain"), **_MENDED)
 
 
 def finetuning_config(dataset: str) -> DaptConfig:
-    """The paper's network for a dataset, with the faults of the released code mended and no auxiliary head: waymo,
-    humanm3, lidarhuman26m or sloper4d. Raises InputError for another name."""
+    """The paper's network for a dataset, with the released code's faults fixed and without an auxiliary head.
+
+    dataset: waymo, humanm3, lidarhuman26m or sloper4d. Raises InputError for another name.
+    """
     return replace(named_config(dataset), auxiliary=False, **_MENDED)
 
 
 def small(config: DaptConfig) -> DaptConfig:
-    """The same design, joints and heads with a fortieth of the weights: levels of 4, 8 and 16 cm. For CPUs."""
+    """The same design, joints and heads with a fortieth of the weights and levels of 4, 8 and 16 cm, for CPUs."""
     return replace(
         config,
         name=f"small-{config.name}",
@@ -155,8 +158,10 @@ def small(config: DaptConfig) -> DaptConfig:
 
 
 def tiny(config: DaptConfig) -> DaptConfig:
-    """The same with a hundredth of the weights: levels of 6, 12 and 24 cm; two heads in the neck, where nothing
-    is dropped, for which attention on CPUs has no fast way."""
+    """The same with a hundredth of the weights and levels of 6, 12 and 24 cm.
+
+    The neck has two heads and no dropout, since attention with dropout has no fast implementation on CPUs.
+    """
     return replace(
         small(config),
         name=f"tiny-{config.name}",
@@ -173,13 +178,13 @@ def tiny(config: DaptConfig) -> DaptConfig:
     )
 
 
-# by the name of a reduced size
+# reduced sizes by name
 REDUCED = {SMALL_PAPER: small, TINY_PAPER: tiny}
 
 
 def nearest_joints(points: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """points (M, 3) m, joints (M, J, 3) m of each point's person, NaN where unknown -> (M,) int64: 1 + the number of
-    the nearest joint within `PRN_RADIUS`, 0 for background, -1 for people without any label."""
+    """points (M, 3) m, joints (M, J, 3) m of each point's person, NaN if unknown -> (M,) int64: 1 + the index of the
+    nearest joint within `PRN_RADIUS`, 0 for background, -1 for people without any label."""
     distance = np.linalg.norm(joints - points[:, None], axis=-1)
     is_known = np.isfinite(distance)
     distance = np.where(is_known, distance, np.inf)
@@ -188,9 +193,9 @@ def nearest_joints(points: np.ndarray, joints: np.ndarray) -> np.ndarray:
 
 
 def _thinned(example: Example, grid: float) -> tuple[np.ndarray, np.ndarray]:
-    """A random point of each voxel (m, 3), and the part that most of the voxel's points are of (m,).
+    """A random point of each voxel (m, 3), and the part of most of the voxel's points (m,).
 
-    Cells as in `build_tables`, which then finds one point in each.
+    The cells are those of `build_tables`, which then finds one point in each.
     """
     points = np.asarray(example.points, np.float32).reshape(-1, 3)
     part = np.asarray(example.part, np.int64)

@@ -1,5 +1,5 @@
-"""`DetectorObjective`: people's candidates against the hardest of nobody's, and where the people are; and the share of
-people who are missed on whole scans that training never shows.
+"""`DetectorObjective`: classifies candidates with hard negative mining and regresses boxes of people; and the miss rate
+on held-out whole scans.
 
 Legend: K candidates of a batch.
 """
@@ -20,12 +20,12 @@ from lidarpose.models.detector.render import render
 from lidarpose.train.detector.candidate_source import IGNORE, NOBODY, DetectorExample
 from lidarpose.train.objectives.objective import Share, at_least_one, on_device, one_process
 
-# weights; distances are in meters
+# loss weights; distances are in meters
 PERSON, OFFSET, FOOT, HEIGHT, MOUNTED = 1.0, 2.0, 1.0, 1.0, 0.5
-# nobody's candidates that are learned from: of the largest loss, for each of people's and for each scan; and at random,
-# a share of the rest
+# negatives that are learned from: numbers of those with the largest loss, per positive and per scan; and the share of
+# the rest, drawn at random
 HARD, HARD_OF_SCAN, EASY = 1.5, 4, 0.1
-# in validation, the false people a scan at which people are counted
+# false positives per scan at which the miss rate is measured in validation
 FALSE_PER_SCAN = 1.0
 
 
@@ -39,10 +39,10 @@ class DetectorObjective:
         return DetectorNet(self.config)
 
     def collate(self, examples: list[DetectorExample]) -> dict[str, np.ndarray]:
-        """The network's inputs as float16, which halves what goes between processes; labels (K, ...) of all scans one
-        after the other, and scan (K,), of which each is."""
+        """The network's inputs as float16, which halves the data sent between processes; labels (K, ...) of all scans,
+        concatenated; and scan (K,), the index of each candidate's scan."""
         renders = [render(example.candidates, example.augmentation) for example in examples]
-        # torch rounds ten times as fast as numpy
+        # torch converts to float16 ten times as fast as numpy
         arrays = {
             name: torch.as_tensor(np.concatenate([scan[name] for scan in renders])).half().numpy() for name in INPUTS
         }
@@ -53,7 +53,7 @@ class DetectorObjective:
     def terms(
         self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = one_process
     ) -> dict[str, Tensor]:
-        """Cross entropy of people's candidates and of the hard ones of nobody's; distances and height of people's."""
+        """Cross entropy of positives and of selected negatives; errors of position and height of positives."""
         tensors = on_device(arrays, device)
         inputs = [tensors[name].float() for name in INPUTS]
         person = tensors["person"]
@@ -92,19 +92,19 @@ class DetectorObjective:
 
 
 def training_rows(logit: Tensor, person: Tensor, scan: Tensor) -> Tensor:
-    """Rows to learn from, by logits (K,): all people's, the hardest of nobody's, and some at random, by torch's
-    generator."""
+    """Rows to learn from, given logits (K,): all positives, the hardest negatives, and some random negatives, drawn
+    with torch's generator."""
     positives, negatives = (person >= 0).nonzero()[:, 0], (person == NOBODY).nonzero()[:, 0]
     scans = int(scan.max()) + 1 if len(scan) else 0
     hard_count = min(round(HARD * len(positives)) + HARD_OF_SCAN * scans, len(negatives))
-    # the loss of somebody who is not there rises with the logit
+    # the loss of a negative rises with its logit
     order = negatives[logit[negatives].argsort(descending=True)]
     easy = order[hard_count:]
     return torch.cat([positives, order[:hard_count], easy[torch.rand(len(easy), device=easy.device) < EASY]])
 
 
 def average_precision(logit: Tensor, is_person: Tensor) -> Tensor:
-    """Mean precision over the ranks of the true ones; 0 where there are none."""
+    """Mean precision over the ranks of the positives; 0 if there are none."""
     hits = is_person[logit.argsort(descending=True)].float()
     precision = hits.cumsum(0) / torch.arange(1, len(hits) + 1, device=hits.device)
     return (precision * hits).sum() / hits.sum().clamp(min=1)
@@ -113,7 +113,10 @@ def average_precision(logit: Tensor, is_person: Tensor) -> Tensor:
 def missed_people(
     objective: DetectorObjective, network: nn.Module, examples: Sequence[DetectorExample], batch: int
 ) -> tuple[float, None]:
-    """Per cent of the people who have candidates who are missed at `FALSE_PER_SCAN` false ones a scan; no batches."""
+    """Percentage of the people with candidates that are missed at `FALSE_PER_SCAN` false positives per scan.
+
+    batch: not used.
+    """
     device = next(network.parameters()).device
     false_logits: list[np.ndarray] = []
     best_logits: list[np.ndarray] = []
@@ -129,8 +132,10 @@ def missed_people(
 
 
 def share_missed(false_logits: Sequence[np.ndarray], best_logits: Sequence[np.ndarray]) -> float:
-    """Per cent of people who are missed at `FALSE_PER_SCAN` false ones a scan, by the logits of the false ones and the
-    best of each person, (n,) of each scan."""
+    """Percentage of people that are missed at `FALSE_PER_SCAN` false positives per scan.
+
+    false_logits: (n,) per scan, logits of the false positives; best_logits: (n,) per scan, each person's highest logit.
+    """
     false_ranking = np.sort(np.concatenate([*false_logits, [-np.inf]]))[::-1]
     threshold = false_ranking[min(round(FALSE_PER_SCAN * len(false_logits)), len(false_ranking) - 1)]
     person_logits = np.concatenate([*best_logits, np.zeros(0)])

@@ -1,4 +1,4 @@
-"""`PoseNetObjective`: what the package's own network minimizes.
+"""`PoseNetObjective`: the losses of the package's own network.
 
 Legend: B people, J joints, N fine voxels, W heatmap bins, P parts.
 """
@@ -20,15 +20,15 @@ from lidarpose.skeleton import BODY26
 from lidarpose.train.augment import Example
 from lidarpose.train.objectives.objective import Share, at_least_one, majority_part, one_process
 
-# most fine voxels a person in training
+# maximum number of fine voxels per person in training
 MAX_VOXELS = 224
-# weights; distances are in meters, so a weight of 10 brings 10 cm to order one
+# loss weights; distances are in meters, so a weight of 10 brings 10 cm to order one
 VOTE, JOINTS, LEVEL, HEATMAP, PART, CONFIDENCE, SPREAD, VISIBLE = 10.0, 5.0, 2.0, 0.25, 0.25, 0.1, 0.05, 0.05
-# of what learns apart from all else
+# weight of the person head, whose loss has no effect on the rest of the network
 PERSON = 1.0
-# width of the heatmap's target: 1.2 bins
+# width of the heatmap's target, m: 1.2 bins
 SIGMA = 0.036
-# bones as pairs (parent, child), and pairs of bones that mirror each other
+# bones as pairs (parent, child), and pairs of left and right bones
 _BONES = torch.tensor(BODY26.bones)
 _PAIRS = torch.tensor(
     [
@@ -42,7 +42,8 @@ _PAIRS = torch.tensor(
 def training_voxels(
     clouds: list[np.ndarray], view: np.ndarray, seeds: np.ndarray, config: NetworkConfig
 ) -> VoxelPyramid:
-    """The voxels of examples' clouds (n, 3) m, as many as memory holds; view (B, 5); seeds (B,): of what is drawn."""
+    """The voxels of examples' clouds (n, 3) m, at most `MAX_VOXELS` fine ones each; view (B, 5); seeds (B,): for the
+    random draws."""
     return voxelize(
         np.concatenate(clouds),
         np.array([len(cloud) for cloud in clouds]),
@@ -95,17 +96,18 @@ class PoseNetObjective:
 def losses(
     outputs: Outputs, targets: Targets, *, share: Share = one_process, bone: float = 0.0, symmetry: float = 0.0
 ) -> dict[str, Tensor]:
-    """Each term, weighted, by name; their sum is what is minimized. "mpjpe" (meters) is for the log alone.
+    """Weighted loss terms by name; their sum is minimized. "mpjpe" (meters) is for the log only.
 
-    All are means over the joints whose truth is known; share: see `objective`; bone, symmetry: weights of terms on the
-    lengths of bones whose ends are known, and on the difference of left and right ones, known or not. Paper: L_reg is
-    here the mean distance of votes, of decoded joints and of the coarser levels' joints (the released code squares it);
-    L_hm a cross entropy against normalized targets, axes alike; L_seg with background as a class.
+    Joint terms are means over labeled joints; share: see `objective`; bone, symmetry: weights of terms on the lengths
+    of bones whose ends are labeled, and on the length difference of left and right bones, labeled or not. Paper: L_reg
+    is here the mean distance of votes, of decoded joints and of the coarser levels' joints (the released code squares
+    it); L_hm a cross entropy against normalized targets with equal weights of the axes; L_seg has background as a
+    class.
     """
     is_labeled = targets.known.float()
     truth = torch.where(targets.known[..., None], targets.joints, 0.0)
     labels = at_least_one(share(is_labeled.sum()))
-    # of joints with a label, those whose visibility is known
+    # labeled joints whose visibility is known
     visibility = targets.visible.float()
     has_visibility = is_labeled * ~visibility.isnan()
 
@@ -126,7 +128,7 @@ def losses(
         "level": LEVEL * sum((mean((j.float() - truth).norm(dim=-1)) for j in outputs.level_joints), torch.zeros(())),
         "part": PART * over(part, (targets.part >= 0).sum().float()),
         "confidence": CONFIDENCE * mean(_binary(outputs.confidence, is_hit)),
-        # log-likelihood of an exponential law: its mean, exp(log_spread), becomes the expected distance
+        # negative log-likelihood of an exponential distribution; its mean, exp(log_spread), fits the expected distance
         "spread": SPREAD * mean(log_spread + distance * torch.exp(-log_spread)),
         "visible": VISIBLE * over((visible_loss * has_visibility).sum(), has_visibility.sum()),
         "mpjpe": mean(distance),
@@ -151,7 +153,7 @@ def losses(
 def _lengths(
     joints: Tensor, truth: Tensor, is_labeled: Tensor, share: Share, bone: float, symmetry: float
 ) -> dict[str, Tensor]:
-    """Mean errors of bones' lengths, and mean differences between the two sides."""
+    """Mean errors of bone lengths, and mean length differences between the two sides, weighted."""
     parent, child = _BONES.to(joints.device).unbind(1)
     length = (joints[:, parent] - joints[:, child]).norm(dim=-1)
     terms = {}

@@ -1,4 +1,4 @@
-"""`VerifierObjective`: whether a detection is a person, and whether they ride, by a network that learns nothing else.
+"""`VerifierObjective`: trains a network that only tells whether a detection is a person, and whether it is mounted.
 
 Legend: K detections of a batch of scans, G groups of them.
 """
@@ -19,15 +19,15 @@ from lidarpose.train.objectives.detector_objective import average_precision, sha
 from lidarpose.train.objectives.objective import Share, at_least_one, one_process
 from lidarpose.train.objectives.posenet_objective import training_voxels
 
-# weight of whether people ride or sit in wheelchairs
+# weight of the loss of "mounted": the person rides or sits in a wheelchair
 MOUNTED = 0.5
-# detections of like size that are computed together: a batch costs as much as if all were its largest
+# detections of similar size that are computed together: clouds are padded to the largest of their group
 _GROUP = 32
 
 
 @dataclass(frozen=True, kw_only=True)
 class VerifierObjective:
-    """The objective of a `PoseNet` of which `person` alone is used: logits of a person, and of one who is mounted."""
+    """The objective of a `PoseNet` of which only `person` is used: the logits of a person and of a mounted one."""
 
     config: NetworkConfig
 
@@ -35,8 +35,8 @@ class VerifierObjective:
         return PoseNet(self.config)
 
     def collate(self, examples: list[CropExample]) -> list[dict[str, np.ndarray]]:
-        """G groups of the detections of all scans, by size: the arrays of a `VoxelPyramid`, and "person" (K, 2)
-        float32: 1 for people, and for those who are mounted."""
+        """G groups of the detections of all scans, sorted by size: the arrays of a `VoxelPyramid`, and "person" (K, 2)
+        float32: whether the detection is a person, and a mounted one."""
         clouds = [cloud for example in examples for cloud in example.clouds]
         view = np.concatenate([example.view for example in examples])
         person = np.concatenate([example.person for example in examples]) != NOBODY
@@ -54,7 +54,7 @@ class VerifierObjective:
     def terms(
         self, network: Callable, arrays: list[dict], *, device: torch.device | str = "cpu", share: Share = one_process
     ) -> dict[str, Tensor]:
-        """Cross entropy of the K detections, and of people's being mounted."""
+        """Cross entropy of "person" over the K detections, and of "mounted" over the people among them."""
         logits = torch.cat([self._logits(network, group, device) for group in arrays])
         labels = torch.cat([torch.as_tensor(group["person"]).to(device) for group in arrays])
         person, mounted = F.binary_cross_entropy_with_logits(logits, labels, reduction="none").unbind(1)
@@ -79,8 +79,8 @@ class VerifierObjective:
 def missed_by_verifier(
     objective: VerifierObjective, network: nn.Module, examples: Sequence[CropExample], batch: int
 ) -> tuple[float, None]:
-    """Per cent of the people among the detections who are missed at `detector_objective.FALSE_PER_SCAN` false people a
-    scan, by the verifier alone. batch: not used."""
+    """Percentage of the people among the detections that the verifier's score alone misses at
+    `detector_objective.FALSE_PER_SCAN` false positives per scan. batch: not used."""
     device = next(network.parameters()).device
     false_logits: list[np.ndarray] = []
     best_logits: list[np.ndarray] = []
