@@ -103,7 +103,7 @@ def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...
     body = re.sub(r"(?<![^,;\s])'|'(?![^,;\s])", "", parts[num_skipped]) if len(parts) > num_skipped else ""
     # finds decimal commas that the first line does not show: 1e-05 there and 0,5 on a later line
     if separator != "," and "," in body:
-        # blanks allowed in a cell, but none that could be a separator: in a long run each could be either, which is slow
+        # blanks allowed within a cell, except those that could be a separator: a long run would be matched in many ways
         edge, blanks = separator or r"[ \t]", {None: "", "\t": " *"}.get(separator, r"[ \t]*")
         if re.search(rf"(?m)(?:^|{edge}){blanks}[-+]?\d*,\d+(?:[eE][-+]?\d+)?{blanks}(?:{edge}|$)", body):
             decimal = ","
