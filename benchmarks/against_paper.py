@@ -38,8 +38,9 @@ from lidarpose.train.setup import make_setup
 
 @dataclass(frozen=True)
 class Way:
-    """How the paper's network is trained. rates: learning rates of the two stages; anchors: whether anchors are kept
-    between the stages; recipe: changes of the recipe; one_stage: all people train heatmaps, at the second rate."""
+    """How the paper's network is trained. scene: the scene of the training people; rates: learning rates of the two
+    stages; anchors: whether anchors are kept between the stages; recipe: changes of the recipe; one_stage: all people
+    train heatmaps, at the second rate."""
 
     what: str
     scene: str = "paper"
