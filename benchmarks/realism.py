@@ -8,7 +8,7 @@ is compared with `--people` people of the scene `wild`, scanned with the same se
 
     points        in the box
     rings         rows of the sensor with at least two points
-    ring step     median third of |r[i-1] - 2 r[i] + r[i+1]| along a ring, on the upper body: noise and curvature, m
+    ring step     third of the median |r[i-1] - 2 r[i] + r[i+1]| along a ring, upper body: noise and curvature, m
     ring offset   median distance from a ring's points to the mean of the rings above and below, upper body, m
     ground        share of the points within 10 cm of the box's bottom edge
     wide, tall    extent of the points across the line of sight and in height, m
