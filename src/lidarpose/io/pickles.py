@@ -22,7 +22,7 @@ import numpy as np
 
 from lidarpose.io.files import FormatError, file_error, read_bytes, shorten
 
-# files of labels or body models are not larger; the content is in memory up to three times
+# larger files are not labels or body models, and their content would be in memory three times
 MAX_BYTES = 4 * 2**30
 # maximum nesting depth of lists and dicts (chosen: data sets have less than ten levels)
 MAX_DEPTH = 100

@@ -46,7 +46,7 @@ def open_recording(path: Path, options: ReadingOptions) -> "VelodyneRecording":
 class VelodyneRecording(PacketRecording):
     """A capture of a Velodyne sensor's packets; a frame's time is the time of capture.
 
-    The packets name the model, whose nominal beam angles are used; an HDL-64E sends its own calibration in its packets.
+    The packets name the model, whose beam angles are used; an HDL-64E sends its own calibration in its packets.
     """
 
     def __init__(self, path: Path):
