@@ -1,4 +1,4 @@
-"""Networks that lack one thing each, for `ablations.py`."""
+"""Networks that each lack one component, for `ablations.py`."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ LEVELS = ("coarse", "mid", "fine")
 
 
 class Unread(nn.Module):
-    """An exchange whose anchors read no voxels, only each other."""
+    """An exchange whose anchors attend only to each other, not to voxels."""
 
     def __init__(self, exchange: Exchange):
         super().__init__()
@@ -38,7 +38,7 @@ class Unread(nn.Module):
 
 
 class Pooled(Unread):
-    """An exchange that gives all anchors the same: mean and maximum of the level's voxels."""
+    """An exchange that gives all anchors the same input: mean and maximum of the level's voxels."""
 
     def __init__(self, exchange: Exchange, voxel_channels: int):
         super().__init__(exchange)
@@ -54,7 +54,7 @@ class Pooled(Unread):
 
 
 def pooled(config: NetworkConfig) -> PoseNet:
-    """Joints from pooled features instead of anchors that look for their own evidence."""
+    """A network that predicts joints from pooled features instead of anchors with attention to the voxels."""
     network = PoseNet(config)
     fine, mid, coarse = config.channels
     levels = zip(network.exchanges, (coarse, mid, fine), strict=True)
@@ -63,7 +63,7 @@ def pooled(config: NetworkConfig) -> PoseNet:
 
 
 def reading(*levels: str):
-    """A network whose anchors read these levels alone."""
+    """A factory of networks whose anchors attend only to the voxels of these levels."""
 
     def make_network(config: NetworkConfig) -> PoseNet:
         network = PoseNet(config)
@@ -77,7 +77,7 @@ def reading(*levels: str):
 
 
 class Uncounted(PoseNet):
-    """Voxels whose number of points nobody is told."""
+    """A network that does not get the number of points of the voxels."""
 
     def forward(self, batch: Batch):
         blank = {
@@ -88,7 +88,7 @@ class Uncounted(PoseNet):
 
 
 class Unplaced(PoseNet):
-    """A person of whom nobody is told from where, and from how far, they are seen."""
+    """A network that does not get the direction and distance of the sensor."""
 
     def forward(self, batch: Batch):
         return super().forward(replace(batch, view=torch.zeros_like(batch.view)))

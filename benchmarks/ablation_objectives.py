@@ -1,4 +1,4 @@
-"""What could be worth more than people: other losses and other ways of choosing people, for `ablations.py`.
+"""Alternatives to training on more people: other losses and other selections of people, for `ablations.py`.
 
 Legend: B people, J joints, N fine voxels, K voxels near a joint.
 """
@@ -24,19 +24,19 @@ from lidarpose.train.objectives.baseline_objective import point_labels
 from lidarpose.train.objectives.objective import Share, at_least_one, one_process
 from lidarpose.train.objectives.posenet_objective import PoseNetObjective, losses
 
-# voxels that refine a joint
+# number of voxels that refine a joint
 NEAR = 16
-# m: voxels farther from a joint look as far as this; what is padding lies farther than FAR
+# m: offsets of voxels from a joint are clipped to WIDEST; padding is farther than FAR
 WIDEST, FAR = 2.0, 1e3
-# weights of the losses of `PointJoints`, as its counterparts in `posenet_objective` are weighted
+# weights of the losses of `PointJoints`, as for their counterparts in `posenet_objective`
 LABEL, OFFSET = 0.25, 2.0
-# weight of the distance between a person's pose and that of their mirror image
+# weight of the distance between the poses of a person and of the person's mirror image
 CONSISTENCY = 2.0
-# share of a batch whose loss is added to that of all
+# share of a batch whose loss is averaged with the loss of the whole batch
 HARDEST = 0.25
-# terms on joints, which a teacher's joints may stand in for
+# terms of joints, for which a teacher's joints may replace the labels
 _OF_JOINTS = ("joints", "level", "vote", "heatmap")
-# prefix of the arrays of mirror images
+# prefix of the names of the mirror images' arrays
 _IMAGE = "image."
 _FLIP = list(BODY26.flip)
 _ACROSS = np.array([1, -1, 1], np.float32)
@@ -44,7 +44,7 @@ _ACROSS = np.array([1, -1, 1], np.float32)
 
 @dataclass(frozen=True, kw_only=True)
 class VariantObjective(PoseNetObjective):
-    """`PoseNetObjective` of a network that may lack something, or have something more."""
+    """`PoseNetObjective` for a network that may lack a component or have an additional one."""
 
     made: Callable[[NetworkConfig], nn.Module] = PoseNet
 
@@ -52,13 +52,13 @@ class VariantObjective(PoseNetObjective):
         return self.made(self.config)
 
 
-# ---- every point's own joint, and joints refined by the points near them
+# ---- nearest joint of each point, and joints refined by nearby points
 
 
 class LocalVoteHead(VoteHead):
-    """Votes, moved by what the voxels nearest to them say: local refinement of each joint.
+    """A vote head with local refinement: each vote is moved by an offset predicted from the voxels nearest to it.
 
-    After the refinement of PRN (LiDAR-HMR), whose points vote for the joint nearest to them.
+    Follows the refinement of PRN (LiDAR-HMR), whose points vote for their nearest joint.
     """
 
     def __init__(self, channels: int, voxel_channels: int, joints: int):
@@ -76,7 +76,7 @@ class LocalVoteHead(VoteHead):
     def forward(self, anchors: Tensor, voxels: Tensor, position: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
         vote, features = super().forward(anchors, voxels, position, bias)
         start = vote.detach()
-        # padding is far off
+        # the bias of padding makes its distance large
         distance, index = (torch.cdist(start, position) - bias[:, 0]).topk(min(NEAR, position.shape[1]), largest=False)
         people, n, _ = position.shape
         rows = (index + n * torch.arange(people, device=index.device)[:, None, None]).flatten()
@@ -90,7 +90,7 @@ class LocalVoteHead(VoteHead):
 
 
 def with_point_joints(config: NetworkConfig) -> PoseNet:
-    """A network whose fine voxels also say which joint is nearest to them, and where it is."""
+    """A network whose fine voxels also predict which joint is nearest to them, and the offset to it."""
     network = PoseNet(config)
     joints = len(network.skeleton)
     network.part = nn.Linear(config.channels[0], config.parts + joints + 1 + 3)
@@ -98,7 +98,7 @@ def with_point_joints(config: NetworkConfig) -> PoseNet:
 
 
 def with_local_refinement(config: NetworkConfig) -> PoseNet:
-    """`with_point_joints`, its votes refined by the voxels near them."""
+    """`with_point_joints`, with votes refined by nearby voxels."""
     network = with_point_joints(config)
     fine, mid, _ = config.channels
     network.vote = LocalVoteHead(mid, fine, len(network.skeleton))
@@ -107,11 +107,11 @@ def with_local_refinement(config: NetworkConfig) -> PoseNet:
 
 @torch.no_grad()
 def grown(network: PoseNet, made: Callable[[NetworkConfig], PoseNet]) -> PoseNet:
-    """A network of one of the two kinds above that answers as a trained one does; what is new is random."""
+    """A network of one of the two kinds above with the weights of a trained network; new weights are random."""
     larger = made(network.config)
     state = larger.state_dict()
     for name, value in network.state_dict().items():
-        # of each voxel's outputs the parts come first
+        # the parts are the first of each voxel's outputs
         state[name][: len(value)] = value
     larger.load_state_dict(state)
     return larger.train()
@@ -119,7 +119,8 @@ def grown(network: PoseNet, made: Callable[[NetworkConfig], PoseNet]) -> PoseNet
 
 @dataclass(frozen=True, kw_only=True)
 class PointJoints(VariantObjective):
-    """Of networks `with_point_joints`: the cross entropy of each voxel's joint and the distance to it besides."""
+    """Objective of networks `with_point_joints`, with additional losses: the cross entropy of each voxel's nearest
+    joint and the error of the offset to it."""
 
     def terms(
         self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = one_process
@@ -131,7 +132,7 @@ class PointJoints(VariantObjective):
         terms = losses(replace(outputs, part=part), targets, share=share)
         true = torch.where(targets.known[..., None], targets.joints, 0.0)
         nearest_joint, to_joint = point_labels(batch.fine.position, batch.fine.valid, true, targets.known)
-        # things near a joint are nobody's
+        # voxels of objects near a joint get the class without a joint
         nearest_joint = nearest_joint.masked_fill((targets.part == 0) & batch.fine.valid, count).masked_fill(
             targets.part < 0, -1
         )
@@ -149,8 +150,8 @@ class PointJoints(VariantObjective):
 
 @dataclass(frozen=True, kw_only=True)
 class HardestPeople(VariantObjective):
-    """The mean of the loss of a batch and of that of the quarter of its people with the largest errors, each of whom
-    weighs five times as much as another."""
+    """The mean of a batch's loss and the loss of the quarter of its people with the largest errors. Each of these
+    people has five times the weight of another person."""
 
     def terms(
         self, network: Callable, arrays: dict, *, device: torch.device | str = "cpu", share: Share = one_process
@@ -167,7 +168,7 @@ class HardestPeople(VariantObjective):
 
 
 def of_people(tensors: Any, rows: Tensor) -> Any:
-    """`Outputs` or `Targets` of these people of a batch."""
+    """The `Outputs` or `Targets` of the given people of a batch."""
 
     def taken(value: Any) -> Any:
         if isinstance(value, tuple):
@@ -182,8 +183,8 @@ def of_people(tensors: Any, rows: Tensor) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class MirroredPairs(VariantObjective):
-    """Every other person of a batch is left out for the mirror image of the one before; the poses of both are drawn
-    to each other. As many people pass through the network as without it."""
+    """Every second person of a batch is replaced with the mirror image of the person before, and a loss pulls the two
+    poses together. The number of people that pass through the network is unchanged."""
 
     def collate(self, examples: list[Example]) -> dict[str, np.ndarray]:
         originals = examples[::2]
@@ -201,7 +202,7 @@ class MirroredPairs(VariantObjective):
 
 
 def mirrored(example: Example) -> Example:
-    """The person across the plane y = 0 of their own frame."""
+    """The person mirrored at the plane y = 0 of the person's frame."""
     return replace(
         example,
         points=example.points * _ACROSS,
@@ -213,7 +214,7 @@ def mirrored(example: Example) -> Example:
 
 
 def mirrored_joints(joints: Tensor) -> Tensor:
-    """joints (B, J, 3) m across the same plane."""
+    """joints (B, J, 3) m, mirrored at the same plane."""
     return joints[:, _FLIP] * torch.as_tensor(_ACROSS, device=joints.device)
 
 
@@ -222,8 +223,8 @@ def mirrored_joints(joints: Tensor) -> Tensor:
 
 @dataclass(frozen=True, kw_only=True)
 class Taught(VariantObjective):
-    """Half of the losses on joints are distances to those of a bundled network, the mean of two looks: the person and
-    their mirror image."""
+    """Half of the weight of the losses on joints is for the joints of a bundled network, the mean of its predictions
+    for the person and for the mirror image."""
 
     teacher: str = "small"
 

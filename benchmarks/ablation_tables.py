@@ -1,8 +1,9 @@
-"""Tables of runs that differ in one thing each, from the scores of ablations.py and against_paper.py.
+"""Tables of runs that each differ in one change, from the scores of ablations.py and against_paper.py.
 
-A difference to `base` is an effect of an additive model: error = variant + seed + noise, by least squares over all runs
-of one length. A seed shows all variants the same people, so its effect is shared; the noise, taken as alike for all
-variants, is what is left. The 95 % interval is Student's with the degrees of freedom that are left.
+A difference to `base` is an effect in an additive model: error = variant + seed + noise, fitted by least squares to all
+runs of one length. With the same seed all variants train on the same people, so the seed's effect is shared. The noise
+is the residual, assumed equal for all variants. The 95 % interval is from Student's t distribution with the remaining
+degrees of freedom.
 """
 
 import json
@@ -18,7 +19,7 @@ BASE = "base"
 # two-sided 95 % points of Student's t by degrees of freedom
 _STUDENT = {1: 12.71, 2: 4.30, 3: 3.18, 4: 2.78, 5: 2.57, 6: 2.45, 7: 2.36, 8: 2.31, 10: 2.23, 12: 2.18, 15: 2.13}
 _STUDENT |= {20: 2.09, 30: 2.04, 60: 2.00}
-# figures of a run that tables show: (group, of, figure) of `eval.scores.MetricRow`
+# figures of a run for the tables: (group, of, figure) of `eval.scores.MetricRow`
 FIGURES = {
     "all": ("all", "all", "mpjpe"),
     "plain": ("plain", None, "mpjpe"),
@@ -31,18 +32,18 @@ FIGURES = {
     "PA": ("all", "all", "pa_mpjpe"),
 }
 _SHOWN = ("plain", "clean", "cluttered", "company", "occluded", "turned round")
-# what the pages call figures and conditions, where the data has another name
+# names of figures and conditions on the pages, if they differ from those in the data
 WORDS = {"company": "second person", "crop": "poor box", "turned round": "facing > 90 deg off"}
 _HEADER = tuple(WORDS.get(name, name) for name in _SHOWN)
 
 
 def own_lines(result: Result) -> list[MetricRow]:
-    """The lines of what was evaluated, without the baselines', by this package's arithmetic."""
+    """The rows of the evaluated method, without those of baselines, computed with this package's arithmetic."""
     return [x for x in result.lines if x.method == result.setting.method and x.arithmetic == OURS]
 
 
 def figures(result: Result) -> dict[str, dict[str, float]]:
-    """value, low and high of each of `FIGURES` that the result has."""
+    """value, low and high of each figure in `FIGURES` that the result contains."""
     values = {}
     for name, (group, of, figure) in FIGURES.items():
         matches = (x for x in own_lines(result) if x.group == group and x.figure == figure and of in (None, x.of))
@@ -52,15 +53,15 @@ def figures(result: Result) -> dict[str, dict[str, float]]:
 
 
 def collect(folder: Path, known: list[dict]) -> list[dict]:
-    """What the runs of a folder scored, and those known that it does not hold, in a fixed order."""
+    """The scores of the runs in a folder and of the known runs that are not in it, in a fixed order."""
     new_runs = [json.loads(path.read_text()) for path in sorted(folder.rglob("scores.json"))]
     runs = {(run["variant"], run["begun"], run["people"], run["seed"]): run for run in known + new_runs}
     return [runs[key] for key in sorted(runs)]
 
 
 class Runs:
-    """Runs of one length, by variant and seed. freedom: degrees of freedom of the noise; deviation: of a run but for
-    its variant and seed, mm, NaN where nothing tells it."""
+    """Runs of one length, by variant and seed. freedom: degrees of freedom of the noise; deviation: standard deviation
+    of the noise, mm, NaN without degrees of freedom."""
 
     def __init__(self, runs: list[dict], people: int):
         self.people = people
@@ -82,14 +83,14 @@ class Runs:
         return float(np.mean([self.by[variant, seed]["figures"][figure]["value"] for seed in self.seeds(variant)]))
 
     def difference(self, variant: str, figure: str = "all") -> float:
-        """The variant's effect against `base`; NaN where no chain of seeds joins them."""
+        """The variant's effect relative to `base`; NaN if no chain of shared seeds connects them."""
         contrast = self._contrast(variant)
         if not np.allclose(contrast @ self._inverse @ self._design.T @ self._design, contrast):
             return math.nan
         return float(contrast @ self._effects(self._found(figure)))
 
     def reach(self, variant: str) -> float:
-        """Half the difference's interval; NaN where nothing tells the noise."""
+        """Half the width of the difference's interval; NaN if the noise cannot be estimated."""
         if not self.freedom:
             return math.nan
         contrast = self._contrast(variant)
@@ -97,7 +98,7 @@ class Runs:
         return float(point * self.deviation * (contrast @ self._inverse @ contrast) ** 0.5)
 
     def difference_text(self, variant: str) -> str:
-        """The difference and its interval, and whether it is one."""
+        """The difference and its interval, with a note if it is not significant."""
         difference, reach = self.difference(variant), self.reach(variant)
         if math.isnan(difference):
             return "-"
@@ -120,7 +121,7 @@ Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]
 
 
 def study(runs: list[dict], studies: Collection[str] | None = None) -> Rows:
-    """The variants of some studies, or of all, beside `base`, at the length that most runs have."""
+    """The variants of the given studies, by default of all, and `base`, at the most frequent run length."""
     common_runs = _common(runs)
     names = dict.fromkeys(run["variant"] for run in runs if studies is None or run["study"] in studies)
     variants = [variant for variant in names if variant != BASE and common_runs.seeds(variant)]
@@ -149,7 +150,8 @@ def noise(runs: list[dict]) -> str:
 
 
 def scaling(runs: list[dict], shipped: dict | None = None) -> Rows:
-    """`base` by the number of people seen; runs of their own, each cooled, and what ships as the longest."""
+    """`base` by the number of training people, with a separate run and a full schedule for each number, and the
+    released network as the longest run."""
     run_lengths = sorted({run["people"] for run in runs if run["variant"] == BASE})
     runs_by_length = {people: Runs(runs, people) for people in run_lengths}
     figures_by_length = {
@@ -165,7 +167,7 @@ def scaling(runs: list[dict], shipped: dict | None = None) -> Rows:
 
 
 def against_paper(runs: list[dict]) -> Rows:
-    """`base` and the paper's design, at every length at which both ran."""
+    """`base` and the paper's design, at each run length of the paper's design."""
     rows = []
     for people in sorted({run["people"] for run in runs if run["study"] == "paper"}):
         length_runs = Runs(runs, people)
@@ -187,6 +189,6 @@ def _beside(runs: Runs, variant: str) -> tuple[str, ...]:
 
 
 def _common(runs: list[dict]) -> Runs:
-    """The runs of the length that most have."""
+    """The runs of the most frequent length."""
     lengths = [run["people"] for run in runs]
     return Runs(runs, max(set(lengths), key=lengths.count))

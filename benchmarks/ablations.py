@@ -1,14 +1,15 @@
-"""What matters: the same network trained the same way on as many people, one thing changed at a time.
+"""Ablations: the same network trained in the same way on the same number of people, with one change at a time.
 
     python benchmarks/ablations.py --list
     python benchmarks/ablations.py --motion cmu_motion.npz --people 24576 --out runs/ablations
     python benchmarks/ablations.py --motion cmu_motion.npz --people 24576 --seeds 1,2 base pooled "heatmaps alone"
 
-Each run trains `tiny` without convolutions, as it was when the first of them ran, on `--people` synthesized people and
-judges it on lidarpose-bench, cloud-centered, the sensor known. With `--init FILE` it goes on from trained weights, its
-rate falling for most of the run, which tells by less noise what people to learn from; variants of another network are
-left out then. What is done is not done again. A run's figures go to OUT/NAME-PEOPLE-SEED/scores.json, as `results.py`
-reads them. Seed s of every variant shows the same people in the same order, but for those that change the people.
+Each run trains `tiny` without convolutions (its design at the time of the first run) on `--people` synthesized people
+and evaluates it on lidarpose-bench, cloud-centered, with known sensor position. With `--init FILE` it continues from
+trained weights with a learning rate that decays for most of the run. This compares training people with less noise;
+variants with another network are left out then. Finished runs are not repeated. A run's figures are written to
+OUT/NAME-PEOPLE-SEED/scores.json, which `results.py` reads. With the same seed all variants train on the same people in
+the same order, except those that change the people.
 """
 
 import argparse
@@ -60,9 +61,9 @@ _WILD = SCENES["wild"]
 
 @dataclass(frozen=True)
 class Variant:
-    """One change. study: the table it stands in; network: what makes it of its configuration; config, recipe: changed
-    entries of `NetworkConfig` and `Pretrain`; scene: where people are drawn; objective: what is minimized; kinds:
-    whether people in hard poses are drawn more often, see `HardKindsSource`."""
+    """One change. study: the table that lists it; network: creates the network from its configuration; config, recipe:
+    changed entries of `NetworkConfig` and `Pretrain`; scene: the scene of the people; objective: the minimized
+    objective; kinds: whether people in hard poses are drawn more often, see `HardKindsSource`."""
 
     study: str
     what: str
@@ -78,7 +79,7 @@ class Variant:
 _CALM = replace(_WILD, clutter=0.0, company=0.0, occluder=0.0, noise=replace(_WILD.noise, clutter=0.0))
 VARIANTS = {
     "base": Variant("base", "`tiny` without convolutions"),
-    # the six that matter
+    # the six most important studies
     "pooled": Variant("anchors", "joints from pooled features, votes", network=pooled),
     "pooled, heatmaps alone": Variant(
         "anchors", "joints from pooled features, heatmaps alone", network=pooled, config={"heatmap": "full"}
@@ -95,7 +96,7 @@ VARIANTS = {
     "grid 4 cm": Variant("grid", "voxels of 4, 8 and 16 cm", config={"grid": 0.04, "max_voxels": 512}),
     "grid 8 cm": Variant("grid", "voxels of 8, 16 and 32 cm", config={"grid": 0.08}),
     "grid 10 cm": Variant("grid", "voxels of 10, 20 and 40 cm", config={"grid": 0.1}),
-    # and more
+    # further studies
     "coarse alone": Variant("levels", "anchors read 24 cm alone", network=reading("coarse")),
     "fine alone": Variant("levels", "anchors read 6 cm alone", network=reading("fine")),
     "coarse and mid": Variant("levels", "anchors read 24 and 12 cm", network=reading("coarse", "mid")),
@@ -117,7 +118,7 @@ VARIANTS = {
     "batch 128": Variant("steps", "batches of 128, half the steps", recipe={"batch": 128}),
     "AdamW": Variant("network", "AdamW for all weights, no Muon", recipe={"muon_rate": 0.0}),
     "deeper": Variant("size", "2 + 3 + 2 blocks instead of 1 + 1 + 1", config={"blocks": (2, 3, 2)}),
-    # worth more than people?
+    # alternatives to training on more people
     "point joints": Variant(
         "losses", "every voxel says which joint is nearest to it, and where", with_point_joints, objective=PointJoints
     ),
@@ -139,7 +140,7 @@ VARIANTS = {
 
 @dataclass(frozen=True, kw_only=True)
 class SceneSource(SyntheticSource):
-    """`SyntheticSource` of a scene that has no name, that remembers its people for the next variant shown the same."""
+    """`SyntheticSource` for a scene without a name. It caches its people for the next variant that uses the same."""
 
     config: SceneConfig
 
@@ -154,7 +155,7 @@ class SceneSource(SyntheticSource):
         return replace(super()._generator, scene=self.config)
 
 
-# error of an activity's people in units of the easiest one's, of bench-2 and `small`; of those not named 1.5
+# error of `small` on bench-2 by activity, relative to the easiest activity; 1.5 for activities not listed
 KIND_WEIGHTS = {
     "lie": 3.5,
     "kneel": 2.5,
@@ -169,44 +170,44 @@ KIND_WEIGHTS = {
 
 @dataclass(frozen=True, kw_only=True)
 class HardKindsSource(SceneSource):
-    """Of two people one is shown, with odds as what they do is hard."""
+    """Selects one of two people, with odds given by the difficulty of their activities."""
 
     def example(self, index: int) -> Example:
         return super().example(self.chosen(index))
 
     def chosen(self, index: int) -> int:
-        """Which person example `index` shows."""
+        """The index of the person in example `index`."""
         pair = 2 * index, 2 * index + 1
         weights = [KIND_WEIGHTS.get(self.kind(k), 1.5) for k in pair]
         takes_first = np.random.default_rng([self.seed, index]).random() < weights[0] / sum(weights)
         return pair[0] if takes_first else pair[1]
 
     def kind(self, index: int) -> str:
-        """What person `index` does."""
+        """The activity of person `index`."""
         block, row = divmod(index, BLOCK)
         return self._generator._bodies(self.seed, block).kinds[row]
 
 
 @lru_cache(maxsize=1)
 def _remembered(source: SceneSource) -> dict[int, Example]:
-    """Those of the last source alone: to make them takes a third of a run, to keep them 6 KB each."""
+    """The cached examples of the last source only: making them takes a third of a run, caching them 6 KB each."""
     return {}
 
 
 def keeps_network(variant: Variant) -> bool:
-    """Whether trained weights of the usual network, perhaps grown, are such a one's too."""
+    """Whether trained weights of the usual network fit this variant's network, possibly after adding new layers."""
     is_usual = variant.network in (PoseNet, with_point_joints, with_local_refinement)
     return is_usual and not set(variant.config) - {"blocks", "channels"}
 
 
 def configuration(variant: Variant, init: str) -> NetworkConfig:
-    """That of the variant's network: without convolutions, or with those of the weights that it goes on from."""
+    """The configuration of the variant's network: without convolutions, or with those of the initial weights."""
     convolution = read_header(init).config.convolution if init else 0
     return replace(preset(variant.size), **{"convolution": convolution} | variant.config)
 
 
 def job(variant: Variant, settings: Pretrain) -> TrainSetup:
-    """What the variant comes to."""
+    """The training setup of a variant."""
     base_setup = make_setup(settings)
     config = configuration(variant, settings.init)
     objective = variant.objective(config=config, made=variant.network)
@@ -215,9 +216,9 @@ def job(variant: Variant, settings: Pretrain) -> TrainSetup:
     if not variant.scene.hard:
         values["easy"] = math.inf
     if variant.kinds:
-        # of twice as many people
+        # the indices run over twice as many people
         values["easy"] *= 2
-    # the pairs or the teacher's arrays of an objective are of training alone
+    # the pairs or the teacher's arrays of an objective are only for training, so validation uses a plain objective
     plain_objective = VariantObjective(config=config, made=variant.network)
     network = objective.network
     if settings.init:
@@ -236,7 +237,7 @@ def job(variant: Variant, settings: Pretrain) -> TrainSetup:
 
 
 def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict:
-    """Trains and judges a variant; returns its `record`."""
+    """Trains and evaluates a variant; returns its `record`."""
     variant, people, init = VARIANTS[name], options.people, options.init
     subjects = tuple(options.subjects.split(","))
     changes = {"motion": options.motion, "subjects": subjects, "people": people, "seed": seed}
@@ -263,15 +264,15 @@ def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict
 
 
 def record(name: str, seed: int, people: int, **more) -> dict:
-    """What a scores.json holds, as `results.py` reads it."""
+    """The content of a scores.json, as `results.py` reads it."""
     head = {"version": __version__, "variant": name, "seed": seed, "people": people}
     return head | {key: round(value, 1) if isinstance(value, float) else value for key, value in more.items()}
 
 
 def each(names: Iterable[str], options: argparse.Namespace, scored: Callable[[str, int, Path], dict]) -> None:
-    """Runs every name with every seed whose scores.json is not there yet: scored(name, seed, folder) -> `record`.
+    """Runs each name with each seed that has no scores.json yet: scored(name, seed, folder) -> `record`.
 
-    Those of other motion, subjects or weights end the program.
+    Exits if stored scores are of other motion, subjects or weights.
     """
     torch.set_num_threads(1)
     init = getattr(options, "init", "")
@@ -290,7 +291,7 @@ def each(names: Iterable[str], options: argparse.Namespace, scored: Callable[[st
 
 
 def arguments(parser: argparse.ArgumentParser, **motion) -> None:
-    """What both benchmarks ask."""
+    """Adds the arguments of both benchmarks."""
     parser.add_argument("--motion", help="npz of clips, see lidarpose.body.mocap.motion", **motion)
     parser.add_argument("--subjects", default="002,005", help="of its clips, those to learn from")
     parser.add_argument("--people", type=int, default=24_576)

@@ -1,11 +1,11 @@
-"""Our recipe against our own implementation of the paper's network and recipe: as many parameters, as many people.
+"""Our recipe compared with our implementation of the paper's network and recipe, at equal parameters and people.
 
     python benchmarks/against_paper.py --motion cmu_motion.npz --out runs/ablations
 
-The paper's design at the size of `tiny`: voxels of 4, 8 and 16 cm, 1 + 1 + 1 encoder and 1 + 1 decoder blocks. Half of
-the people teach coordinates and parts (its pre-training), half heatmaps (its fine-tuning, here on synthesized people).
-Ours is `base` of `ablations.py`, whose scores.json and tables these runs share. Judged by the released decoding and by
-ours, whichever is better.
+The paper's design has the size of `tiny`: voxels of 4, 8 and 16 cm, 1 + 1 + 1 encoder and 1 + 1 decoder blocks. Half of
+the people are used to train coordinates and parts (its pre-training), half to train heatmaps (its fine-tuning, here on
+synthesized people). Our recipe is `base` of `ablations.py`, and these runs use the same scores.json format and tables.
+Each run is evaluated with the released decoding and with ours, and the better result counts.
 """
 
 import argparse
@@ -38,8 +38,9 @@ from lidarpose.train.setup import make_setup
 
 @dataclass(frozen=True)
 class Way:
-    """How the paper's network learns: scene, rates of both stages, whether anchors are kept between them, changes;
-    one_stage: all people teach heatmaps, at the second rate."""
+    """How the paper's network is trained. scene: the scene of the training people; rates: learning rates of the two
+    stages; anchors: whether anchors are kept between the stages; recipe: changes of the recipe; one_stage: all people
+    train heatmaps, at the second rate."""
 
     what: str
     scene: str = "paper"
@@ -86,7 +87,7 @@ def sized(config: DaptConfig) -> DaptConfig:
 
 
 def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict:
-    """Both stages and the verdict; returns its `ablations.record`."""
+    """Runs both stages and the evaluation; returns the `ablations.record`."""
     variant, people = WAYS[name], options.people
     start, process_start = time.perf_counter(), time.process_time()
     subjects = tuple(options.subjects.split(","))
@@ -102,7 +103,7 @@ def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict
         setup = replace(make_setup(settings), objective=pretraining, network=pretraining.network)
         trained_network, _ = load_checkpoint(train(settings, folder / "pretrain", setup=setup))
         make_network = partial(transferred, trained_network, finetuning.config, keep_anchors=variant.anchors)
-    # other people than those of the first half
+    # another seed, so that the people differ from those of the first half
     settings = replace(settings, seed=seed + 1_000, rate=variant.rates[1])
     setup = replace(make_setup(settings), objective=finetuning, network=make_network)
     model = train(settings, folder / "finetune", setup=setup)

@@ -1,11 +1,11 @@
-"""Networks to measure the package's own beside: its first draft, a plain transformer over groups, a PointNet++.
+"""Baseline networks for speed comparisons: the package's first draft, a plain transformer over groups, a PointNet++.
 
-Legend: B people, N points (padded), G groups or centers, K points a group, M voxels of all people at a level, W of them
-under one parent at most, C channels, J joints.
+Legend: B people, N points (padded), G groups or centers, K points per group, M voxels of all people at a level, W
+maximum number of them under one parent, C channels, J joints.
 
-Each has `prepare(clouds)`, the geometry of people's clouds (n, 3) m about their centers, made without gradients, and
-`forward` of it, which gives joints (B, J, 3) m in the person's frame. What either gives of a person depends on no batch
-mate. They are made for their cost: none has been tuned for accuracy.
+Each has `prepare(clouds)`, which computes the geometry of people's clouds (n, 3) m around their centers without
+gradients, and `forward`, which computes joints (B, J, 3) m in the person's frame from it. The result for a person does
+not depend on the other people in the batch. The networks are for comparing cost: none has been tuned for accuracy.
 """
 
 from collections.abc import Callable
@@ -24,9 +24,9 @@ JOINTS = len(BODY26)
 
 
 def about(make: Callable[[int], nn.Module], parameters: int, *, widths: range) -> nn.Module:
-    """`make(width)` of the width whose count of parameters comes nearest to `parameters`.
+    """`make(width)` for the width whose number of parameters is closest to `parameters`.
 
-    Raises ValueError where none comes within a tenth.
+    Raises ValueError if no width comes within a tenth.
     """
 
     def off(width: int) -> float:
@@ -40,7 +40,7 @@ def about(make: Callable[[int], nn.Module], parameters: int, *, widths: range) -
 
 
 def count(network: nn.Module) -> int:
-    """Trained numbers of a network."""
+    """Number of parameters of a network."""
     return sum(value.numel() for value in network.parameters())
 
 
@@ -49,10 +49,11 @@ def count(network: nn.Module) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class DraftLevel:
-    """Voxels of one width, of all people one after the other.
+    """Voxels of one size, concatenated over all people.
 
     position (M, 3) m; slot (M,): row among the padded B * N; valid (B, N) bool; children (M', W): rows of this level
-    under each of the next, the first one repeated, and parent (M,): row of the next level; None at the coarsest.
+    under each voxel of the next level, padded by repeating the first child, and parent (M,): row of the next level;
+    both None at the coarsest level.
     """
 
     position: Tensor
@@ -64,23 +65,24 @@ class DraftLevel:
 
 @dataclass(frozen=True, kw_only=True)
 class DraftTables:
-    """What `Draft` reads: features (M, 7) of the fine voxels, and the levels from fine to coarse."""
+    """The input of `Draft`: features (M, 7) of the fine voxels, and the levels from fine to coarse."""
 
     features: Tensor
     levels: tuple[DraftLevel, ...]
 
 
 class Draft(nn.Module):
-    """The package's first draft of a backbone: what its networks have to outrun.
+    """The package's first draft of a backbone, which its networks should be faster than.
 
-    Voxels of 4, 8 and 16 cm; linear stem; attention of all of a person's voxels with rotary places, no convolution; an
-    exchange (a stock post-norm decoder layer) after each decoder level. Rows are ragged, padded only around attention.
+    Voxels of 4, 8 and 16 cm; linear stem; attention among all voxels of a person with rotary position encoding, no
+    convolution; an exchange (a stock post-norm decoder layer) after each decoder level. Rows are ragged, and padded
+    only for attention.
     """
 
     GRID, MOST = 0.04, 1024
-    # channels a head, of which the rotary encoding turns 12
+    # channels per head, 12 of which the rotary encoding rotates
     HEAD = 16
-    # of encoder and decoder: about a third of the draft's parameters, a fifth more, and the draft that was measured
+    # channels of encoder and decoder, for about a third of the draft's parameters, a fifth more, and the measured draft
     WIDTHS = (((32, 48, 96), (48, 48)), ((64, 96, 176), (64, 96)), ((48, 96, 144), (64, 96)))
 
     def __init__(
@@ -108,7 +110,7 @@ class Draft(nn.Module):
 
     @classmethod
     def of_parameters(cls, parameters: int) -> "Draft":
-        """The one of `WIDTHS` that has about so many parameters."""
+        """The draft with the `WIDTHS` that give about `parameters` parameters."""
         return about(lambda k: cls(*cls.WIDTHS[k]), parameters, widths=range(len(cls.WIDTHS)))
 
     def prepare(self, clouds: list[np.ndarray]) -> DraftTables:
@@ -140,7 +142,7 @@ class Draft(nn.Module):
             rows = self.skip[s](skips[s]) + self.up[s](rows)[level.parent]
             for block in self.decoder[s]:
                 rows = block(rows, places[s], level, biases[s])
-            # a person without voxels reads a row of zeros: all keys masked would be not a number
+            # a person without voxels attends to a row of zeros, since attention with all keys masked gives NaN
             is_empty = ~level.valid
             is_empty[:, 0] = False
             anchors = self.exchange[s](self.anchor[s](anchors), _padded(rows, level), memory_key_padding_mask=is_empty)
@@ -178,12 +180,12 @@ def _aligned(channels: int, out_channels: int) -> nn.Sequential:
 
 
 def _bias(valid: Tensor, dtype: torch.dtype) -> Tensor | None:
-    """`key_bias`, None where all people have as many voxels."""
+    """`key_bias`, None if all people have the same number of voxels."""
     return None if valid.all() else key_bias(valid, dtype)
 
 
 def _padded(rows: Tensor, level: DraftLevel) -> Tensor:
-    """rows (M, C) -> (B, N, C), zero where there is no voxel."""
+    """rows (M, C) -> (B, N, C), zero in padding."""
     people, max_voxels = level.valid.shape
     if rows.shape[0] == people * max_voxels:
         return rows.unflatten(0, (people, max_voxels))
@@ -195,13 +197,13 @@ def _padded(rows: Tensor, level: DraftLevel) -> Tensor:
 
 
 def _ragged(level: VoxelLevel, coarser: VoxelLevel | None) -> DraftLevel:
-    """A pyramid's padded level as ragged rows; coarser: the next one."""
+    """A padded level of a voxel pyramid as ragged rows; coarser: the next level."""
     children = parent = None
     if coarser is not None:
         lengths = coarser.valid.sum(1)
         start = np.cumsum(lengths) - lengths
         parent = (level.parent + start[:, None])[level.valid]
-        # parents of a person's voxels go up and down: children are numbered in the parents' order
+        # a person's voxels are not sorted by parent, so the children are sorted first
         order = np.argsort(parent, kind="stable")
         child_count = np.bincount(parent, minlength=lengths.sum())
         first_child = np.cumsum(child_count) - child_count
@@ -223,10 +225,11 @@ def _ragged(level: VoxelLevel, coarser: VoxelLevel | None) -> DraftLevel:
 
 @dataclass(frozen=True, kw_only=True)
 class Groups:
-    """Centers of people's clouds and the points about each.
+    """Centers of people's clouds and the points around each center.
 
-    center (B, G, 3) m; center_valid (B, G) bool: false where the person has fewer places than centers; index (B, G, K):
-    the neighbors' rows among the N; relative (B, G, K, 3) m: neighbors from their center; valid (B, G, K) bool.
+    center (B, G, 3) m; center_valid (B, G) bool: false for centers in excess of the person's distinct points; index
+    (B, G, K): the neighbors' rows among the N; relative (B, G, K, 3) m: neighbors relative to their center; valid
+    (B, G, K) bool.
     """
 
     center: Tensor
@@ -237,10 +240,10 @@ class Groups:
 
 
 class GroupedViT(nn.Module):
-    """A plain transformer over groups: farthest-point centers, their nearest points through a small PointNet.
+    """A plain transformer over groups: farthest-point centers, whose nearest points a small PointNet encodes.
 
-    After Point-BERT and Point-MAE: 64 groups of 32 points; pre-norm blocks; joints by a perceptron from the tokens'
-    mean and maximum.
+    Follows Point-BERT and Point-MAE: 64 groups of 32 points; pre-norm blocks; a perceptron predicts joints from the
+    tokens' mean and maximum.
     """
 
     GROUPS, NEIGHBORS = 64, 32
@@ -281,7 +284,7 @@ class GroupedViT(nn.Module):
 
 
 class _PlainBlock(nn.Module):
-    """A pre-norm transformer block over tokens (B, G, C), perceptron four times as wide."""
+    """A pre-norm transformer block over tokens (B, G, C), with a perceptron four times as wide."""
 
     def __init__(self, channels: int, heads: int):
         super().__init__()
@@ -297,13 +300,13 @@ class _PlainBlock(nn.Module):
 
 
 class PointNet2(nn.Module):
-    """Set abstraction after PointNet++ (single scale): points to centers, to fewer centers, to one vector, to joints.
+    """Set abstraction as in PointNet++ (single scale): points to centers, to fewer centers, to one vector, to joints.
 
-    Widths keep PointNet++'s proportions (its own: width 64). Its batch norms are left out but for one layer norm a set:
-    they cost as much as the products on a CPU. Of a ball the nearest points are taken.
+    Widths keep PointNet++'s proportions (the original has width 64). One layer norm per set replaces its batch norms,
+    which cost as much as the matrix products on a CPU. The nearest points of each ball are taken.
     """
 
-    # centers, points a center, radius in meters
+    # centers, points per center, radius in meters
     SETS = ((128, 32, 0.2), (32, 32, 0.5))
 
     def __init__(self, width: int):
@@ -367,7 +370,7 @@ def padded(clouds: list[np.ndarray]) -> tuple[Tensor, Tensor]:
 def farthest(points: Tensor, valid: Tensor, centers: int) -> tuple[Tensor, Tensor]:
     """points (B, N, 3), valid (B, N) -> index (B, G), fresh (B, G) bool.
 
-    Farthest-point sampling from each person's first point on; fresh: false where no place was left to take.
+    Farthest-point sampling that starts at each person's first point; fresh: false if no distinct point was left.
     """
     people = torch.arange(len(points))
     distance = torch.where(valid, torch.inf, -1.0)
@@ -386,7 +389,7 @@ def grouped(points: Tensor, valid: Tensor, *, centers: int, neighbors: int, radi
     """points (B, N, 3) m, valid (B, N) -> farthest-point centers and their nearest points within `radius` m."""
     index, fresh = farthest(points, valid, centers)
     center = points.gather(1, index[..., None].expand(-1, -1, 3))
-    # differences, not products: what is far from the origin is not less exact
+    # distances from differences instead of matrix products, which are less accurate far from the origin
     distance = torch.cdist(center, points, compute_mode="donot_use_mm_for_euclid_dist")
     distance = distance.masked_fill(~valid[:, None], torch.inf)
     distances, indices = distance.topk(min(neighbors, points.shape[1]), largest=False)
@@ -401,5 +404,5 @@ def grouped(points: Tensor, valid: Tensor, *, centers: int, neighbors: int, radi
 
 
 def _largest(values: Tensor, valid: Tensor, axis: int) -> Tensor:
-    """Maximum over `axis` of values (..., C) where valid (...); a large negative number where nothing is."""
+    """Maximum over `axis` of values (..., C) where valid (...); a large negative number if none is valid."""
     return values.masked_fill(~valid[..., None], -1e4).amax(axis)

@@ -1,11 +1,11 @@
-"""What a learned background is worth to a sensor that does not move: people found and false ones with and without it.
+"""Benefit of a learned background for a stationary sensor: detected people and false positives with and without it.
 
     python benchmarks/background.py --streets 20 --json docs/scores/background.json
 
-Synthesized streets of `synth.street`: the background is learned from the frames of four seconds, people are searched
-for in three of them. People of ten points and more within 40 m count; they are found by a box whose center is within
-0.5 m. Who moves does so by more than a meter in these seconds; who stands through all of them is a part of the
-background by design.
+Streets are synthesized by `synth.street`. The background is learned from the frames of four seconds, and people are
+detected in three of these frames. People with at least ten points within 40 m count; a person is found if the center of
+a box is within 0.5 m. People are moving if they move by more than a meter in these seconds; people who stand still for
+all of them become part of the background by design.
 """
 
 import argparse
@@ -27,7 +27,7 @@ SENSORS = ("os1-64", "os1-128", "hdl-32e", "os0-128", "pandar64")
 
 
 def of_street(index: int, *, seed: int, scores: tuple[float | None, ...]) -> list[dict]:
-    """A row each searched frame, way of searching and least score."""
+    """One row for each searched frame, with and without background, and score threshold."""
     frames = street(seed, index, sensor=SENSORS[index % len(SENSORS)], people=(6, 10), frames=FRAMES).frames
     background = learn_background([frame.points for frame in frames])
     way = [np.linalg.norm(a.center - b.center) for a, b in zip(frames[0].boxes, frames[-1].boxes, strict=True)]

@@ -1,9 +1,9 @@
-"""People a second of each network, in a training step and in inference, on people synthesized for training.
+"""People per second of each network, in a training step and in inference, on people synthesized for training.
 
     python benchmarks/baselines.py prn lpformer dapt paper-small ours lidarcap ne --threads 1
 
-Names are those of models or of their sizes. For networks of clips a person is a frame. Times are of this process's
-processor, so other programs count little. Quote ratios of one run.
+Names are model names or sizes. For networks that read clips, each frame counts as a person. Times are this process's
+processor time, on which other programs have little influence. Quote ratios within one run.
 """
 
 import argparse
@@ -33,7 +33,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     source = SyntheticSource(scene="wild", seed=0)
-    # a run sorts its people by size, so a batch has people of like size
+    # training sorts people by size, so the people of a batch have similar sizes
     people = sorted(map(source.example, range(4 * options.people)), key=lambda example: len(example.points))
     people = people[2 * options.people : 3 * options.people]
     print(f"{np.mean([len(example.points) for example in people]):.0f} points a person")
@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def clips(source: SyntheticSource, count: int) -> list[ClipExample]:
-    """At least one synthesized clip."""
+    """`count` synthesized clips, at least one."""
     examples = [source.clip(index, trans_center=False) for index in range(max(count, 1))]
     points = [len(frame.points) for clip in examples for frame in clip.frames]
     print(f"{len(examples)} clips, {np.mean(points):.0f} points a frame")
@@ -76,7 +76,7 @@ def clips(source: SyntheticSource, count: int) -> list[ClipExample]:
 
 
 def _seconds(task: Callable[[], None]) -> float:
-    """The least of some rounds after one that warms up."""
+    """Seconds of the fastest of `ROUNDS` rounds, after a warm-up."""
     task()
     times = []
     for _ in range(ROUNDS):

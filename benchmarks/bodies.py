@@ -1,12 +1,12 @@
-"""The figures of docs/synthesis.md: where the joints are, who is drawn, what clothes and props cost and look like.
+"""The figures of docs/synthesis.md: joint positions, drawn people, and cost and appearance of clothes and props.
 
 python benchmarks/bodies.py [--people 4000] [--sheet docs/images/props.png]
 
-joints        of the mean adult, standing in the T-pose: height above the soles, to the left and ahead of the
+joints        of the mean adult in the T-pose: height above the soles, position to the left and in front of the
               pelvis, and the distance to the skin, cm
-people        mean and deviation of stature, percentiles of BMI and age, by sex and for children
-costs         microseconds a person, one core, the best of a few rounds
-things        how often each is drawn among the default mix of poses
+people        mean and standard deviation of stature, percentiles of BMI and age, by sex and for children
+costs         microseconds per person, one core, best of a few rounds
+things        how often each prop is drawn with the default mix of poses
 """
 
 import argparse
@@ -58,7 +58,7 @@ def print_people(count: int) -> None:
 
 
 def best(work: Callable[[], object], rounds: int = 5) -> float:
-    """Seconds of the fastest of some rounds."""
+    """Seconds of the fastest of `rounds` rounds."""
     work()
     times = []
     for _ in range(rounds):
@@ -87,7 +87,7 @@ def print_costs(bodies: Bodies) -> None:
 
 
 def drawn(bodies: Bodies, rounds: int) -> dict[str, list[tuple[list[Prop], int]]]:
-    """name of a prop -> everything its person has, and the person's row."""
+    """name of a prop -> all props of each person who has it, and the person's row."""
     rng = np.random.default_rng(0)
     entries_by_name: dict[str, list[tuple[list[Prop], int]]] = {}
     for _ in range(rounds):
@@ -109,7 +109,7 @@ def print_things(bodies: Bodies) -> None:
 
 
 def draw_sheet(bodies: Bodies, path: Path) -> None:
-    """People with each of the things, from ahead on their right."""
+    """Draws people with each of the props, seen from the front right."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
@@ -131,7 +131,7 @@ def draw_sheet(bodies: Bodies, path: Path) -> None:
         axes = figure.add_subplot(rows, PER_ROW, 1 + place, projection="3d")
         axes.add_collection3d(Poly3DCollection(triangles, facecolors=colors))
         x, y = bodies.vertices[row][:, :2].mean(0)
-        # room for a trolley ahead and an umbrella above
+        # leaves space for a trolley in front and an umbrella above
         axes.set(xlim=(x - 0.6, x + 1.3), ylim=(y - 0.95, y + 0.95), zlim=(0, 2.2))
         axes.set_box_aspect((1.9, 1.9, 2.2), zoom=1.3)
         axes.view_init(12, -60)

@@ -1,11 +1,11 @@
-"""Whether a joint's confidence, spread and visibility can be taken at their word, on held-out synthetic people.
+"""Calibration of the joints' confidence, spread and visibility on held-out synthetic people.
 
     python benchmarks/calibration.py --motion cmu_motion.npz \\
         --out docs/images/reliability.png --json docs/scores/calibration.json
 
-The people of benchmarks/heldout.py under another seed. Confidence says how likely a joint is within 10 cm, `visible`
-how likely a point of the body lies within 18 cm of it, `spread` how far off it is on average. Expected calibration
-error is over ten equal bins; the plot shows them, with the share of joints in each.
+The people are those of benchmarks/heldout.py with another seed. `confidence` predicts the probability that a joint is
+within 10 cm, `visible` the probability that a point of the body is within 18 cm of it, `spread` its mean error. The
+expected calibration error is over ten equal bins; the plot shows them with the share of joints in each.
 """
 
 import argparse
@@ -27,7 +27,7 @@ from lidarpose.synth.bodies import PoseBank
 from lidarpose.train.augment import visible_joints
 
 BINS = 10
-# what `spread` may say, m
+# ranges of `spread`, m
 SPREADS = (
     ("all", 0.0, np.inf),
     ("under 5 cm", 0.0, 0.05),
@@ -84,7 +84,7 @@ def main() -> None:
 
 
 def _rank(a: np.ndarray, b: np.ndarray) -> float:
-    """Spearman's correlation."""
+    """Spearman's rank correlation."""
     a, b = (np.argsort(np.argsort(x.ravel())) for x in (a, b))
     return float(np.corrcoef(a, b)[0, 1])
 

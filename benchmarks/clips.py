@@ -1,16 +1,16 @@
-"""How steady and near poses over clips are: frame by frame, by a plain solve, and as `model.predict_clip` gives them.
+"""Smoothness and accuracy of poses in clips: frame by frame, with a plain solve, and smoothed as by `predict_clip`.
 
     python benchmarks/clips.py --motion cmu_motion.npz:006,007 --store clips.npz --json docs/scores/clips.json
 
-Clips of 16 frames at 10 Hz of the scene preset `wild` (full difficulty, 14 sensors, 2.5 to 25 m), of people and motion
-that nothing was trained on: --motion FILE[:SUBJECTS] or `prior`, which may stand more than once and takes turns;
-without it activities of the prior. Sensors stand still. Poses are predicted once and kept in --store.
+Clips have 16 frames at 10 Hz, in the scene preset `wild` (full difficulty, 14 sensors, 2.5 to 25 m). People and motion
+were not used in training: --motion FILE[:SUBJECTS] or `prior`, which may be repeated and are used in turn; by default
+activities of the prior. Sensors do not move. Poses are predicted once and stored in --store.
 
-MPJPE on the 15 joints of human15. Acceleration error: distance of second differences, mm a frame squared. Turned round:
-the way from right to left hips and shoulders is over 90 degrees off. Bone lengths: standard deviation over a clip, mean
-of the bones of both limbs and the hips. Frames in which the person was not seen count too: frame by frame they repeat
-the nearest frame that was seen. The plain solve: for each joint, squared second differences plus distances weighted by
-1/spread^2, one linear system.
+MPJPE is on the 15 joints of human15. Acceleration error: distance of second differences, mm per frame squared. Turned
+round: the direction from right to left hips and shoulders is over 90 degrees off. Bone lengths: standard deviation over
+a clip, mean over the bones of both limbs and the hips. Frames in which the person is not visible count, too: frame by
+frame they repeat the nearest frame with a pose. The plain solve minimizes for each joint squared second differences
+plus squared distances weighted by 1/spread^2, as one linear system.
 """
 
 import argparse
@@ -33,9 +33,9 @@ from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.live import filter_track
 from lidarpose.tracking.smoothing import smooth
 
-# never a seed of a training run, nor of the clips that the smoother was tuned on, 71001
+# differs from the seeds of training runs and from that of the clips on which the smoother was tuned, 71001
 SEED = 77_001
-# weight of squared second differences in the plain solve: the best of 100, 300, 1000, 3000 on the clips for tuning
+# weight of squared second differences in the plain solve: the best of 100, 300, 1000, 3000 on the tuning clips
 STIFFNESS = 300.0
 _PRIOR = "prior"
 _VALUES = ("joints", "spread", "visible", "confidence")
@@ -43,7 +43,7 @@ _PICKED = BODY26.map_to(HUMAN15)
 
 
 def make_clips(motion: list[str], count: int, seed: int, weights: str, looks: int) -> dict[str, np.ndarray]:
-    """Truth (C, T, 26, 3) m and what the network says frame by frame, NaN where the person was not seen."""
+    """Ground truth (C, T, 26, 3) m and the network's predictions frame by frame, NaN in frames without the person."""
     generators = []
     for spec in motion or [_PRIOR]:
         path, _, subjects = spec.partition(":")
@@ -52,7 +52,7 @@ def make_clips(motion: list[str], count: int, seed: int, weights: str, looks: in
         else:
             bank = PoseBank.from_clips(path, tuple(subjects.split(",")) if subjects else None)
             generators.append(Generator(scene="wild", bank=bank, captured=1.0, measure=False))
-    # clips are small batches, which further threads only delay
+    # clips are small batches, which more threads only slow down
     model, clips = load(weights, tta=looks, threads=1), []
     for index in range(count):
         people = generators[index % len(generators)].clip(seed, index)
@@ -67,14 +67,14 @@ def make_clips(motion: list[str], count: int, seed: int, weights: str, looks: in
 
 
 def nearest_seen(joints: np.ndarray) -> np.ndarray:
-    """Frames (T, J, 3) without joints repeat the nearest that has some."""
+    """Joints (T, J, 3) in which frames without joints repeat the nearest frame that has some."""
     frames = np.arange(len(joints))
     seen_frames = np.flatnonzero(np.isfinite(joints).all((1, 2)))
     return joints[seen_frames[np.abs(frames[:, None] - seen_frames).argmin(1)]]
 
 
 def plain_solve(track: TrackPoses) -> np.ndarray:
-    """(T, J, 3) m."""
+    """Joints (T, J, 3) m of the plain solve."""
     frames = len(track)
     second_differences = np.diff(np.eye(frames), 2, axis=0)
     weight = np.where(track.seen[:, None], track.spread**-2, 0.0)
@@ -84,7 +84,7 @@ def plain_solve(track: TrackPoses) -> np.ndarray:
 
 
 def live_joints(track: TrackPoses) -> np.ndarray:
-    """(T, J, 3) m, NaN where there are none."""
+    """Joints (T, J, 3) m of the live filter, NaN in frames without joints."""
     return TrackPoses.of_poses(track.times, filter_track(track), BODY26).joints
 
 
@@ -97,7 +97,7 @@ WAYS = {
 
 
 def across(joints: np.ndarray) -> np.ndarray:
-    """(..., 3): from right to left."""
+    """The sum (..., 3) of the vectors from the right to the left hip and from the right to the left shoulder."""
     index = BODY26.index
     return sum(
         joints[..., index(f"left_{name}"), :] - joints[..., index(f"right_{name}"), :] for name in ("hip", "shoulder")
@@ -105,7 +105,7 @@ def across(joints: np.ndarray) -> np.ndarray:
 
 
 def figures(joints: np.ndarray, base: np.ndarray, true: np.ndarray) -> dict:
-    """Of clips (C, T, 26, 3) m, with intervals over clips; base: those of frame by frame."""
+    """Figures of clips (C, T, 26, 3) m, with intervals over clips; base: the joints predicted frame by frame."""
     rng = np.random.default_rng(0)
     count = len(true)
 
@@ -137,7 +137,7 @@ def figures(joints: np.ndarray, base: np.ndarray, true: np.ndarray) -> dict:
 
 
 def run(clips: dict[str, np.ndarray]) -> dict:
-    """The figures of each way."""
+    """The figures of each entry in `WAYS`."""
     tracks = [
         TrackPoses(
             times=np.arange(clips["true"].shape[1]) / CLIP_HZ,
@@ -167,7 +167,7 @@ def run(clips: dict[str, np.ndarray]) -> dict:
 
 
 def hidden(clips: dict[str, np.ndarray], gap: int) -> list[list[float]]:
-    """Of frames hidden in the middle of clips, by frames to the nearest one that is seen: mean spread and error, mm."""
+    """Mean spread and error, mm, in frames hidden in the middle of clips, by distance in frames to a visible frame."""
     count, frames = clips["true"].shape[:2]
     rows = np.arange((frames - gap) // 2, (frames - gap) // 2 + gap)
     frames_to_seen = np.minimum(rows - rows[0], rows[-1] - rows)

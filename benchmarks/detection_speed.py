@@ -1,16 +1,18 @@
-"""How long finding people in a scan takes, beside an earlier state of the package where one is given.
+"""Time for detecting people in a scan, optionally compared with an earlier version of the package.
 
     python benchmarks/detection_speed.py [--before REF] [--rounds 8] [--million] [SCAN ...]
 
-Scans are files of points around a sensor at 0, 0, 0; without any, a street of the generator's seen by 128 beams, some
-100,000 points, and with --million the same ten times over with 1 cm of noise. One thread. A row is a step:
+Scans are files of points around a sensor at 0, 0, 0; by default a generated street scanned with 128 beams, about
+100,000 points, and with --million the same street repeated ten times with 1 cm of noise. One thread. Each row is a
+step:
 
 - detector: from points to scored places: thinning, leveling, proposals and scorer;
-- detect: `lidarpose.detect`, with verification and the poses of those who are found;
-- predict: `lidarpose.predict` of the ten surest people by `small` at one look, with detection.
+- detect: `lidarpose.detect`, with verification and the poses of the detections;
+- predict: `lidarpose.predict` of the ten highest-scoring people with `small` and `tta=1`, including detection.
 
-States take turns, scan by scan, each in a process of its own; cells are CPU milliseconds, the best round (the median).
-Read ratios: a busy machine slows all alike. --before: a git reference, checked out into a temporary folder.
+Versions take turns, scan by scan, each in its own process; cells are CPU milliseconds of the best round (the median).
+Compare ratios, since a busy machine slows down all versions equally. --before: a git reference, checked out into a
+temporary folder.
 """
 
 import argparse
@@ -23,7 +25,7 @@ import time
 from functools import cache
 from pathlib import Path
 
-# before numpy starts its threads
+# set before numpy starts its threads
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
@@ -33,7 +35,7 @@ STEPS = ("detector", "detect", "predict")
 
 
 def street(times: int) -> np.ndarray:
-    """(n, 3) m: a street by 128 beams, so many times over."""
+    """(n, 3) m: a street scanned with 128 beams, repeated `times` times."""
     from lidarpose.synth.street import street
 
     points = street(3, 2, sensor="os1-128").frames[0].points
@@ -42,7 +44,7 @@ def street(times: int) -> np.ndarray:
 
 
 def worker(file: str) -> None:
-    """Times a step of the package that Python finds, for each line that comes in."""
+    """Times one step for each line on the standard input, with the package on Python's path."""
     import lidarpose
     from lidarpose.inference import detection, verification
     from lidarpose.inference.scan import Scan
@@ -51,10 +53,10 @@ def worker(file: str) -> None:
 
     points = np.load(file)
     detector, predictor = Detector(threads=1), lidarpose.load("small", threads=1, tta=1)
-    # those of the package take all processors
+    # replaces the package's own detector and verifiers, which use all processors
     detection._detector = lambda: detector
     backend = cache(lambda name: verification.OnnxBackend(weights_file(f"{name}.onnx"), threads=1))
-    # before there was a network that only verifies
+    # for versions without a separate verification network
     verification._bundled = backend
     verification._verifier = lambda: backend(verification.VERIFIER)
     origin = np.zeros(3)
@@ -87,7 +89,7 @@ def timed(process: subprocess.Popen, step: str) -> float:
 
 
 def measure(sources: dict[str, Path], file: Path, rounds: int) -> dict[str, dict[str, list[float]]]:
-    """ms by step and source, the first turn left out."""
+    """ms by step and source, without the first round."""
     workers = {name: start(source, file) for name, source in sources.items()}
     times = {step: {name: [] for name in sources} for step in STEPS}
     for _ in range(rounds + 1):

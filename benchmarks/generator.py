@@ -1,10 +1,11 @@
-"""How many people a second the generator makes, from pose to packed points, and in how much memory.
+"""Speed of the generator in people per second, from pose to packed points, and its memory.
 
     python benchmarks/generator.py [--people 2048] [--rounds 3] [--scenes paper wild]
 
-Each scene is timed in one process, then in two at once that make other people of the same seed; the rounds take
-turns. Figures are people a second of wall time, the best round; "x one" is the two processes' rate over the one's.
-Times are of one core each: BLAS and numba are held to one thread. The first block of each process warms up.
+Each scene is timed in one process, then in two concurrent processes that generate different people of the same seed;
+the rounds alternate. Figures are people per second of wall time in the best round; "x one" is the rate of two processes
+divided by that of one. Each process uses one core: BLAS and numba are limited to one thread. The first block of each
+process is the warm-up.
 """
 
 import argparse
@@ -16,7 +17,7 @@ import time
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
-from lidarpose.synth.generator import BLOCK, Generator  # noqa: E402 - after the threads are held
+from lidarpose.synth.generator import BLOCK, Generator  # noqa: E402 - after the threads are limited
 from lidarpose.synth.scene import scene_config  # noqa: E402
 
 
@@ -29,12 +30,12 @@ def work(scene, first, people, ready, go, out):
     start = time.perf_counter()
     points = sum(len(generator.person(0, index).sample.points) for index in range(first, first + people))
     stop = time.perf_counter()
-    # kilobytes on Linux
+    # ru_maxrss is in kilobytes on Linux
     out.put((start, stop, points, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024))
 
 
 def rate(scene, people, processes):
-    """People a second of all processes together, mean points a person, the largest process in MiB."""
+    """People per second of all processes together, mean points per person, MiB of the largest process."""
     context = multiprocessing.get_context("spawn")
     ready, go, out = context.Semaphore(0), context.Event(), context.Queue()
     workers = [
@@ -48,7 +49,7 @@ def rate(scene, people, processes):
     results = [out.get() for _ in workers]
     for process in workers:
         process.join()
-    # the clock is the machine's, the same for all processes
+    # perf_counter is the same clock in all processes of the machine
     seconds = max(result[1] for result in results) - min(result[0] for result in results)
     return (
         processes * people / seconds,

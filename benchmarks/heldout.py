@@ -1,10 +1,10 @@
-"""How far off the network is on synthetic people whose poses come from captured motion that it never saw.
+"""Errors of the network on synthetic people with poses from captured motion that was not used in training.
 
     python benchmarks/heldout.py --motion cmu_motion.npz --subjects 006,007
     python benchmarks/heldout.py --motion cmu_motion.npz --weights runs/tiny/model.safetensors --json scores.json
 
 Full difficulty of the scene preset `wild` (occluders, masks, clutter, noise, jittered crop boxes, 14 sensors), at
-least 50 points a person, centered from the points alone: no box, no root joint. MPJPE on the 15 joints of human15.
+least 50 points per person, centered using only the points: no box, no root joint. MPJPE on the 15 joints of human15.
 """
 
 import argparse
@@ -24,7 +24,7 @@ from lidarpose.synth.bodies import PoseBank
 from lidarpose.synth.generator import Generator, SyntheticPerson
 from lidarpose.synth.scene import scene_config
 
-# never a seed of a training run, which count from 0
+# differs from the seeds of training runs, which count from 0
 SEED = 90_001
 PAIRED = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
 
@@ -43,7 +43,7 @@ def people(bank: PoseBank, count: int, least: int, seed: int) -> list[SyntheticP
 
 
 def score(predicted, persons: list[SyntheticPerson]) -> dict:
-    """Figures in millimeters or shares."""
+    """Figures, in millimeters or as shares."""
     pred = np.stack([p.pose.to(HUMAN15).joints for p in predicted])
     true = np.stack([p.sample.pose.to(HUMAN15).joints for p in persons])
     facts = [p.facts for p in persons]
@@ -131,7 +131,7 @@ def main() -> None:
 
 
 def _mean_pose_error(persons: list[SyntheticPerson]) -> float:
-    """MPJPE of the mean pose, turned to where each person truly faces, about the center of their points."""
+    """MPJPE of the mean pose at the center of each person's points, rotated to the person's true facing."""
     true = np.stack([p.sample.pose.to(HUMAN15).joints - p.sample.center for p in persons])
     R_world_person = rotation_about("z", facing(true, HUMAN15))
     local_joints = true @ R_world_person

@@ -1,22 +1,22 @@
-"""Speed and memory of the network, beside a plain transformer, a PointNet++ and the package's first draft.
+"""Speed and memory of the network, compared with a plain transformer, a PointNet++ and the package's first draft.
 
     python benchmarks/network.py                  # about half an hour on two cores; Markdown on standard output
-    python benchmarks/network.py --quick          # a trial of all of it, minutes
+    python benchmarks/network.py --quick          # a quick trial of everything, minutes
     python benchmarks/network.py --device cuda    # training in bfloat16; no ONNX, no baselines
 
-Legend: B people a call, n points a person, J joints.
+Legend: B people per call, n points per person, J joints.
 
-Whatever is compared runs in one process and takes turns, round after round; cells give the best round and the median.
-Quote ratios: they hold on another machine, and mostly on a busy one. What is timed:
+All compared networks run in one process and take turns, round after round; cells give the best round and the median.
+Quote ratios: they also hold on other machines, and mostly on busy ones. Timed are:
 
-- latency: one person, from points about their center to joints, the tables (voxels, groups) made on the way;
-- forward: the same of B people, and beside it the network alone;
-- training: a step on tables made before, as the loop's are by other processes: forward, losses, backward, gradients
-  clipped, optimizers, running mean of the weights. Baselines and the paper's network: AdamW on the mean distance of the
-  joints (of all heads that tell joints, and the parts, for the paper's).
+- latency: one person, from centered points to joints, including the computation of the tables (voxels, groups);
+- forward: the same for B people, and also the network alone;
+- training: a step on tables computed before, as other processes do in the training loop: forward, losses, backward,
+  gradient clipping, optimizers, running mean of the weights. Baselines and the paper's network use AdamW on the mean
+  distance of the joints (for the paper's: of all heads that predict joints, plus the loss of the parts).
 
-People are of the generator's scene `wild`, brought to exactly n points; "crops" are people as they come, their median
-170 points, sorted into batches as in training. Weights are random: no time depends on them.
+People are from the generator's scene `wild`, resampled to exactly n points; "crops" are people with their own number of
+points, 170 in the median, sorted into batches as in training. Weights are random, since times do not depend on them.
 """
 
 import argparse
@@ -58,17 +58,17 @@ from lidarpose.train.data_loader import BATCHES
 SECTIONS = ("latency", "forward", "training", "scaling", "memory")
 POINTS, SCALING_POINTS = (128, 256, 512, 1024), (128, 256, 512, 1024, 2048)
 SCALING_PEOPLE, SCALING_PEOPLE_CUDA = (1, 4, 16, 64), (1, 16, 64, 256, 1024)
-# a turn goes on for so long, s, so many times at most; between turns other threads come to rest for so long, s
+# duration of a turn, s, maximum number of calls in it, and pause between turns, s, in which other threads become idle
 TURN, MOST_TIMES, REST = 0.15, 20, 0.02
-# what takes so long, s, has its turn every second round
+# s; jobs that take longer are run only every second round
 SLOW = 5.0
-# people whose latency is taken, one after the other: they differ in voxels
+# number of people for the latency, one after the other, since people differ in voxels
 ALONE = 8
 
 
 @dataclass(frozen=True)
 class Job:
-    """Something to time: `run` returns the seconds that the network alone took."""
+    """A job to time: `run` returns the seconds of the network alone."""
 
     key: Key
     runner: Runner
@@ -101,12 +101,12 @@ def training_job(section: str, one: Runner, points: int | str, calls: list[list[
 
 
 def measure(jobs: list[Job], rounds: int, left_out: list[str]) -> Times:
-    """Seconds of each job's calls, whole and of the network alone, all jobs in turn each round."""
+    """Seconds of each job's calls, in total and of the network alone; in each round all jobs take turns."""
     repeats, slow_keys, times = {}, set(), defaultdict(list)
     for number, job in enumerate(jobs):
         say(f"warming up {job.key.section} {number + 1}/{len(jobs)}: {job.key.network}, {job.key.points}")
         try:
-            # the first call allocates, the second shows how long one takes
+            # the first call allocates memory, so the second one is timed
             first = _turn(job, 1)[0][0]
             seconds = first if first > 1 else _turn(job, 1)[0][0]
             repeats[job.key] = min(max(math.ceil(TURN / seconds), 1), MOST_TIMES)
@@ -118,7 +118,7 @@ def measure(jobs: list[Job], rounds: int, left_out: list[str]) -> Times:
         say(f"{jobs[0].key.section if jobs else 'nothing'}: round {number + 1} of {rounds}")
         for job in jobs:
             if job.key in repeats and not (job.key in slow_keys and number % 2):
-                # of several calls the first finds the caches as another network left them
+                # with several calls, the first is dropped: the caches still hold data of another network
                 num_extra = repeats[job.key] > 1
                 times[job.key] += _turn(job, repeats[job.key] + num_extra)[num_extra:]
     return dict(times)
@@ -137,7 +137,7 @@ def _turn(job: Job, calls: int) -> list[tuple[float, float]]:
 
 
 def measured(made: list[Runner], options: argparse.Namespace, left_out: list[str]) -> Times:
-    """All times that were asked for."""
+    """All requested times."""
     if not made:
         return {}
     rng = np.random.default_rng(0)
@@ -187,7 +187,7 @@ def measured(made: list[Runner], options: argparse.Namespace, left_out: list[str
 
 
 def memory(options: argparse.Namespace, left_out: list[str]) -> list[dict]:
-    """Peak memory of training steps, each network in a process of its own; bytes."""
+    """Peak memory of training steps in bytes, each network in its own process."""
     names = [name for size in options.sizes for name in ([size, DRAFT] if size == "small" else [size])]
     names = names if options.device == "cpu" else [name for name in names if name != DRAFT]
     rng = np.random.default_rng(0)
@@ -197,7 +197,7 @@ def memory(options: argparse.Namespace, left_out: list[str]) -> list[dict]:
     context = multiprocessing.get_context("spawn")
     for name in names:
         batch = PAPER_BATCH if name == "paper" and options.device == "cpu" else BATCH
-        # of the crops the batch of the most voxels
+        # for crops, the batch with the most voxels
         people_by_points = {n: of_points(pool, n, batch, rng) for n in options.points[-2:]}
         people_by_points[CROPS] = batches(pool, batch, number)[-1]
         for points, people in people_by_points.items():
@@ -218,7 +218,7 @@ def memory(options: argparse.Namespace, left_out: list[str]) -> list[dict]:
 
 
 def _memory_of_steps(name: str, people: list[Example], options: argparse.Namespace, queue) -> None:
-    """Three training steps; puts bytes before the network is made and at the peak."""
+    """Runs three training steps; puts the bytes before the network is created and at the peak into the queue."""
     torch.set_num_threads(options.threads)
     try:
         bytes_before = resident()
@@ -236,14 +236,14 @@ def _memory_of_steps(name: str, people: list[Example], options: argparse.Namespa
 
 
 def resident() -> int:
-    """Bytes of this process in memory now; at the peak where the system does not say."""
+    """Resident bytes of this process now, or the peak if the system does not report it."""
     return _status("VmRSS") or peak()
 
 
 def peak() -> int:
-    """The most bytes that this process had in memory.
+    """Peak resident bytes of this process.
 
-    Of /proc where there is one: what getrusage tells on Linux counts the process that started this one, too.
+    Read from /proc if available, since getrusage on Linux also counts the process that started this one.
     """
     kilobytes = 1 if sys.platform == "darwin" else 1024
     return _status("VmHWM") or resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * kilobytes
@@ -274,7 +274,7 @@ def parsed(arguments: list[str] | None = None) -> argparse.Namespace:
         parser.error("--device cuda: torch finds no such device here")
     if options.json is not None and not options.json.resolve().parent.is_dir():
         parser.error(f"--json: the folder {options.json.resolve().parent} does not exist")
-    # in their own order, each once
+    # each size once, in the order of SIZES
     options.sizes = [size for size in SIZES if size in options.sizes]
     options.rounds = options.rounds or (2 if options.quick else 5)
     options.points = (128, 512) if options.quick else POINTS
@@ -293,7 +293,7 @@ def main() -> None:
     options = parsed()
     torch.set_num_threads(options.threads)
     left_out: list[str] = []
-    # first, while this process is small and no thread of it is busy
+    # memory first, while this process is small and none of its threads is busy
     memory_rows = memory(options, left_out) if "memory" in options.sections else []
     with tempfile.TemporaryDirectory() as folder:
         runners = runners_of(options, Path(folder), left_out)

@@ -19,7 +19,7 @@ CROPS = "crops"
 
 @dataclass(frozen=True)
 class Key:
-    """What a time is of. points: n, or "crops"; people: how many one call serves."""
+    """Identifies a timed job. points: n, or "crops"; people: number of people per call."""
 
     section: str
     network: str
@@ -27,12 +27,12 @@ class Key:
     people: int
 
 
-# seconds of calls, whole and of the network alone
+# seconds of calls, in total and of the network alone
 Times = dict[Key, list[tuple[float, float]]]
 
 
 class Report:
-    """Markdown from times and memory."""
+    """Creates the Markdown report from times and memory."""
 
     def __init__(self, options, made: list[Runner], times: Times, memory_rows: list[dict], left_out: list[str]):
         self.options, self.made, self.times = options, made, times
@@ -41,19 +41,19 @@ class Report:
         self.trained = [runner.name for runner in made if runner.trains]
 
     def seconds(self, section: str, network: str, points, people: int | None = None) -> tuple[np.ndarray, int] | None:
-        """Whole and network-alone seconds (calls, 2), and the people of a call; None where not measured."""
+        """Seconds in total and of the network alone (calls, 2), and the people per call; None if not measured."""
         for key, values in self.times.items():
             if (key.section, key.network, key.points) == (section, network, points) and people in (None, key.people):
                 return np.array(values), key.people
         return None
 
     def median(self, section: str, network: str, points, people: int | None = None, *, alone: bool = False) -> float:
-        """Median seconds a person, not a number where not measured."""
+        """Median seconds per person, NaN if not measured."""
         measurement = self.seconds(section, network, points, people)
         return math.nan if measurement is None else float(np.median(measurement[0][:, int(alone)])) / measurement[1]
 
     def best(self, section: str, network: str, points, people: int | None = None, *, alone: bool = False) -> float:
-        """Least seconds a person."""
+        """Minimum seconds per person, NaN if not measured."""
         measurement = self.seconds(section, network, points, people)
         return math.nan if measurement is None else float(measurement[0][:, int(alone)].min()) / measurement[1]
 
@@ -164,8 +164,8 @@ class Report:
         return table(head + ["on the device"] * any("device_peak" in row for row in self.memory_rows), rows)
 
     def targets(self) -> list[dict]:
-        """what, unit, target, whether it is a ceiling; figures by the medians and by the best rounds, None where not
-        measured; whether the medians meet it."""
+        """A dict for each target: what, unit, target, whether it is a maximum; figures from the medians and from the
+        best rounds, None if not measured; whether the medians meet the target."""
         by_median, by_best = self._figures(self.median), self._figures(self.best)
         rows = []
         for (what, unit, most, target, figure), (*_, best) in zip(by_median, by_best, strict=True):
@@ -175,7 +175,7 @@ class Report:
         return rows
 
     def _figures(self, statistic: Callable[..., float]) -> list[tuple[str, str, bool, float, float]]:
-        """what, unit, whether a ceiling, target, figure; statistic: `median` or `best`."""
+        """what, unit, whether the target is a maximum, target, figure; statistic: `median` or `best`."""
         figures = [
             ("`tiny` ONNX, one person of 512 points", "ms", True, 3, statistic("latency", "tiny ONNX", 512) * 1e3),
             ("`tiny` in torch, one person of 512 points", "ms", True, 8, statistic("latency", "tiny", 512) * 1e3),

@@ -1,8 +1,8 @@
-"""How often inputs that are no person in meters with z up are noticed, and good ones suspected.
+"""How often warnings detect inputs that are not in meters with z up, and how often they are false alarms.
 
     python benchmarks/plausibility.py --people 400
 
-Prints the share of people of lidarpose-bench with each warning: as they are, in other units, upside down.
+Prints the share of people of lidarpose-bench with each warning: unchanged, in other units, and upside down.
 """
 
 import argparse

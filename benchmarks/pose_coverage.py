@@ -1,11 +1,12 @@
-"""How near poses of the prior come to captured ones, by action or person.
+"""Distance of captured poses to the nearest poses of the prior, by action or person.
 
 python benchmarks/pose_coverage.py MOTION.npz [MOTION.npz ...] [--poses 20000] [--unusual 0 0.3] [--people bd dg]
 
 MOTION: `joints` (F, 24, 3) m of SMPL's joints, z up, and `clip` and `clip_length`: names PERSON_ACTION_NUMBER or
-PERSON_NUMBER. All poses get the same bones, the hips' middle at the origin and one heading of the hips; the figure is
-the mean distance of 13 joints (head, hips, knees, ankles, shoulders, elbows, wrists) to the nearest of the poses drawn,
-mm. A column for each share of unusual poses (`SceneConfig.unusual`): 0 is what `wild` draws, 0.3 what `wide` does.
+PERSON_NUMBER. All poses are given the same bone lengths, the center of the hips at the origin and the same heading of
+the hips. The figure is the mean distance of 13 joints (head, hips, knees, ankles, shoulders, elbows, wrists) to the
+nearest drawn pose, mm. There is a column for each share of unusual poses (`SceneConfig.unusual`): 0 as in `wild`, 0.3
+as in `wide`.
 """
 
 import argparse
@@ -18,7 +19,7 @@ from lidarpose.body.rig import forward_kinematics, mean_adult_joints
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import SMPL24
 
-# m: from the hips' middle to that of the shoulders, on to the head, and half the breadth of hips and shoulders
+# m: from the center of the hips to that of the shoulders, from there to the head, half widths of hips and shoulders
 CHEST, HEAD, HALF_HIPS, HALF_SHOULDERS = 0.50, 0.25, 0.09, 0.18
 THIGH, SHANK, UPPER_ARM, FOREARM = 0.42, 0.42, 0.28, 0.25
 

@@ -1,12 +1,12 @@
-"""How long one cast of a body takes, beside the slow twin of the tests and, where installed, Embree and Open3D.
+"""Time for ray casting one body, compared with the tests' reference and, if installed, Embree and Open3D.
 
     python benchmarks/raycast.py [--rounds 5] [--sensor dapt64] [--rings 60] [--plot docs/images/raycast.png]
 
-30 scenes from one seed: 5 distances x 6 closed meshes, each with a ground quad. The ways take turns, one scene each,
-so that a busy machine slows all alike: read the ratios. A cast is `scan`: window, cast and packed points; the others
-get the window's rays ready made. "open3d" goes by a legacy mesh, as the released code of the paper does, "open3d
-direct" hands its tensors over; each builds its tree for every body. The slow twin casts a sample of the rays and is
-scaled up. All on one thread.
+30 scenes from one seed: 5 distances x 6 closed meshes, each with a ground quad. The methods take turns scene by scene,
+so that a busy machine slows down all equally: compare ratios. `scan` is timed including window, cast and packed points;
+the other methods get the rays of the window precomputed. "open3d" uses a legacy mesh, as the paper's released code
+does, "open3d direct" passes tensors; every method builds its tree for each body. The slow twin, the reference of the
+tests, casts a sample of the rays, and its time is scaled up. All on one thread.
 
     pip install embreex open3d-cpu matplotlib    # optional; Open3D also wants libusb-1.0-0 and libgl1 of the system
 """
@@ -17,7 +17,7 @@ import sys
 import time
 from pathlib import Path
 
-# before numpy and Open3D start their threads
+# set before numpy and Open3D start their threads
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
@@ -31,15 +31,15 @@ from reference.raycast_reference import cast_ray_list_reference, window_rays  # 
 DISTANCES = (4.0, 7.0, 10.0, 15.0, 20.0)
 MESHES = 6
 REFERENCE_RAYS = 16
-# of the meshes of the plot: 4 * rings * (rings - 1) triangles
+# rings of the meshes in the plot, which have 4 * rings * (rings - 1) triangles
 RINGS = (18, 25, 42, 60, 90)
 REFERENCE = "slow twin"
-# ms, of the plot
+# ms, ticks of the plot
 TICKS = (0.05, 0.1, 0.2, 0.3, 0.5, 1, 5, 20, 50)
 
 
 def blob(rng, rings):
-    """A closed bumpy mesh about as large as a person, with 4 * rings * (rings - 1) triangles."""
+    """A closed bumpy mesh of about the size of a person, with 4 * rings * (rings - 1) triangles."""
     segments = 2 * rings
     polar, angle = np.pi * np.arange(1, rings) / rings, np.pi * np.arange(segments) / rings
     ring = np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -60,7 +60,7 @@ def blob(rng, rings):
 
 
 def scenes(sensor, rings):
-    """Lists of (distance, vertices, faces, the body's vertex count); the ground's two faces are the last."""
+    """A list of (distance, vertices, faces, the body's vertex count); the ground's two faces are the last ones."""
     scene_list = []
     for m in range(MESHES):
         for distance in DISTANCES:
@@ -76,7 +76,7 @@ def scenes(sensor, rings):
 
 
 def other_ways():
-    """Name -> function(vertices, faces, rays, ...); each builds its tree and casts, as a new body needs."""
+    """Name -> function(vertices, faces, rays, ...) that builds the tree and casts, as is necessary for each body."""
     casters = {}
     try:
         from embreex import rtcore_scene
@@ -116,11 +116,11 @@ def other_ways():
 
 
 def measure(made, sensor, ways, rounds, *, reference=False):
-    """Way -> least seconds of each scene (scenes,), and the number of hits of each."""
+    """Method -> minimum seconds for each scene (scenes,), and the number of hits in each scene."""
     best = {name: np.full(len(made), np.inf) for name in (*ways, *([REFERENCE] if reference else []))}
     counts = np.zeros(len(made))
     rng = np.random.default_rng(0)
-    for turn in range(rounds + 1):  # the first turn warms up
+    for turn in range(rounds + 1):  # the first round is the warm-up
         for i, (_, vertices, faces, body) in enumerate(made):
             hits = scan(vertices, faces, sensor, window_vertices=vertices[:body])
             rays, counts[i] = window_rays(hits, sensor).reshape(-1, 3), len(hits.points)
@@ -150,7 +150,7 @@ def plot(path, sensor, by_distance, by_count):
             axis.plot(list(series), values, marker="o", ms=4, label=name)
         axis.set_yscale("log")
         axis.grid(True, lw=0.3)
-    # of both axes, which share them
+    # the limits of both axes, which are shared
     limits = left.get_ylim()
     left.set_yticks(TICKS, [f"{ms:g}" for ms in TICKS])
     left.set_ylim(limits)

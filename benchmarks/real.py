@@ -1,11 +1,11 @@
-"""Poses of labeled people in real sweeps, where boxes are labeled and joints are not.
+"""Poses of people in real sweeps with labeled boxes but without labeled joints.
 
     python benchmarks/real.py FOLDER --json docs/scores/real.json
 
-FOLDER holds sweep_N.pcd, .bin or .ply, and beside each a sweep_N.json of boxes as `lidarpose predict` takes them.
-Prints for each person: points, distance, the angle between where the pose faces and where the box heads, and that with
-`--tta 4`, the share of points within 15 cm of the skeleton's bones, lean of the trunk, confidence; and, for a track
-that two sweeps share, how far the pose moved against itself once both are put on one pelvis.
+FOLDER holds sweep_N.pcd, .bin or .ply, each with a sweep_N.json of boxes in the format of `lidarpose predict`. Prints
+for each person: points, distance, the angle between the pose's facing and the box's heading (also with `--tta 4`), the
+share of points within 15 cm of the skeleton's bones, lean of the trunk, and confidence. For tracks in two sweeps it
+also prints the mean joint distance between the two poses after their pelvises are aligned.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from lidarpose.models import DEFAULT
 from lidarpose.sample import facing
 from lidarpose.skeleton import SMPL24
 
-# a limb's half thickness with clothes and the noise of a range, m
+# half thickness of a limb, including clothes and range noise, m
 NEAR = 0.15
 
 
@@ -36,7 +36,7 @@ def distance_to_bones(points: np.ndarray, joints: np.ndarray) -> np.ndarray:
 
 
 def rows_of(model: Predictor, four: Predictor, folder: Path, least: int) -> Iterator[tuple[dict, PersonPose]]:
-    """Each labeled person of `least` points and more, sweep by sweep: their figures and their pose."""
+    """The figures and the pose of each labeled person with at least `least` points, sweep by sweep."""
     for labels in sorted(folder.glob("sweep_*.json")):
         sweep = next(path for path in sorted(folder.glob(f"{labels.stem}.*")) if path.suffix != ".json")
         boxes = {"people": json.loads(labels.read_text())["people"]}
@@ -60,14 +60,14 @@ def rows_of(model: Predictor, four: Predictor, folder: Path, least: int) -> Iter
 
 
 def turn(person: PersonPose) -> float:
-    """From where the box heads to where the pose faces, degrees."""
+    """The angle from the box's heading to the pose's facing, degrees."""
     forward = facing(person.pose)
     angle = np.arctan2(forward[1], forward[0]) - person.box.yaw
     return float(np.degrees((angle + np.pi) % (2 * np.pi) - np.pi))
 
 
 def moved(people: list[tuple[dict, PersonPose]]) -> Iterator[dict]:
-    """How far a person's joints went from one sweep to the next, both pelvises in one place, mm."""
+    """The mean joint distance between a person's poses in consecutive sweeps, with aligned pelvises, mm."""
     tracks: dict[str, list[np.ndarray]] = {}
     pelvis = SMPL24.index("pelvis")
     for row, person in people:

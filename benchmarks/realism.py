@@ -1,14 +1,14 @@
-"""How much synthetic people look like real ones: counts, rings, surfaces, ground, boxes.
+"""Similarity of synthetic and real people: counts, rings, surfaces, ground, boxes.
 
     python benchmarks/realism.py [FOLDER] [--people 60] [--picture docs/images/realism.png] [--crops crops.png]
 
-FOLDER holds real sweeps of Argoverse 2 as `benchmarks/real.py` takes them (sweep_N.pcd, .bin or .ply, and beside each
-a sweep_N.json of boxes); without it only the published averages are compared. Each real person of at least 50 points
-is set against `--people` people of the scene `wild` as the same sensor sees them at the same distance.
+FOLDER holds real sweeps of Argoverse 2 in the layout of `benchmarks/real.py` (sweep_N.pcd, .bin or .ply, each with a
+sweep_N.json of boxes); without it only the published averages are compared. Each real person with at least 50 points
+is compared with `--people` people of the scene `wild`, scanned with the same sensor at the same distance.
 
     points        in the box
-    rings         rows of the sensor with two points or more
-    ring step     median third of |r[i-1] - 2 r[i] + r[i+1]| along a ring, on the upper body: noise and curvature, m
+    rings         rows of the sensor with at least two points
+    ring step     third of the median |r[i-1] - 2 r[i] + r[i+1]| along a ring, upper body: noise and curvature, m
     ring offset   median distance from a ring's points to the mean of the rings above and below, upper body, m
     ground        share of the points within 10 cm of the box's bottom edge
     wide, tall    extent of the points across the line of sight and in height, m
@@ -35,20 +35,20 @@ from lidarpose.synth.scene import SCENES
 
 LEAST = 50
 SENSOR = "av2"
-# the roof carries two sensors of 32 rings, the lower one upside down; measured on the sweeps by what height makes the
-# elevations of its points fall on the maker's table
+# m; the roof carries two sensors of 32 rings, the lower one upside down. The height was measured on the sweeps: with
+# it, the elevations of the lower sensor's points match the manufacturer's table
 LOWER_HEAD = -0.11
-# a point belongs to a ring whose elevation is this near, degrees
+# a point belongs to a ring if their elevations differ by less than this, degrees
 RING_TOLERANCE = 0.07
 GROUND = 0.1
-# people whom a tilted sensor looks at are within this azimuth, rad
+# maximum azimuth of people in front of a tilted sensor, rad
 AHEAD = np.radians(40.0)
 UPPER_BODY = (0.5, 0.85)
 MEASURES = ("points", "rings", "ring step", "ring offset", "ground", "wide", "tall")
 
 
 def measures(points: np.ndarray, ring: np.ndarray, box: Box) -> dict[str, float]:
-    """The figures of one person. points (n, 3) m in the sensor's frame, ring (n,), -1 for none; box as a detector's."""
+    """The figures of one person. points (n, 3) m in the sensor frame, ring (n,), -1 for none; box as of a detector."""
     bottom = box.center[2] - box.size[2] / 2
     forward = box.center[:2] / np.linalg.norm(box.center[:2])
     lateral = points[:, :2] @ [-forward[1], forward[0]]
@@ -68,7 +68,7 @@ def measures(points: np.ndarray, ring: np.ndarray, box: Box) -> dict[str, float]
 
 
 def along_rings(points: np.ndarray, ring: np.ndarray) -> tuple[float, float]:
-    """Roughness along rings and between them, m; nan where there are too few points."""
+    """Roughness along rings and between rings, m; NaN if there are too few points."""
     distance = np.linalg.norm(points, axis=1)
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     steps, middles = [], []
@@ -90,7 +90,7 @@ def along_rings(points: np.ndarray, ring: np.ndarray) -> tuple[float, float]:
 
 
 def rings_of(points: np.ndarray) -> np.ndarray:
-    """(n,) rings of points of a real sweep, by the elevation seen from either head; -1 for points between rings."""
+    """(n,) rings of a real sweep's points, from their elevations relative to the two heads; -1 between rings."""
     table = np.degrees(sensor("vlp-32c").elevations)
     horizontal = np.hypot(points[:, 0], points[:, 1])
     deviations, numbers = [], []
@@ -104,7 +104,7 @@ def rings_of(points: np.ndarray) -> np.ndarray:
 
 
 def real_people(folder: Path) -> list[tuple[str, float, np.ndarray, np.ndarray, Box]]:
-    """(name, distance m, points (n, 3), ring (n,), box) of the labeled people of at least `LEAST` points."""
+    """(name, distance m, points (n, 3), ring (n,), box) of the labeled people with at least `LEAST` points."""
     people = []
     for labels in sorted(folder.glob("sweep_*.json")):
         sweep = next(path for path in sorted(folder.glob(f"{labels.stem}.*")) if path.suffix != ".json")
@@ -119,15 +119,15 @@ def real_people(folder: Path) -> list[tuple[str, float, np.ndarray, np.ndarray, 
 
 
 def synthetic_people(distance: float, count: int, seed: int) -> list[tuple[np.ndarray, np.ndarray, Box]]:
-    """(points, ring, box) of `count` people of `wild` within 5 percent of a distance, seen as by the real sensor."""
+    """(points, ring, box) of `count` people of `wild` within 5 percent of a distance, scanned with the real sensor."""
     scene = replace(SCENES["wild"], sensors=(SENSOR,), distance=(0.95 * distance, 1.05 * distance), median_points=0)
     maker = Generator(scene=scene, measure=False)
     samples = [maker.person(seed, index).sample for index in range(count)]
     return [(sample.points, sample.ring, sample.box) for sample in samples if len(sample.points)]
 
 
-# published means: data set, sensor, its tilt in rad, its height over the ground in m, points a person, mean distance
-# in m (None: not published). From the review arXiv:2509.12197; SLOPER4D's sensor leans by 45 deg
+# published means: data set, sensor, its tilt in rad, its height above the ground in m, points per person, mean distance
+# in m (None: not published). From the review arXiv:2509.12197; SLOPER4D's sensor is tilted by 45 deg
 PUBLISHED = (
     ("Waymo", "waymo-top", 0.0, 2.0, 384, 14.5),
     ("SLOPER4D", "os1-128", np.radians(45.0), 1.7, 968, 2.81),
@@ -136,11 +136,11 @@ PUBLISHED = (
 
 
 def points_alone(device: Sensor | RayPattern, tilt: float, height: float, distance: float, count: int) -> float:
-    """Median of the returns of `count` bodies with nothing around, somewhere ahead of a sensor."""
+    """Median number of returns from `count` isolated bodies at random places in front of a sensor."""
     rng, bodies, counts = np.random.default_rng(0), draw_bodies(None, 0.0, count, 1, 0), []
     mount = rotation_about("y", -tilt)
     for body in bodies.vertices:
-        # a tilted sensor sees all of a person only beside the way it is tilted
+        # a tilted sensor sees a whole person only near the direction of its tilt
         azimuth = rng.uniform(-AHEAD, AHEAD)
         vertices = (body + [distance * np.cos(azimuth), distance * np.sin(azimuth), -height]) @ mount.T
         if isinstance(device, RayPattern):
@@ -151,14 +151,15 @@ def points_alone(device: Sensor | RayPattern, tilt: float, height: float, distan
 
 
 def print_published(count: int) -> None:
-    """What our sensors cast where people of published data sets are, and where they cast as much as is published.
+    """Prints the points per person of our sensors at the mean distances of published data sets, and the distances at
+    which they give the published numbers of points.
 
-    A mean of points lies above the points at the mean distance, since they go with 1 / distance^2.
+    A mean number of points exceeds the number at the mean distance, since points are proportional to 1 / distance^2.
     """
     distances = np.geomspace(2, 30, 10)
     for name, device, tilt, height, mean, distance in PUBLISHED:
         counts = [points_alone(sensor(device), tilt, height, d, count) for d in distances]
-        # from afar: very near, the fan cuts people
+        # accumulated from far to near: at very small distances the vertical field of view cuts people off
         from_afar = np.maximum.accumulate(np.maximum(counts, 1)[::-1])
         same_distance = np.exp(np.interp(np.log(mean), np.log(from_afar), np.log(distances)[::-1]))
         line = f"{name}: {mean} points a person on average; {device} casts as many at {same_distance:.1f} m"
@@ -169,7 +170,7 @@ def print_published(count: int) -> None:
 
 
 def compare(real: list, count: int) -> tuple[list[tuple], list[tuple]]:
-    """Rows (name, distance, real figures, synthetic figures: one dict a person) and the synthetic crops."""
+    """Rows (name, distance, real figures, synthetic figures: one dict per person) and the synthetic crops."""
     rows, crops = [], []
     for number, (name, distance, points, ring, box) in enumerate(real):
         synthetic = synthetic_people(distance, count, seed=100 + number)
@@ -179,7 +180,7 @@ def compare(real: list, count: int) -> tuple[list[tuple], list[tuple]]:
 
 
 def print_table(rows: list[tuple]) -> None:
-    """Each real figure, and below it the 10, 50 and 90 percent quantiles of the synthetic people."""
+    """Prints each real figure, and below it the 10, 50 and 90 percent quantiles of the synthetic people."""
     print(f"{'real person':>14} {'m':>5} " + " ".join(f"{name:>17}" for name in MEASURES))
     inside_counts = dict.fromkeys(MEASURES, 0)
     for name, distance, figures, synthetic in rows:
@@ -203,7 +204,7 @@ def print_table(rows: list[tuple]) -> None:
 
 
 def draw(rows: list[tuple], path: Path) -> None:
-    """Figures by distance: real people as dots, synthetic ones as bars of their 10 to 90 percent."""
+    """Draws figures by distance: real people as dots, synthetic ones as bars from 10 to 90 percent."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -233,7 +234,7 @@ def draw(rows: list[tuple], path: Path) -> None:
 
 
 def draw_crops(real: list, crops: list, path: Path) -> None:
-    """Real crops from the front and from the side, over three synthetic ones of the same sensor and distance."""
+    """Draws real crops from the front and the side, above three synthetic ones of the same sensor and distance."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,11 +1,11 @@
-"""How fast recordings are posed, from points in memory to joints: sweeps a second without tracks and with them.
+"""Speed of predicting recordings, from points in memory to joints: sweeps per second without and with tracks.
 
     python benchmarks/recording_speed.py --sweeps 1000
 
-A street of the generator is seen by an OS1-128, of whose returns every other one is kept, about 100,000 a sweep; the
-frames are repeated forth and back. Printed are wall and processor time a sweep, what each part takes (the detector runs
-beside them, a frame ahead), people a sweep, tracks, and the memory after a tenth of the sweeps and after all. On a
-machine that does something else, the processor time tells more.
+A generated street is scanned with an OS1-128, of which every second return is kept, about 100,000 per sweep; the frames
+are repeated forwards and backwards. Printed are wall and processor time per sweep, the time of each part (the detector
+runs in parallel, one frame ahead), people per sweep, tracks, and the memory after a tenth of the sweeps and after all.
+On a busy machine, the processor time is more informative.
 """
 
 import argparse
@@ -24,13 +24,13 @@ RATE = 10.0
 
 
 def clouds(seed: int, people: int, count: int) -> list[np.ndarray]:
-    """Points (n, 3) m of so many frames."""
+    """Points (n, 3) m of `count` frames."""
     frames = street(seed, 0, people=(people, people), frames=count).frames
     return [frame.points[::2].astype(float) for frame in frames]
 
 
 class ForthAndBack:
-    """A source of so many frames in order of time, in which nobody jumps."""
+    """A source of `count` frames in chronological order, in which no person jumps."""
 
     name, warnings = "street", ()
 
@@ -66,7 +66,7 @@ def main() -> None:
         memory = []
         source = ForthAndBack(points, options.sweeps + 2)
         for result in lidarpose.predict_recording(source, track=track, model=model):
-            # the first two compile and warm up
+            # the first two frames compile and warm up
             if result.index == 1:
                 wall, processor = time.perf_counter(), time.process_time()
                 parts.clear()

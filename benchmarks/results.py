@@ -1,14 +1,14 @@
-"""The tables of the README, docs/results.md, evaluate.md, method.md and the model cards, from docs/scores.
+"""Writes the tables of the README, docs/results.md, evaluate.md, method.md and the model cards, from docs/scores.
 
     python benchmarks/results.py --collect runs/ablations     # runs' scores.json into docs/scores/ablations.json
     python benchmarks/results.py                              # docs/scores -> the tables of the pages
-    python benchmarks/results.py --check                      # exit code 1 where they differ
+    python benchmarks/results.py --check                      # exit code 1 if they differ
 
-docs/scores/paper is what `lidarpose paper` wrote, NAME.json what `lidarpose evaluate NAME bench` wrote, NAME-2.json of
-bench-2, NAME-unknown.json with `--sensor-unknown`, stability/NAME.json what it writes besides with `--stability`; the
-others are what the benchmarks of their names wrote.
+docs/scores/paper is the output of `lidarpose paper`, NAME.json that of `lidarpose evaluate NAME bench`, NAME-2.json the
+same for bench-2, NAME-unknown.json with `--sensor-unknown`, and stability/NAME.json the additional output with
+`--stability`. The other files are the output of the benchmarks with the same names.
 
-A table stands between `<!-- table NAME -->` and `<!-- end -->`; the words around it are left as they are.
+A table stands between `<!-- table NAME -->` and `<!-- end -->`; the text around it is not changed.
 """
 
 import argparse
@@ -44,42 +44,42 @@ PAGES = (
 # the networks that find people
 FINDING = ("detector", VERIFIER)
 RUNS = "ablations"
-# people of the longer runs that ask again what the first ones do
+# number of people in the longer runs that repeat the first studies
 LONGER = 98_304
-# plain people, in the words of heldout.py
+# the name of plain people in heldout.py
 _PLAIN = "upright, whole, uncluttered"
 _MARKED = re.compile(r"(<!-- table ([^>]+?) -->\n).*?(<!-- end -->)", re.S)
-# studies shown in one table
+# studies that share one table
 _MORE = ("levels", "mask", "scene", "motion", "network", "steps")
 
 
 def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    """A table of markdown."""
+    """A Markdown table."""
     lines = [header, ("---",) * len(header), *rows]
     return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 
 
 def _longest() -> dict[int, dict[str, float]]:
-    """The figures of `tiny` as it ships, by the number of people that it has seen in all its runs."""
+    """The figures of the released `tiny`, by the number of people in all its training runs."""
     scores = {name: figure["value"] for name, figure in figures(_scored("tiny").results[0]).items()}
     return {sum(entry["people_seen"] for entry in runs_of(read_header(bundled_path("tiny")).card)): scores}
 
 
 def strays(**networks: str) -> str:
-    """What clusters of stray points cost networks, by the name of their study."""
+    """The increase of errors by clusters of stray points, for networks by the name of their study."""
     header = ("", "undisturbed, mm", *(f"two of {amount} points" for amount in disturbed.amounts(next(iter(networks)))))
     return table(header, [(what, *disturbed.strays(name)) for name, what in networks.items()])
 
 
 @lru_cache
 def _read(name: str) -> dict:
-    """What a benchmark wrote."""
+    """The output of a benchmark."""
     return json.loads((SCORES / f"{name}.json").read_text())
 
 
 @lru_cache
 def _scored(model: str) -> Scores:
-    """What a bundled model scored on lidarpose-bench."""
+    """The scores of a bundled model on lidarpose-bench."""
     return read_scores(SCORES / f"{model}.json")
 
 
@@ -97,12 +97,12 @@ def _interval(line: MetricRow) -> str:
 
 
 def _cell(line: MetricRow) -> str:
-    """The value, and its interval where there is one."""
+    """The value, and its interval if it has one."""
     return f"{line.value:.1f} {_interval(line)}".rstrip()
 
 
 def headline(bench: str, **files: str) -> str:
-    """What the scores of a bench say of networks side by side. files: title -> name of the scores."""
+    """The main figures of several networks on a bench. files: column title -> name of the scores."""
     figure_by_title = {
         "MPJPE, mm": ("all", "mpjpe"),
         "95th percentile of people's errors, mm": ("all", "mpjpe_p95"),
@@ -126,21 +126,21 @@ def headline(bench: str, **files: str) -> str:
 
 
 _MEAN_POSE = f"{BASELINE}mean pose, true facing"
-# the bundled models, and the default one of before
+# the bundled models, and the previous default model
 _FIRST = {"`tiny`": "tiny", "`small` of 0.2.0": "small-before", "`small`": "small"}
 _SECOND = {"`tiny`": "tiny-2", "`small` of 0.2.0": "small-2-before", "`small`": "small-2"}
 _CONDITIONS = ("clean", "cluttered", "company", "crop", "occluded")
 
 
 def _mpjpe(file: str, method: str) -> dict[tuple[str, str], MetricRow]:
-    """Lines of MPJPE on lidarpose-bench, by group and by what of it."""
+    """MPJPE rows of a method, by group and entry of the group."""
     lines = _scored(file).results[0].lines
     mpjpe_lines = (x for x in lines if (x.method, x.figure, x.arithmetic) == (method, "mpjpe", "lidarpose"))
     return {(line.group, line.of): line for line in mpjpe_lines}
 
 
 def readme() -> str:
-    """The headline: the default network, the mean pose beside it, and what the paper prints for its own data."""
+    """The headline: the default network, the mean pose, and the paper's published figure on its own data."""
     network_line, mean_pose = _mpjpe(DEFAULT, DEFAULT)["all", "all"], _mpjpe(DEFAULT, _MEAN_POSE)["all", "all"]
     dapt = next(method for method in published()["methods"] if method["method"] == "DAPT")["figures"]["waymo"]
     rows = [
@@ -155,7 +155,7 @@ def readme() -> str:
 
 
 def conditions() -> str:
-    """The default network by condition, the sensor's position known or not, beside the mean pose."""
+    """The default network by condition, with known and unknown sensor position, and the mean pose."""
     groups = [("all", "all"), *(("condition", name) for name in _CONDITIONS)]
     groups.append(("plain", f"{_PLAIN}, 100 points"))
     sources = {
@@ -171,8 +171,8 @@ def conditions() -> str:
 
 
 def second_bench(group: str) -> str:
-    """MPJPE of the bundled models, and of the default one of before, on lidarpose-bench-2 by a group of people, the
-    default's worst last."""
+    """MPJPE of the bundled models and the previous default on lidarpose-bench-2 by a group of people, in ascending
+    order for the default."""
     scores = {name: _mpjpe(file, _scored(file).results[0].setting.method) for name, file in _SECOND.items()}
     lines = [line for key, line in scores["`small`"].items() if key[0] in ("all", group)]
     lines.sort(key=lambda line: (line.group != "all", line.value))
@@ -184,14 +184,14 @@ def second_bench(group: str) -> str:
 
 
 def persons() -> str:
-    """How well networks that say whether somebody is there tell so, on lidarpose-bench-2."""
+    """AUROC of the predictions `person` and `second_person` on lidarpose-bench-2, for networks that have them."""
     figure_by_title = {
         "`person`: people before objects": "person_auroc",
         "`second_person`: crops of two people before those of one": "second_person_auroc",
     }
     lines = {(model, line.figure): line for model in BUNDLED for line in own_lines(_scored(f"{model}-2").results[0])}
     models = [model for model in BUNDLED if (model, "person_auroc") in lines]
-    # one decimal would round to more than it is
+    # two decimals, since one would round up too far
     rows = [
         (what, *(f"{lines[model, figure].value:.2f}" for model in models)) for what, figure in figure_by_title.items()
     ]
@@ -199,7 +199,7 @@ def persons() -> str:
 
 
 def card(model: str) -> str:
-    """How a bundled model was made, as its file says."""
+    """How a bundled model was trained, from the card in its file."""
     path = bundled_path(model)
     card = read_header(path).card
     runs = runs_of(card)
@@ -225,7 +225,7 @@ def card(model: str) -> str:
 
 
 def finding_card(name: str) -> str:
-    """How a network that finds people was made, as its file says."""
+    """How a network for detecting people was trained, from the card in its file."""
     path = weights_file(f"{name}.safetensors")
     runs = runs_of(read_header(path).card)
     onnx = path.with_suffix(".onnx")
@@ -243,26 +243,26 @@ def finding_card(name: str) -> str:
 
 
 def progress(model: str) -> str:
-    """What the runs of a bundled model brought one after the other, as its file says."""
+    """The results of a bundled model's consecutive training runs, from the card in its file."""
     rows, people, hours = [], 0, 0.0
     for run in reversed(runs_of(read_header(bundled_path(model)).card)):
         people, hours = people + run["people_seen"], hours + run["hours"]
         scores = run.get("scores", {})
         held_out = (scores.get(f"sensor known, {group}", "- -").split()[1] for group in ("all", _PLAIN))
-        # a run that was stopped early has none
+        # a run that was stopped early has no validation
         validation = f"{run['validation_mm']:.1f}" if "validation_mm" in run else "-"
         rows.append((f"`{run['recipe']['size']}`", f"{people:,}", f"{hours:.1f}", validation, *held_out))
     return table(("", "people in total", "hours", "validation mm", "`heldout.py` mm", "`heldout.py` plain mm"), rows)
 
 
 def _in_all(runs: list[dict], name: str, form: str) -> str:
-    """A number of the last run, and of all of them."""
+    """A number of the last run, and its sum over all runs."""
     last_value = f"{runs[0][name]:{form}}"
     return last_value if len(runs) == 1 else f"{last_value}; over all runs {sum(run[name] for run in runs):{form}}"
 
 
 def extras(model: str) -> str:
-    """What test-time extras bring; see test_time.py."""
+    """Effects of test-time augmentation; see test_time.py."""
     rows = []
     report = _read("test_time")[model]
     usual_entry = next(entry for entry in report["ways"] if entry["usual"])
@@ -276,7 +276,7 @@ def extras(model: str) -> str:
 
 
 def visibility() -> str:
-    """Conditions against clean people of whom as much is hidden; see visibility.py."""
+    """Conditions compared with equally occluded clean people; see visibility.py."""
     rows = []
     for model, rows_of_model in _read("visibility").items():
         for entry in rows_of_model:
@@ -288,7 +288,7 @@ def visibility() -> str:
 
 
 def real() -> str:
-    """Real people; see real.py."""
+    """Figures of real people; see real.py."""
     rows = [
         (
             entry["sweep"].removeprefix("sweep_"),
@@ -308,7 +308,7 @@ def real() -> str:
 
 
 def clips() -> str:
-    """Poses over clips made steady; see clips.py."""
+    """Smoothed poses of clips; see clips.py."""
     rows = []
     for name, scores in _read("clips")["ways"].items():
         cells = [name]
@@ -325,18 +325,18 @@ def clips() -> str:
 
 
 def moved() -> str:
-    """How far real people's joints went between two sweeps; see real.py."""
+    """Joint distances of real people between two sweeps; see real.py."""
     rows = [(entry["person"], f"{entry['mm']:.0f}") for entry in _read("real")["tracks"]]
     return table(("person", "mean over joints, mm"), rows)
 
 
 def detector(dataset: str, *groups: str) -> str:
-    """Recall of people in whole scans by false people a scan; see `lidarpose evaluate detector`."""
+    """Recall of people in whole scans at given false positives per scan; see `lidarpose evaluate detector`."""
     result = next(candidate for candidate in _read("detector")["results"] if candidate["dataset"] == dataset)
     rows = [row for row in result["rows"] if row["figure"] == "recall" and row["group"] in groups]
     cells: dict[tuple[str, str], dict[str, str]] = {}
     for row in rows:
-        # of older scores, those without width
+        # older scores may have an interval of zero width
         ends = "" if row["low"] == row["high"] else f" [{row['low']:.0f}, {row['high']:.0f}]"
         value = "" if row["value"] is None else f"{row['value']:.1f}{ends}"
         name = row["group"] if row["of"] == "all" else f"{row['group']}: {row['of']}"
@@ -346,7 +346,7 @@ def detector(dataset: str, *groups: str) -> str:
 
 
 def detected_boxes() -> str:
-    """Poses in boxes of the detector beside those in labeled ones; see `lidarpose evaluate detector`."""
+    """Poses in detected boxes compared with poses in labeled boxes; see `lidarpose evaluate detector`."""
     result = next(candidate for candidate in _read("detector")["results"] if candidate["dataset"] == "heldout")
     figures = {name: f"mpjpe_{name}" for name in ("found", "given", "difference")}
     rows = []
@@ -359,7 +359,7 @@ def detected_boxes() -> str:
 
 
 def background() -> str:
-    """People found with and without a learned background; see background.py."""
+    """Detected people with and without a learned background; see background.py."""
     rows = [
         (
             "the default" if row["score"] is None else f"{row['score']:g}",
@@ -375,13 +375,13 @@ def background() -> str:
 
 
 def calibration() -> str:
-    """Whether confidence and visibility can be taken at their word; see calibration.py."""
+    """Calibration of confidence and visibility; see calibration.py."""
     rows = [(entry["what"], f"{entry['ece']:.3f}", f"{entry['auroc']:.3f}") for entry in _read("calibration")["stated"]]
     return table(("", "expected calibration error", "AUROC"), rows)
 
 
 def spread() -> str:
-    """What `spread` predicts beside the truth; see calibration.py."""
+    """Predicted `spread` compared with true errors; see calibration.py."""
     report = _read("calibration")
     rows = [
         (entry["of"], f"{entry['share']:.1f} %", f"{entry['stated']:.1f}", f"{entry['true']:.1f}")
@@ -400,14 +400,14 @@ def rejection(model: str) -> str:
 
 
 def _labels(variant: str) -> dict[str, str]:
-    """The study that a variant belongs to, and what it is."""
+    """The study and the description of a variant."""
     if variant in WAYS:
         return {"study": "paper", "what": WAYS[variant].what}
     return {"study": VARIANTS[variant].study, "what": VARIANTS[variant].what}
 
 
 def tracks() -> str:
-    """Who is who on streets of ten people; see tracks.py."""
+    """Tracking on streets of ten people; see tracks.py."""
     names = ("idf1", "hota", "mota", "recall", "precision")
     rows = [
         (row["boxes"], row["by"], *(f"{row[name]:.3f}" for name in names), str(row["switches"]))
@@ -417,13 +417,13 @@ def tracks() -> str:
 
 
 def paper(name: str) -> str:
-    """A table of the paper on synthesized people, and what its finished cells cost; see `lidarpose paper`."""
+    """A table of the paper on synthesized people, and the cost of its finished cells; see `lidarpose paper`."""
     content = _read(f"paper/{name}")
     return "\n".join([*report.result_lines(content), "", *report.cost_lines(content, finished=True), ""])
 
 
 def tables() -> dict[str, Callable[[], str]]:
-    """What makes each table, by name."""
+    """The functions that create the tables, by table name."""
     all_runs = [run | _labels(run["variant"]) for run in _read(RUNS)]
     runs, later_runs = (
         [run for run in all_runs if bool(run["begun"]) == is_continued] for is_continued in (False, True)
@@ -481,7 +481,7 @@ def tables() -> dict[str, Callable[[], str]]:
 
 
 def written(page: str) -> str:
-    """The page, its tables made anew. Raises KeyError for a table that nothing makes."""
+    """The page with regenerated tables. Raises KeyError for an unknown table."""
     makers = tables()
     return _MARKED.sub(lambda match: match[1] + "\n" + makers[match[2]]() + "\n" + match[3], page)
 

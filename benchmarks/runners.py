@@ -1,9 +1,9 @@
-"""What `benchmarks/network.py` times: people in the numbers it wants, and each network behind one interface.
+"""Inputs and networks for `benchmarks/network.py`: people with given numbers of points, and a common interface.
 
-Legend: B people a call, n points a person, J joints.
+Legend: B people per call, n points per person, J joints.
 
-A runner does in two halves, of which the first is not the network's: tables, then joints of them; a lesson, as a loader
-makes it in another process, then a training step on it.
+A runner splits its work into two parts, the first of which is not part of the network. For a forward pass these are the
+tables, then the joints. For training they are a lesson, which a loader prepares in another process, then a step on it.
 """
 
 import argparse
@@ -32,18 +32,18 @@ from lidarpose.train.optim import average, optimizers
 from lidarpose.train.recipes import Pretrain
 
 SIZES = ("tiny", "small", "base", "paper")
-# median points a person of those who come as in training
+# median points per person of crops as in training
 CROP_POINTS = 170
-# people a batch; the paper's network is a hundred times as large
+# people per batch; the paper's network is a hundred times as large
 BATCH, PAPER_BATCH = 64, 8
-# a point that is doubled moves so far, m
+# m; standard deviation of the shift of duplicated points
 SPREAD = 0.01
 DRAFT = "draft"
 RECIPE = Pretrain()
 
 
 def crops(number: int, rng: np.random.Generator) -> list[Example]:
-    """So many people as they come in training, dense ones left out at random until their median is `CROP_POINTS`."""
+    """`number` people as in training, with dense ones left out so that the median is `CROP_POINTS`."""
     generator = Generator(scene=scene_config(RECIPE.scene), measure=False)
     halves: tuple[list, list] = [], []
     index = 0
@@ -55,7 +55,7 @@ def crops(number: int, rng: np.random.Generator) -> list[Example]:
 
 
 def of_points(people: list[Example], n: int, number: int, rng: np.random.Generator) -> list[Example]:
-    """The `number` people whose points are nearest to n in number, brought to exactly n."""
+    """The `number` people whose numbers of points are closest to n, resampled to exactly n points."""
     nearest_people = sorted(people, key=lambda e: abs(math.log(len(e.points) / n)))[:number]
     nearest_people = [nearest_people[k % len(nearest_people)] for k in rng.permutation(number)]
     return [_resampled(person, n, rng) for person in nearest_people]
@@ -74,14 +74,15 @@ def _resampled(person: Example, n: int, rng: np.random.Generator) -> Example:
 
 
 def batches(people: list[Example], size: int, number: int) -> list[list[Example]]:
-    """`number` batches of `size`, sorted by voxels as `train.data_loader` sorts a chunk; every k-th of too many."""
+    """`number` batches of `size`, sorted by voxels as `train.data_loader` sorts a chunk; surplus people are evenly
+    left out."""
     order = sorted(people, key=lambda e: len(np.unique(np.floor(e.points * 10), axis=0)))
     selected_people = [order[k * len(order) // (size * number)] for k in range(size * number)]
     return [selected_people[k * size : (k + 1) * size] for k in range(number)]
 
 
 class Runner:
-    """A network to time. tables, joints: a forward pass in two halves; lesson, step: a training step in two halves."""
+    """A network to time. tables, joints: the two parts of a forward pass; lesson, step: those of a training step."""
 
     batch = BATCH
     trains = True
@@ -94,22 +95,22 @@ class Runner:
         self.parameters = 0 if network is None else count(network)
 
     def tables(self, people: list[Example]) -> object:
-        """What the network reads of people, on its device."""
+        """The network's input for people, on its device."""
         raise NotImplementedError
 
     def joints(self, tables: object) -> np.ndarray:
-        """(B, J, 3) m."""
+        """Joints (B, J, 3) m."""
         raise NotImplementedError
 
     def lesson(self, people: list[Example]) -> object:
-        """What a loader would hand to the training step."""
+        """The input that a loader would pass to the training step."""
         raise NotImplementedError
 
     def loss(self, lesson: object) -> torch.Tensor:
         raise NotImplementedError
 
     def step(self, lesson: object) -> None:
-        """A whole training step, to its end on any device."""
+        """A whole training step, including waiting for the device."""
         if self.optimizer is None:
             self.optimizer = torch.optim.AdamW(self.network.parameters(), lr=1e-3, weight_decay=0.01, fused=True)
         self.optimizer.zero_grad(set_to_none=True)
@@ -132,7 +133,7 @@ class Runner:
             self.network.train(mode)
 
     def rest(self) -> None:
-        """Frees what only training holds, so that the next one's turn begins as this one's did."""
+        """Frees the gradients, so that the next runner starts with the same memory as this one."""
         if self.network is not None:
             self.network.zero_grad(set_to_none=True)
 
@@ -180,7 +181,7 @@ class Ours(Runner):
 
 
 class Onnx(Runner):
-    """A network of this package, run by ONNX Runtime from a file: the predictor's path, voxels to decoded joints."""
+    """A network of this package in ONNX Runtime, as in the predictor: from voxels to decoded joints."""
 
     trains = False
 
@@ -194,7 +195,7 @@ class Onnx(Runner):
         self.file, self.backend = onnx, backend
         self.session, self.threads = onnx.open_onnx(path)[0], threads
         self.decoder = decode.decoder("window")
-        # parts are of no use to the predictor: what is not asked for is not computed
+        # the predictor does not need the parts, and outputs that are not requested are not computed
         self.outputs = [name for name in onnx.OUTPUTS if name != "part"]
 
     def tables(self, people):
@@ -215,14 +216,14 @@ class Onnx(Runner):
 
 
 class Session(Onnx):
-    """The bare session: only its own run counts as the network."""
+    """Only the ONNX session: the network time is that of the session's run."""
 
     def joints(self, tables):
         return self.run(tables)[0]
 
 
 class Predict(Runner):
-    """The public `predict` of one cloud: its checks, two passes, the choice among candidates."""
+    """The public `predict` for one cloud: its checks, two passes, the choice among candidates."""
 
     trains = False
     batch = 1
@@ -268,7 +269,7 @@ class Paper(Runner):
         tables = self._tables(people)
         part = np.concatenate([person.part for person in people])[tables.kept]
         true = np.stack([person.joints for person in people])
-        # the place of each of this skeleton's joints among the network's, inverted
+        # inverts the order, which maps this skeleton's joints to the network's
         place = np.argsort(self.order)
         return tables, torch.as_tensor(true[:, place]), torch.as_tensor(part, dtype=torch.int64)
 
@@ -281,7 +282,7 @@ class Paper(Runner):
 
 
 class Baseline(Runner):
-    """One of `backbones`."""
+    """A network of `backbones`."""
 
     def tables(self, people):
         return self.network.prepare([person.points for person in people])
@@ -299,12 +300,12 @@ class Baseline(Runner):
 
 
 def _distance(joints: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
-    """(B, J, 3) m each -> mean distance, m."""
+    """Mean distance, m, of joints (B, J, 3) m."""
     return (joints.float() - true).norm(dim=-1).mean()
 
 
 def baselines(size: str) -> dict[str, Callable[[], nn.Module]]:
-    """By name, the networks that stand beside a size of ours, with as many parameters."""
+    """By name, the baselines for a size of our network, with about the same number of parameters."""
     kinds = {"ViT": GroupedViT, "PointNet++": PointNet2}
     parameters = count(PoseNet(preset(size)))
     factories = {
@@ -314,7 +315,7 @@ def baselines(size: str) -> dict[str, Callable[[], nn.Module]]:
 
 
 def runner(name: str, device: str = "cpu") -> Runner:
-    """A runner by name, but for those of a file. Raises ImportError where its code is not there."""
+    """A runner by name, except for ONNX and predictor runners. Raises ImportError if its code is missing."""
     if name in SIZES:
         return Paper(device) if name == "paper" else Ours(name, device)
     factories = baselines("tiny") | baselines("small")
@@ -323,7 +324,7 @@ def runner(name: str, device: str = "cpu") -> Runner:
 
 
 def runners_of(options: argparse.Namespace, folder: Path, left_out: list[str]) -> list[Runner]:
-    """All that take part; a reason in `left_out` for each that cannot."""
+    """All runners; for those that cannot run, a reason is added to `left_out`."""
     names = []
     for size in options.sizes:
         names.append(size)
@@ -342,7 +343,7 @@ def runners_of(options: argparse.Namespace, folder: Path, left_out: list[str]) -
 
 
 def _from_files(ours: Ours, folder: Path, threads: int, left_out: list[str]) -> Iterator[Runner]:
-    """What ONNX Runtime runs of a network, and the public predictors of the smallest one."""
+    """The ONNX runners of a network, and for the smallest one those of the public predictors."""
     weights, path = folder / f"{ours.name}.safetensors", folder / f"{ours.name}.onnx"
     try:
         from lidarpose.models.checkpoint import save_checkpoint
@@ -354,7 +355,7 @@ def _from_files(ours: Ours, folder: Path, threads: int, left_out: list[str]) -> 
         onnx_runner, session_runner = Onnx(ours, path, threads), Session(ours, path, threads)
         session_runner.name += ", session"
         yield from (onnx_runner, session_runner)
-    # whatever an exporter or a runtime raises: the other rows are worth having without this one
+    # an exporter or a runtime may raise any exception; the other rows are still useful
     except Exception as error:
         left_out.append(f"{ours.name} ONNX: {reason(error)}")
     if ours.name != "tiny":
@@ -371,7 +372,7 @@ def _from_files(ours: Ours, folder: Path, threads: int, left_out: list[str]) -> 
 
 
 def reason(error: Exception) -> str:
-    """An error as a part of one line."""
+    """An error as text for one line."""
     return f"{type(error).__name__}: {' '.join(str(error).split())[:160]}"
 
 

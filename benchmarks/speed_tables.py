@@ -1,8 +1,8 @@
-"""Tables of speed, from what `network.py --json` wrote; how its report tells rates and targets too."""
+"""Tables of speed from the output of `network.py --json`; also formats rates and targets for its report."""
 
 from collections.abc import Callable
 
-# what is shown, by the names of network.py
+# the shown networks, by their names in network.py
 NETWORKS = ("tiny", "tiny ONNX", "small", "small ONNX", "base", "base ONNX", "paper", "draft")
 NETWORKS += ("ViT as small", "PointNet++ as small")
 POINTS = (128, 256, 512, 1024)
@@ -11,12 +11,12 @@ Rows = tuple[tuple[str, ...], list[tuple[str, ...]]]
 
 
 def rate(seconds: float) -> str:
-    """People a second of seconds a person."""
+    """People per second, from seconds per person."""
     return f"{1 / seconds:,.0f}" if seconds < 0.05 else f"{1 / seconds:.1f}"
 
 
 def medians(record: dict) -> Rows:
-    """Latency, people a second forward and in training, by points."""
+    """Latency, and people per second in forward passes and in training, by number of points."""
     seconds = {(entry["section"], entry["network"], entry["points"]): entry["median_s"] for entry in record["times"]}
     rows = []
 
@@ -35,13 +35,13 @@ def medians(record: dict) -> Rows:
 
 
 def ratios(targets: list[dict]) -> Rows:
-    """Single figures of network.py, by the medians and by the best rounds, without what was asked of them."""
+    """Single figures of network.py, from the medians and from the best rounds, without their targets."""
     rows = [(target["what"], *_figures(target)) for target in targets]
     return ("", "by medians", "by best rounds"), rows
 
 
 def asked(targets: list[dict]) -> Rows:
-    """Targets of network.py, and what came of them; figures are None where nothing was measured."""
+    """Targets of network.py and their results; figures are None if not measured."""
     rows = []
     for target in targets:
         requirement = f"{'at most' if target['most'] else 'at least'} {target['target']:g} {target['unit']}".strip()
@@ -51,7 +51,7 @@ def asked(targets: list[dict]) -> Rows:
 
 
 def _figures(target: dict) -> list[str]:
-    """By the medians and by the best rounds."""
+    """The figures from the medians and from the best rounds."""
     return [
         "-" if target[name] is None else f"{target[name]:,.2f} {target['unit']}".strip() for name in ("figure", "best")
     ]

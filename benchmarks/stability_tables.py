@@ -1,4 +1,4 @@
-"""Rows of tables of what disturbed points cost, from the stability.json files that lie in docs/scores/stability.
+"""Rows of tables of errors with perturbed points, from the stability.json files in docs/scores/stability.
 
 lidarpose evaluate small bench --stability --out study        # study/stability.json -> small.json
 """
@@ -12,13 +12,13 @@ FOLDER = Path(__file__).parents[1] / "docs" / "scores" / "stability"
 
 @lru_cache
 def read(name: str) -> dict:
-    """The study of a network."""
+    """The stability study of a network."""
     (study,) = json.loads((FOLDER / f"{name}.json").read_text())["studies"]
     return study
 
 
 def curves(name: str) -> list[tuple[str, ...]]:
-    """A row a disturbance: its title, undisturbed, and "amount: MPJPE (people without a pose)" of each amount."""
+    """One row per perturbation: title, unperturbed MPJPE, "amount: MPJPE (people without a pose)" for each amount."""
     rows = []
     for curve in _curves(name).values():
         if curve["name"] == "sensors":
@@ -30,7 +30,7 @@ def curves(name: str) -> list[tuple[str, ...]]:
 
 
 def sensors(name: str) -> list[tuple[str, ...]]:
-    """A row a sensor: its name, the points of half of the people, MPJPE."""
+    """One row per sensor: name, median points of a person, MPJPE."""
     points = _curves(name)["sensors"]["points"]
     return [
         (point["label"], f"{point['points']:.0f}", _error(point)) for point in sorted(points, key=lambda p: p["points"])
@@ -38,19 +38,19 @@ def sensors(name: str) -> list[tuple[str, ...]]:
 
 
 def ends(name: str) -> list[tuple[str, ...]]:
-    """A row an end joint: mean and deviation over the worst people."""
+    """One row per end joint: mean and standard deviation over the worst people."""
     return [(end["group"], f"{end['mean']:.1f}", f"{end['deviation']:.1f}") for end in read(name)["ends"]]
 
 
 def strays(name: str) -> tuple[str, ...]:
-    """Undisturbed, and what each amount of stray points adds, with its interval."""
+    """Unperturbed MPJPE, and the increase with its interval for each amount of stray points."""
     undisturbed, *points = _curves(name)["clusters"]["points"]
     increases = (f"{p['increase']:+.1f} [{p['increase_low']:.1f}, {p['increase_high']:.1f}]" for p in points)
     return f"{undisturbed['mpjpe']:.1f}", *increases
 
 
 def amounts(name: str) -> tuple[str, ...]:
-    """Of stray points in a cluster."""
+    """The amounts of stray points in a cluster."""
     return tuple(point["label"] for point in _curves(name)["clusters"]["points"][1:])
 
 

@@ -1,4 +1,4 @@
-"""Stored results answer only for the options and weights that they are of; RESULT.of.json beside them says which."""
+"""Stored results are used only with the options and weights they were made with, which RESULT.of.json records."""
 
 import json
 import sys
@@ -13,7 +13,7 @@ def digest(weights: Path) -> str:
 
 
 def is_stored(result: Path, of: dict[str, Any]) -> bool:
-    """Whether the result is there; ends the program where it is of something else, or nothing says of what."""
+    """Whether the result exists; exits if it was made with other or unknown options."""
     if not result.is_file():
         return False
     note = _note(result)
@@ -24,7 +24,7 @@ def is_stored(result: Path, of: dict[str, Any]) -> bool:
 
 
 def write_note(result: Path, of: dict[str, Any]) -> None:
-    """Says what a result that is about to be stored is of."""
+    """Records the options of a result that is about to be stored."""
     write_atomic(_note(result), json.dumps(of) + "\n")
 
 

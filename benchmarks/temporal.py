@@ -1,13 +1,13 @@
-"""A network that corrects smoothed clips, trained and judged beside the smoother: not shipped, see docs/log.md.
+"""A network that corrects smoothed clips, trained and compared with the smoother: not released, see docs/log.md.
 
     python benchmarks/temporal.py train.npz judge.npz --seeds 0 1 2
 
-Both files are what `benchmarks/clips.py --store` wrote, of different seeds and people. The network is a transformer
-that reads 16 frames of a track (smoothed joints about the pelvis along the heading, how far each prediction is from
-them, spread, visibility, confidence, time) and answers with the coefficients of a cubic B-spline of time for each
-joint, which is added to the smoothed joints. It learns each clip whole, with frames left out (every second or third
-frame, a shorter clip, a gap), and mirrored. Judged are the mean over each clip and its mirror image, with bones of one
-length.
+Both files are written by `benchmarks/clips.py --store`, with different seeds and people. The network is a transformer
+that reads 16 frames of a track (smoothed joints relative to the pelvis and the heading, offsets of the predictions from
+them, spread, visibility, confidence, time). It predicts for each joint the coefficients of a cubic B-spline over time,
+which is added to the smoothed joints. It is trained on complete clips, on clips with frames left out (every second or
+third frame kept, a shorter clip, a gap), and on mirror images. Evaluated is the mean of the results for each clip and
+its mirror image, with constant bone lengths.
 
 Legend: C clips, T frames, K coefficients, J joints.
 """
@@ -30,7 +30,7 @@ from lidarpose.tracking.smoothing import known_spread, smooth, with_facing_corre
 SEGMENTS = 3
 COEFFICIENTS = SEGMENTS + 3
 WIDTH, LAYERS, HEADS, DROPOUT = 128, 3, 4, 0.2
-# of the embedding of time, s
+# periods of the time embedding, s
 PERIODS = (0.2, 0.4, 0.6, 0.8, 1.2, 1.6, 3.2, 6.4)
 BATCH, RATE, DECAY, AVERAGE = 64, 1e-3, 0.05, 0.995
 _GIVEN = ("joints", "spread", "visible", "confidence")
@@ -39,7 +39,7 @@ _PELVIS = BODY26.index("pelvis")
 
 
 def spline_basis(fraction: np.ndarray) -> np.ndarray:
-    """(..., K): values of the uniform cubic B-splines at fraction (...) in [0, 1] of a window."""
+    """(..., K): values of the uniform cubic B-splines at `fraction` (...) in [0, 1] of a window."""
     place = np.clip(fraction, 0, 1) * SEGMENTS
     first = np.minimum(place.astype(int), SEGMENTS - 1)
     x = place - first
@@ -50,7 +50,7 @@ def spline_basis(fraction: np.ndarray) -> np.ndarray:
 
 
 def frames_left_out(frames: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """(T,) bool: the frames of a clip at another rate or shorter, and those of them in which the person is seen."""
+    """(T,) bool each: the frames of a clip at a lower rate or a shorter clip, and those with a visible person."""
     stride = rng.choice([1, 1, 2, 3])
     is_present = np.zeros(frames, bool)
     is_present[rng.integers(stride) :: stride] = True
@@ -65,8 +65,9 @@ def frames_left_out(frames: int, rng: np.random.Generator) -> tuple[np.ndarray, 
 
 
 def smoothed(clips: dict[str, np.ndarray], index: int, there: np.ndarray, seen: np.ndarray) -> dict | None:
-    """A clip of which the frames there (T,) bool are known, and the person is seen in frames (T,) bool: what was
-    predicted with its facing settled, `steady` joints and `steady_spread`, NaN elsewhere; None where hardly seen."""
+    """A clip with the frames `there` (T,) bool, in which the person is visible in the frames `seen` (T,) bool: the
+    predictions with corrected facing, smoothed joints `steady` and `steady_spread`, NaN in other frames; None if the
+    person is visible in too few frames."""
     part = slice(np.flatnonzero(there)[0], np.flatnonzero(there)[-1] + 1)
     values = {name: np.array(clips[name][index], float) for name in _GIVEN}
     for value in values.values():
@@ -99,8 +100,9 @@ def mirrored(clips: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def inputs(clips: dict[str, np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
-    """What the network reads and learns: features (C, T, F), times (C, T) s from the middle, which frames are there
-    (C, T), the spline's basis (C, T, K), what to add (C, T, J, 3) m, which frames count (C, T); R_world_local."""
+    """The network's inputs and targets: features (C, T, F), times (C, T) s relative to the middle, mask of present
+    frames (C, T), spline basis (C, T, K), target correction (C, T, J, 3) m, mask of frames that count (C, T); and
+    R_world_local."""
     steady = clips["steady"]
     y = np.nanmean(across(steady), 1) * [1, 1, 0] + [0, 1e-9, 0]
     y /= np.linalg.norm(y, axis=-1, keepdims=True)
@@ -137,7 +139,7 @@ def inputs(clips: dict[str, np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
 
 
 class SplineNet(nn.Module):
-    """Tokens are frames and coefficients; features (F) are scaled by their mean and deviation (F,)."""
+    """A transformer with frames and coefficients as tokens; features (F) are normalized by mean and deviation (F,)."""
 
     def __init__(self, mean: torch.Tensor, deviation: torch.Tensor):
         super().__init__()
@@ -158,7 +160,7 @@ class SplineNet(nn.Module):
         return self.time(torch.cat([angles.sin(), angles.cos()], -1))
 
     def forward(self, features, times, there, basis):
-        """(C, T, J, 3) m to add to the smoothed joints."""
+        """Corrections (C, T, J, 3) m of the smoothed joints."""
         first = times.masked_fill(~there, math.inf).amin(1, keepdim=True)
         last = times.masked_fill(~there, -math.inf).amax(1, keepdim=True)
         knots = first + (last - first) * (torch.arange(COEFFICIENTS) - 1) / SEGMENTS
@@ -170,7 +172,7 @@ class SplineNet(nn.Module):
 
 
 def train(clips: dict[str, np.ndarray], seed: int, epochs: int) -> SplineNet:
-    """The moving average of a network that learned the clips; an epoch is half of them, or of their mirror images."""
+    """The moving average of a network trained on the clips; an epoch has half as many samples as there are clips."""
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
     pairs = zip(inputs(clips)[0], inputs(mirrored(clips))[0], strict=True)
@@ -182,7 +184,7 @@ def train(clips: dict[str, np.ndarray], seed: int, epochs: int) -> SplineNet:
     optimizer = torch.optim.AdamW(
         [{"params": groups[0], "weight_decay": DECAY}, {"params": groups[1], "weight_decay": 0.0}], betas=(0.9, 0.98)
     )
-    # joints that are scored count twice
+    # joints that are evaluated have double weight
     weight = torch.ones(len(BODY26))
     weight[torch.from_numpy(np.unique(BODY26.map_to(HUMAN15)))] = 2
     steps = epochs * len(clips["true"]) // (2 * BATCH)
@@ -206,7 +208,7 @@ def train(clips: dict[str, np.ndarray], seed: int, epochs: int) -> SplineNet:
 
 @torch.no_grad()
 def corrected(net: SplineNet, clips: dict[str, np.ndarray]) -> np.ndarray:
-    """(C, T, J, 3) m, NaN where the smoother has nothing."""
+    """Corrected joints (C, T, J, 3) m, NaN in frames without smoothed joints."""
     shifts = []
     for variant in (clips, mirrored(clips)):
         (*net_inputs, _, _), R_world_local = inputs(variant)

@@ -1,10 +1,10 @@
-"""What more work at test time brings on lidarpose-bench, and what it costs.
+"""Benefit and cost of test-time augmentation on lidarpose-bench.
 
     python benchmarks/test_time.py tiny --limit 1000 --out docs/scores/test_time.json
 
-The first pass finds the pelvis, about which the others are: with the person mirrored, turned by quarters, or shifted in
-the grid of voxels. Joints are averaged (`inference/tta.py`). Rejection: the error of the most confident people and
-joints. Cost is processor time of predicting, on one thread, in batches.
+The first pass locates the pelvis, at which the other passes are centered: with the person mirrored, rotated by quarter
+turns, or shifted in the voxel grid. Joints are averaged (`inference/tta.py`). Rejection: the error of the most
+confident people and joints. Cost is the processor time of prediction, on one thread, in batches.
 """
 
 import argparse
@@ -24,8 +24,8 @@ from lidarpose.io.files import write_atomic
 
 @dataclass(frozen=True)
 class Way:
-    """first: how people are shown in the pass that finds the pelvis; averaged: whether its answer counts; transforms:
-    of the passes after it."""
+    """A setting of passes. first: transform in the pass that locates the pelvis; averaged: whether its prediction is
+    averaged, too; transforms: those of the passes after it."""
 
     what: str
     transforms: tuple[TTATransform, ...] = (IDENTITY,)
@@ -47,7 +47,7 @@ WAYS = (
 
 
 class Shown(Predictor):
-    """A predictor of other passes."""
+    """A predictor with other passes."""
 
     def __init__(self, predictor: Predictor, way: Way):
         super().__init__(predictor.backend, name=predictor.model["name"], decode=predictor.model["decode"])
@@ -55,7 +55,7 @@ class Shown(Predictor):
         self.seconds, self.people = 0.0, 0
 
     def predict_in(self, *arguments, **options):
-        """As always, with the processor time that it takes."""
+        """As in `Predictor`, but adds up the processor time."""
         start = time.process_time()
         people = super().predict_in(*arguments, **options)
         self.seconds += time.process_time() - start
@@ -64,7 +64,7 @@ class Shown(Predictor):
 
 
 def rejection(predictions) -> list[dict]:
-    """Error of what is kept, the most confident first: whole people, and joints on their own."""
+    """Errors of the most confident shares, of whole people and of single joints."""
     error = predictions.errors()
     people, joints = [], []
     for score, value, rows in (

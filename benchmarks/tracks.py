@@ -1,12 +1,13 @@
-"""Whether people keep their numbers: streets of ten people for ten seconds, seen at 10 Hz by a sensor that moves.
+"""Consistency of track ids: streets of ten people for ten seconds, scanned at 10 Hz by a moving sensor.
 
-    pip install trackeval                                      # by its authors: HOTA, IDF1, MOTA
+    pip install trackeval                                      # the authors' implementation of HOTA, IDF1, MOTA
     python benchmarks/tracks.py --streets 10 --seed 2 --cache runs/tracks --json docs/scores/tracks.json
 
-People walk, stop for a while, cross each other's ways and hide each other; scans are cast rays, so they are hidden as
-they would be. Boxes are the true ones with noise, of those who are seen, and what the detector finds. A person counts
-where at least ten points are on them; a box belongs to a person within 0.5 m. Beside the tracker stand a plain one,
-which takes the nearest box to where somebody was, and the most that the boxes allow: each has its person's number.
+People walk, stop for a while, cross each other's paths and occlude each other; scans are ray-cast, so occlusions are
+realistic. Boxes are the true boxes of visible people with noise, and detections. A person counts in frames with at
+least ten points on them; a box belongs to a person within 0.5 m. The tracker is compared with a plain tracker, which
+assigns each box to the nearest last position of a track, and with the upper bound for the boxes, in which each box has
+its person's true id.
 """
 
 import argparse
@@ -33,19 +34,19 @@ from lidarpose.tracking.assignment import assign
 from lidarpose.tracking.tracker import Tracker
 
 PEOPLE, FRAMES, HZ = 10, 100, 10.0
-# people keep so far from each other and from the sensor, and start within this of it, m
+# m; minimum distance of people from each other and from the sensor, and maximum distance from the sensor at the start
 APART, CLEAR, NEAR = 0.5, 1.2, 18.0
 SENSORS = ("os1-128", "os1-64", "vlp-32c", "hdl-64e", "os0-128")
-# the least score of boxes that are stored, and of those that may continue a track
+# score thresholds of stored boxes, and of boxes that may continue a track
 LEAST_SCORE, WEAK_SCORE = 0.02, 0.1
-# what finds people
+# weight files used to detect people
 _WEIGHTS = ("detector.onnx", "proposals.npz", f"{VERIFIER}.onnx", f"{DEFAULT}.onnx")
-# who counts is so near, m
+# m; people farther from the sensor do not count
 RANGE = 40.0
 
 
 def sensor_path(plan, rng):
-    """(F, 3): x, y m and yaw rad of the sensor: along the street, a little to and fro."""
+    """(F, 3): x, y m and yaw rad of the sensor, which moves along the street with some lateral and yaw oscillation."""
     time = np.arange(FRAMES) / HZ
     speed, sway, phase = rng.uniform(0.3, 2.0) * rng.choice([-1, 1]), rng.uniform(0, 0.3), rng.uniform(0, 6)
     x, y = speed * time, 0.1 * (np.sin(time + phase) - np.sin(phase))
@@ -55,7 +56,7 @@ def sensor_path(plan, rng):
 
 
 def with_stop(bodies, rng):
-    """Half of the people stand still for one to three seconds."""
+    """The bodies, with a stop of one to three seconds for half of the people."""
     frames = np.arange(FRAMES)
     if rng.random() < 0.5:
         start, pause = rng.integers(10, 60), rng.integers(10, 30)
@@ -66,7 +67,8 @@ def with_stop(bodies, rng):
 
 
 def walkers_of(plan, path, rng):
-    """People whose ways cross: of the starts that keep them apart, the one that brings them nearest to the others."""
+    """People with crossing paths: of the starts that keep each person at a distance from the others, the one whose path
+    comes closest to the others' is chosen."""
     walkers, walks = [], []
     while len(walkers) < PEOPLE:
         bodies = streets._draw_pedestrian(FRAMES, rng)
@@ -87,7 +89,7 @@ def walkers_of(plan, path, rng):
 
 
 def recording(seed, index):
-    """The frames of a street: points (n, 3) m and people in the sensor's frame, and the sensor's x, y, yaw."""
+    """The frames of a street: points (n, 3) m and people in the sensor frame, and the sensor's x, y, yaw."""
     rng = np.random.default_rng([seed, index])
     device = named_sensor(SENSORS[index % len(SENSORS)])
     plan = streets._draw_plan(device, rng)
@@ -107,7 +109,7 @@ def recording(seed, index):
 
 
 def to_world(boxes, pose):
-    """Boxes in the sensor's frame -> in the world's."""
+    """Boxes in the sensor frame -> in the world frame."""
     x, y, yaw = pose
     R_world_sensor = rotation_about("z", yaw)
     return [replace(b, center=R_world_sensor @ b.center + [x, y, 0], yaw=b.yaw + yaw) for b in boxes]
@@ -120,7 +122,7 @@ def to_sensor(boxes, pose):
 
 
 def stored(seed, index, cache):
-    """Frames of a street in the world's frame: the people, how many points each has, and the boxes found."""
+    """Frames of a street in the world frame: the people, the number of points on each, and the detected boxes."""
     path = cache / f"{seed}-{index}.json"
     of = {name: digest(weights_file(name)) for name in _WEIGHTS}
     if not is_stored(path, of):
@@ -139,7 +141,7 @@ def stored(seed, index, cache):
 
 
 def noisy(frame, rng):
-    """The true boxes of who is seen, with a detector's errors; the fewer points, the more are missed."""
+    """The true boxes of visible people with errors as of a detector; people with fewer points are missed more often."""
     boxes = []
     for person, points in zip(frame["people"], frame["points"], strict=True):
         shift, turn, drop = rng.normal(0, [0.08, 0.08, 0.05]), rng.normal(0, 0.2), rng.random()
@@ -153,7 +155,7 @@ def boxes_of_score(frame, least, below=1.1):
 
 
 def distances(frame, boxes):
-    """(P, B) m, level, of people and boxes."""
+    """(P, B) m: horizontal distances between people and boxes."""
     people, centers = (
         np.reshape(places, (-1, 3))[:, None, :2]
         for places in ([p["center"] for p in frame["people"]], [b.center for b in boxes])
@@ -162,7 +164,7 @@ def distances(frame, boxes):
 
 
 class Nearest:
-    """The plain tracker: each box in turn takes the nearest track's last place within 1 m, for 2 s."""
+    """The plain tracker: each box in turn continues the track with the nearest last position within 1 m and 2 s."""
 
     def __init__(self):
         self.tracks, self.next_id = {}, 0
@@ -186,7 +188,7 @@ class Nearest:
 
 
 def evaluated(frames, boxes, ids):
-    """What trackeval needs of a street: boxes within 0.5 m of people who do not count are left out."""
+    """The input of trackeval for a street: boxes within 0.5 m of people who do not count are left out."""
     number_of_id = {name: k for k, name in enumerate(sorted({i for frame_ids in ids for i in frame_ids}))}
     gt_ids, tracker_ids, similarities = [], [], []
     for frame, frame_boxes, own_frame_ids in zip(frames, boxes, ids, strict=True):
@@ -194,7 +196,7 @@ def evaluated(frames, boxes, ids):
         is_near = np.linalg.norm(places - frame["sensor"][:2], axis=1) < RANGE
         is_counted = is_near & (np.array(frame["points"]) >= LEAST_POINTS)
         distance = distances(frame, frame_boxes)
-        # people who count first
+        # people who count are assigned first
         person, box = assign(
             np.where(distance < MATCH_RADIUS, distance - MATCH_RADIUS - 10.0 * is_counted[:, None], np.inf)
         )
@@ -223,7 +225,7 @@ def scored(sequences):
 
 
 def true_ids(frames, boxes):
-    """Each box has its person's number, and false ones their own."""
+    """Ids with which each box has its person's number, and each false positive a new one."""
     ids, next_id = [], PEOPLE
     for frame, frame_boxes in zip(frames, boxes, strict=True):
         distance = distances(frame, frame_boxes)
@@ -236,7 +238,8 @@ def true_ids(frames, boxes):
 
 
 def tracked(frames, boxes, weak, tracker, poses_known=True):
-    """The boxes that are somebody's, and whose; without poses the tracker sees them in the sensor's frame."""
+    """The evaluation input from a tracker's boxes and ids. If the sensor's poses are not known, the tracker gets boxes
+    in the sensor frame."""
     track_boxes, ids = [], []
     for number, (frame_boxes, weak_boxes) in enumerate(zip(boxes, weak, strict=True)):
         tracker_boxes = (
@@ -252,7 +255,7 @@ def tracked(frames, boxes, weak, tracker, poses_known=True):
 
 
 def figures(recordings):
-    """Rows: boxes, who numbers them, and the figures over all streets."""
+    """Rows with the kind of boxes, the source of their ids, and the figures over all streets."""
     default_score = round(float(Detector().header["default_score"]), 2)
     rng = np.random.default_rng(0)
     no_boxes = [[[] for _ in frames] for frames in recordings]

@@ -1,9 +1,9 @@
-"""Where the time of training goes: a person made, and a step's forward, backward and optimizers, in milliseconds, in
-float32 and bf16 by turns.
+"""Parts of the training time in milliseconds: generating a person, and forward, backward and optimizers of a step,
+alternately in float32 and bf16.
 
     python benchmarks/training_step.py --threads 1 --size small
 
-Quote ratios of one run, not the times themselves.
+Quote ratios within one run, not absolute times.
 """
 
 import argparse
@@ -68,7 +68,7 @@ def main() -> None:
                 optimizer.zero_grad()
             rows[precision].append(np.diff(times) * 1e3)
     names = ["forward and loss", "backward", *(type(optimizer).__name__ for optimizer in network_optimizers)]
-    # the first round warms up
+    # the first round is the warm-up
     best_times = {precision: np.min(values[1:], axis=0) for precision, values in rows.items()}
     for name, single, half in zip(names, *best_times.values(), strict=True):
         print(f"{name}: {single:.1f} ms a step of {options.people} people, {half:.1f} in bf16")

@@ -1,11 +1,11 @@
-"""What clutter, company, poor boxes and occluders cost at equal visibility.
+"""Increase of errors by clutter, second people, poor boxes and occluders, at equal visibility.
 
     lidarpose evaluate tiny bench --out evaluation/tiny
     python benchmarks/visibility.py evaluation/tiny --out docs/scores/visibility.json
 
-People of a condition are compared with clean people of whom as much is hidden: the error of each bin of hidden share,
-weighted by how many of the condition are in it. Bins with under ten people of either are left out. The interval is a
-bootstrap's over people.
+People of a condition are compared with equally occluded clean people: the errors in bins of the occluded share are
+weighted by the number of the condition's people in each bin. Bins with fewer than ten people of either group are left
+out. Intervals are from a bootstrap over people.
 """
 
 import argparse
@@ -24,7 +24,7 @@ CLEAN = "clean"
 
 
 def compared(error: np.ndarray, hidden: np.ndarray, condition: np.ndarray, name: str) -> tuple[float, float, int]:
-    """Mean errors, mm: of a condition's people, of clean ones of whom as much is hidden; how many of the condition."""
+    """Mean errors, mm, of a condition's people and of equally occluded clean people; number of the former."""
     bins = np.digitize(hidden, EDGES)
     condition_sum = clean_sum = 0.0
     people = 0

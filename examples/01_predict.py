@@ -12,7 +12,7 @@ points = Generator(scene=scene_config("wild").eased(0.0)).person(seed=3, index=5
 print(f"{len(points)} points, from {points.min(0).round(2)} to {points.max(0).round(2)} m")
 
 model = lidarpose.load()
-# the sensor stood at the origin of these points; leave it away where you do not know
+# the sensor is at the origin of these points; omit sensor_origin if the position is unknown
 pose = model.predict(points, sensor_origin=(0, 0, 0))
 
 for name, joint, confidence, spread in zip(

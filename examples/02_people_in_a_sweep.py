@@ -1,6 +1,6 @@
-"""Everybody in a whole sweep, found or given by boxes, from files.
+"""All people in a whole sweep, detected or given by boxes, from files.
 
-The sweep here is synthesized and written first; the second half is all that your own files need.
+The sweep here is synthesized and written first; for your own files only the second half is needed.
 Run: python examples/02_people_in_a_sweep.py    (needs, in the clone: pip install '.[synth]')
 """
 
@@ -13,7 +13,7 @@ from lidarpose.lidar.raycast import scan
 from lidarpose.synth.bodies import draw_bodies
 from lidarpose.synth.environment.mesh import Mesh, quad, union
 
-# ---- a sweep: three people on flat ground about a sensor 1.7 m above it
+# ---- a sweep: three people on flat ground around a sensor 1.7 m above it
 
 device = lidarpose.sensor("os1-128")
 assert isinstance(device, lidarpose.Sensor)  # not a rosette
@@ -33,13 +33,13 @@ for name, mesh in zip("abc", meshes, strict=True):
 with open("people.json", "w") as file:
     json.dump({"people": people}, file)
 
-# ---- the people, searched for
+# ---- detecting the people
 
 boxes = lidarpose.detect("sweep.npy")
 for box in boxes:
     print(f"found at {box.center.round(1)} m with a score of {box.score:.2f}")
 
-# ---- their poses, in boxes from elsewhere; without boxes, in those that are found
+# ---- their poses, in given boxes; without boxes, in detected ones
 
 poses = lidarpose.predict("sweep.npy", boxes="people.json", skeleton="human15")
 for person in poses:

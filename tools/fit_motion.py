@@ -2,7 +2,7 @@
 
     python tools/fit_motion.py CLIPS.npz --subjects 002 005 --out src/lidarpose/body/assets/motion_prior.npz
 
-CLIPS.npz is laid out as `lidarpose.body.mocap.motion` says. Only the mixture's parameters are kept, never a pose.
+`lidarpose.body.mocap.motion` describes the layout of CLIPS.npz. Only the mixture's parameters are stored, no poses.
 """
 
 import argparse
@@ -23,21 +23,21 @@ from lidarpose.body.rig import without_yaw
 from lidarpose.geometry import rotation_about, rotation_vector
 from lidarpose.skeleton import SMPL24
 
-_LIFT_STEPS = 6  # fixed-point steps that take the collar's share out of the upper arm
+_LIFT_STEPS = 6  # fixed-point steps that remove the collar's share from the upper arm
 _ITERATIONS = 60
-_RIDGE = 3.0**2  # degrees squared added to every variance: a pose is known no better, and none is stored exactly
+_RIDGE = 3.0**2  # degrees squared added to each variance: poses are not more exact, and none is stored exactly
 _SHRINK = 0.1  # share of the pooled covariance in each component's
 
 
 def angles_from_rotations(rotations: np.ndarray) -> np.ndarray:
-    """The inverse of `activities.rotations_from_angles`: the angles (n, 27), degrees, nearest to local rotations
+    """The inverse of `activities.rotations_from_angles`: the angles (n, 27), degrees, closest to local rotations
     (n, 24, 3, 3).
 
-    What the angles cannot express is dropped: turns of wrists and hands, unlike shares of the spine's joints, and of
-    the collars all but where they take the upper arms.
+    Rotations that the angles cannot express are dropped: rotations of wrists and hands, unequal shares of the spine's
+    joints, and rotations of the collars except for their effect on the upper arms.
     """
     rotations = np.asarray(rotations, float)
-    # joints that share an angle turn by the same small rotation: their Euler angles are added
+    # joints that share an angle have the same small rotation, so their Euler angles are added
     angles = _to_euler(rotations).reshape(len(rotations), 72) @ np.sign(EULER_FROM_ANGLES).T
     for side, sign in (("left", 1.0), ("right", -1.0)):
         collar, shoulder = (rotations[:, SMPL24.index(f"{side}_{name}")] for name in ("collar", "shoulder"))
@@ -74,7 +74,7 @@ def save_mixture(path: str | Path, weights: np.ndarray, means: np.ndarray, covar
 
 
 def fit_mixture(features: np.ndarray, components: int, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """features (n, D) -> weights (K,), means (K, D), covariances (K, D, D), by expectation and maximization."""
+    """features (n, D) -> weights (K,), means (K, D), covariances (K, D, D), by expectation maximization."""
     n, width = features.shape
     means = features[_spread_seeds(features, components, rng)]
     pooled = np.cov(features.T) + _RIDGE * np.eye(width)
@@ -99,7 +99,7 @@ def fit_mixture(features: np.ndarray, components: int, rng: np.random.Generator)
 
 
 def _spread_seeds(features: np.ndarray, count: int, rng: np.random.Generator) -> list[int]:
-    """Indices of rows far from each other: each drawn with odds of its squared distance from those before."""
+    """Indices of distant rows: each drawn with probability proportional to its squared distance from those before."""
     seeds = [int(rng.integers(len(features)))]
     distance = np.full(len(features), np.inf)
     while len(seeds) < count:

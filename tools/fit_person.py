@@ -1,12 +1,13 @@
-"""Fits the output of a network that says whether a crop shows a person, and a second one: also to what a detector takes
-for people in whole scans, its mistakes among them. Nothing else of the network changes.
+"""Fits a network's outputs for whether a crop contains a person, and a second one, also to the detections in whole
+scans, including false positives. The rest of the network is not changed.
 
     python tools/fit_person.py crops CROPS.npz --scenes 1500 --samples 20000 --motion wide_motion.npz
     python tools/fit_person.py fit CROPS.npz RUN/model.safetensors OUT.safetensors
 
-`crops` makes what is learned from: the detections in synthesized scans (family "train"), posed as `lidarpose.detect`
-poses them, and as many people as objects of the scene "wide", as pre-training shows them. `fit` trains the head anew on
-what the network makes of them. A network of later weights is fitted to the same crops. Needs lidarpose[train].
+`crops` creates the training data: crops of the detections in synthesized scans (family "train"), prepared as in
+`lidarpose.detect`, and equal numbers of people and objects of the scene "wide", as in pre-training. `fit` trains the
+head further on the network's features of these crops. Later weights of a network are fitted to the same crops. Needs
+lidarpose[train].
 """
 
 import argparse
@@ -36,7 +37,7 @@ Crop = tuple[np.ndarray, np.ndarray, np.ndarray, int]
 
 
 def scene_crops(index: int) -> list[Crop]:
-    """Points (n, 3) m about the center, view (5,), labels (2,), group 1, of the detections of a scene."""
+    """Points (n, 3) m relative to the center, view (5,), labels (2,), group 1, of the detections in a scene."""
     scan = scan_crops(SEED, index)
     labels = [
         np.array([1.0, second_person_label(others, len(cloud))]) if person != NOBODY else np.zeros(2)
@@ -46,7 +47,7 @@ def scene_crops(index: int) -> list[Crop]:
 
 
 def sample_crops(index: int, *, source: SyntheticSource) -> list[Crop]:
-    """As `scene_crops`, group 0, of a person or an object."""
+    """As `scene_crops`, for a person or an object of the scene "wide", with group 0."""
     example = source.example(index)
     return [(example.points, example.view, example.person, 0)]
 
@@ -72,7 +73,7 @@ def make_crops(out: Path, scenes: int, samples: int, motion: str | None, workers
 
 @torch.inference_mode()
 def head_inputs(network: PoseNet, crops: dict[str, np.ndarray]) -> torch.Tensor:
-    """(K, F): what the network's head reads of each crop."""
+    """(K, F): the input of the network's head for each crop."""
     inputs: list[torch.Tensor] = []
     clouds = np.split(crops["points"], np.cumsum(crops["count"])[:-1])
     order = np.argsort(crops["count"], kind="stable")
@@ -94,7 +95,7 @@ def fit(path: Path, model: Path, out: Path) -> None:
     network, header = load_checkpoint(model)
     x = head_inputs(network.eval(), crops).clone()
     label, group = torch.as_tensor(crops["label"], dtype=torch.float32), torch.as_tensor(crops["group"])
-    # both groups count alike, and within each people and nobody
+    # both groups have equal weight, and within each group crops with and without a person
     kind = 2 * group + label[:, 0].long()
     weight = (1 / torch.bincount(kind, minlength=4).clamp(min=1))[kind]
     weight = weight / weight.mean()

@@ -1,9 +1,10 @@
-"""Fits what tells a column that may be a person from one that next to never is: models/weights/proposals.npz.
+"""Fits the classifier that discards columns that are almost never a person: models/weights/proposals.npz.
 
     python tools/fit_proposals.py SCENES
 
-Columns of so many synthesized scenes (1,500: family "train", seed 9001); a perceptron of 16 hidden units, and the
-logit below which three in a thousand people who have a column lose all of theirs. Needs lidarpose[train].
+The columns are those of SCENES synthesized scenes (1,500: family "train", seed 9001). Fits a perceptron with 16 hidden
+units, and the logit threshold below which three in a thousand of the people with a column lose all their columns. Needs
+lidarpose[train].
 """
 
 import sys
@@ -23,7 +24,8 @@ SEED, HIDDEN, EPOCHS, LOST = 9001, 16, 25, 0.003
 
 
 def scene_columns(index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Features (K, F), distance (K,) m to the nearest person with 5 points, and who that is: index and number."""
+    """Features (K, F) of columns, distance (K,) m to the nearest person with at least 5 points, and id of that person:
+    1000 times the scene's index plus the person's number."""
     scene = detection_scene(SEED, index)
     scene = as_detected(scene, scene.origin)
     points, origin = scene.points.astype(float), scene.origin

@@ -1,9 +1,9 @@
-"""Freezes the scenes on which detectors of people are judged: their numbers and the hash of each one's points.
+"""Freezes the scenes on which detectors of people are evaluated: their indices and the hash of each scene's points.
 
     python tools/freeze_detector_heldout.py src/lidarpose/eval/assets/detector-heldout-1.json
 
-They hold the kinds of things and the rooms that training never draws. Run once, before the first detector was trained;
-a later generator that makes other scenes needs a list of its own: a test compares some of them.
+They contain kinds of objects and rooms that are never drawn in training. Run once, before the first detector was
+trained. A later generator that makes different scenes needs its own list; a test compares some of the scenes.
 """
 
 import argparse

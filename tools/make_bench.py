@@ -1,12 +1,12 @@
-"""Makes lidarpose-bench 2: 3,000 synthetic people and 500 objects on which weights are judged. Run once; never again.
+"""Makes lidarpose-bench 2: 3,000 synthetic people and 500 objects for evaluating weights. Run once; never again.
 
     python tools/make_bench.py DATA src/lidarpose/eval/assets/lidarpose-bench-2.parquet
 
-DATA is a folder with cmu_motion.npz, hdm05_motion.npz and idle_motion.npz: clips of people of whom those in `SUBJECTS`
-are kept out of all training. A third of the poses comes from the procedural prior (seeds that no training run uses).
-What each condition is stands in `conditions`. 20 to `MOST` points in the crop, 10 of them on the body. Later versions
-of the generator make other people: the file is what counts, and a test holds its hash. Bench 1 was made by this
-file's version of lidarpose 0.1.
+DATA is a folder with the clips cmu_motion.npz, hdm05_motion.npz and idle_motion.npz, whose subjects in `SUBJECTS` are
+excluded from all training. A third of the poses comes from the procedural prior (with seeds that no training run uses).
+`conditions` defines the conditions. Crops have 20 to `MOST` points, at least 10 of them on the body. Later versions of
+the generator make different people: the file is authoritative, and a test checks its hash. Bench 1 was made by the
+version of this file in lidarpose 0.1.
 """
 
 import argparse
@@ -33,11 +33,11 @@ from lidarpose.synth.objects import draw_object
 from lidarpose.synth.scene import CropErrors, SceneConfig, scene_config
 
 NAME = BENCHES["bench-2"].name
-# training counts its seeds from 0, the held-out benchmarks use those about 90,000, bench 1 those from 710,000
+# training counts its seeds from 0, the held-out benchmarks use seeds around 90,000, bench 1 seeds from 710,000
 SEED = 720_000
 SENSORS = ("vlp-16", "vlp-32c", "hdl-64e", "os1-64", "os1-128", "os0-128", "pandar64", "waymo-top")
 ROSETTES = ("livox-avia", "livox-mid360", "livox-mid100")
-# file -> the starts of clips' names and the family of their poses
+# file -> prefixes of clip names and the family of their poses
 SUBJECTS = {
     "cmu": {"007": "walk", "006": "basketball"},
     "idle": {"014": "idle", "015": "idle"},
@@ -55,15 +55,15 @@ SUBJECTS = {
         "bk_throwBasketball": "throw",
     },
 }
-# families of the prior's kinds where they have another name; of its fitted mixture nobody can tell
+# families of the prior's kinds with different names; the families of its fitted mixture are unknown
 FAMILIES = {"captured": "mixture", "crouch": "squat"}
-# people of each condition by the source of their poses, of the last two half as many
+# number of people of each condition by source of the poses; "sparse" and "integrated" have half as many
 SOURCES = {"prior": 100, "hdm05": 100, "cmu": 60, "idle": 40}
 OBJECTS = 500
 LEAST, LEAST_BODY, MOST = 20, 10, 1200
 # key of the card in the file's metadata
 METADATA = "lidarpose-bench"
-# column -> type, of a value or of the values of a list
+# column -> type of the value, or of the values of a list
 COLUMNS = {
     "clip": "int16",
     "frame": "int16",
@@ -96,7 +96,7 @@ def schema() -> pa.Schema:
 
 
 def conditions() -> dict[str, SceneConfig]:
-    """clean: nothing but the sensor's own noise and a detector's box 3 cm off; each other one adds its own trouble."""
+    """The scene of each condition. clean: only sensor noise and 3 cm box jitter; each other one adds a difficulty."""
     wild = scene_config("wild")
     lossless_noise = replace(wild.noise, mask=0.0, clutter=0.0, missing_part=0.0)
     clean = replace(
@@ -145,7 +145,7 @@ def main() -> None:
     table = pa.Table.from_pylist(rows, schema()).replace_schema_metadata({METADATA: json.dumps(card)})
     out = Path(options.out)
     out.parent.mkdir(parents=True, exist_ok=True)
-    # numbers of points are noise, of which a dictionary is larger than they are
+    # coordinates of points are noise, for which a dictionary is larger than the values
     lists = {f"{name}.list.element": "BYTE_STREAM_SPLIT" for name in ("points_mm", "joints", "box", "origin")}
     words = ["condition", "poses", "family", "sensor", "kind", "part.list.element"]
     with atomic_path(out) as path:
@@ -157,7 +157,8 @@ def main() -> None:
 
 
 def people(data: Path) -> Iterator[dict]:
-    """As many of every condition, and in it of every source, whose families go round; sensors as they are drawn."""
+    """Rows of people: fixed numbers for each condition and source, cycling through the families of a source; sensors
+    are drawn at random."""
     banks: dict[str, dict[str, PoseBank | None]] = {"prior": {"": None}}
     for source, clips in SUBJECTS.items():
         motion = load_motion(data / f"{source}_motion.npz")
@@ -176,12 +177,12 @@ def people(data: Path) -> Iterator[dict]:
 def _drawn(
     condition: str, source: str, family: str, scene: SceneConfig, bank: PoseBank | None, seed: int
 ) -> Iterator[dict]:
-    """People without end."""
+    """An endless stream of rows of people."""
     generator = Generator(scene=scene, bank=bank, captured=0.0 if bank is None else 1.0)
     for index in count():
         person = generator.person(seed, index)
         sample, facts = person.sample, person.facts
-        # a rosette's frame may be of 0.1 s
+        # these conditions are not in every sample: a rosette's frame, for instance, may last only 0.1 s
         has_condition = condition in sample.conditions or condition not in (
             "merged",
             "accumulated",
@@ -197,7 +198,7 @@ def _drawn(
 
 
 def objects() -> Iterator[dict]:
-    """Crops without a person, half of them of kinds of things that training never sees."""
+    """Rows of crops without a person, half of them with kinds of objects that are never used in training."""
     for left_out in (False, True):
         crops = (draw_object(conditions()["cluttered"], SEED, index, left_out=left_out) for index in count())
         usable_crops = (crop for crop in crops if LEAST <= len(crop[0].points) <= MOST)

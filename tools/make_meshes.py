@@ -2,8 +2,9 @@
 
     python tools/make_meshes.py [--out src/lidarpose/synth/assets/meshes.npz]
 
-All are closed, of few triangles, each in a frame of its own: x ahead, y left, z up; meters, or 1 where their user
-scales them (see `lidarpose.synth.environment.mesh.shape`). The file is the same on any machine with the same numpy.
+All are closed, with few triangles, each in its own frame: x forward, y left, z up; in meters, or of unit size if they
+are scaled when used (see `lidarpose.synth.environment.mesh.shape`). The file is the same on any machine with the same
+numpy.
 """
 
 import argparse
@@ -22,7 +23,7 @@ OUT = Path(__file__).parents[1] / "src/lidarpose/synth/assets/meshes.npz"
 
 def hull(outlines: list, tips: tuple[float, float] | None = None) -> Mesh:
     """A closed surface through outlines (K, 3), each counter-clockwise seen from above, from the lowest to the highest,
-    with a fan at both ends, about the ends' middles or at the heights `tips`."""
+    with a fan at both ends around the outline's center, whose height may be set by `tips`."""
     outlines = [np.asarray(outline, float) for outline in outlines]
     sides = len(outlines[0])
     ends = [outlines[0].mean(0), outlines[-1].mean(0)]
@@ -56,8 +57,8 @@ def rectangle(x0: float, x1: float, half: float) -> np.ndarray:
 
 
 def turned(rings: tuple, sides: int, *, tips: tuple[float, float] | None = None) -> Mesh:
-    """A closed surface about the z axis through rings (z, radius), from the lowest; `tips`: z of its two ends, by
-    default in the planes of the first and last ring."""
+    """A closed surface of revolution around the z axis through rings (z, radius), from the lowest; `tips`: z of its two
+    ends, by default in the planes of the first and last ring."""
     turn = 2 * np.pi * np.arange(sides) / sides
     outlines = [np.stack([r * np.cos(turn), r * np.sin(turn), np.full(sides, z)], 1) for z, r in rings]
     return hull(outlines, tips or (rings[0][0], rings[-1][0]))
@@ -78,8 +79,7 @@ def loft(*stations: tuple[float, float, float, float, float]) -> Mesh:
 
 
 def prism(sides: int, *, top: float = 1.0) -> Mesh:
-    """An upright prism of radius and height 1 standing on the origin; open at the bottom, `top` times as wide at the
-    top."""
+    """An upright prism of radius and height 1 on the origin, open at the bottom; the top is `top` times as wide."""
     angle = np.arange(sides) * (2 * np.pi / sides)
     ring = np.column_stack([np.cos(angle), np.sin(angle)])
     levels = [np.column_stack([ring * scale, np.full(sides, z)]) for z, scale in ((0.0, 1.0), (1.0, top))]
@@ -105,7 +105,7 @@ def rod(start: tuple, end: tuple, radius: float = 0.015) -> Mesh:
 
 
 def disc_wheels(radius: float, x: tuple, half: float, wide: float, *, sides: int = 5) -> Mesh:
-    """Small solid wheels about the y axis, on the ground, two at each x."""
+    """Small solid wheels around the y axis, on the ground, two at each x."""
     disc = tube(sides).scaled((radius, radius, wide))
     turn = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]], np.float32)
     wheel = Mesh(disc.vertices @ turn + np.float32([0, wide / 2, radius]), disc.faces)
@@ -113,7 +113,7 @@ def disc_wheels(radius: float, x: tuple, half: float, wide: float, *, sides: int
 
 
 def rim(radius: float, half: float, *, sides: int) -> Mesh:
-    """A wheel about the y axis that one sees through: a ring with the tread outside and two flanks, closed."""
+    """An open wheel around the y axis: a closed ring with the tread outside and two flanks."""
     turn = 2 * np.pi * np.arange(sides) / sides
     circle = np.stack([np.cos(turn), 0 * turn, np.sin(turn)], 1)
     offset = np.array([0, half, 0])
@@ -127,7 +127,7 @@ def rim(radius: float, half: float, *, sides: int) -> Mesh:
 
 
 def blocks(*rows: tuple[tuple, tuple]) -> Mesh:
-    """Boxes from (middle of the lower face, size)."""
+    """Boxes from (center of the lower face, size)."""
     return boxes(*(np.array(column, float) for column in zip(*rows, strict=True)))
 
 
@@ -143,8 +143,8 @@ def street_furniture() -> dict[str, Mesh]:
     table = [((0, 0, 0.95), (1, 1, 0.05))]
     table += [((x, y, 0.0), (0.06, 0.04, 0.95)) for x in (-0.44, 0.44) for y in (-0.46, 0.46)]
     tub = loft((-0.45, 0.35, 0.45, 0.0, 0.93), (0.35, 0.35, 0.45, 0.0, 0.93))
-    # outlines of passenger cars in units of length, width and height: the sill, the bonnet and the boot at 0.25 to 0.7
-    # of the height, glass that leans, a roof narrower than the doors
+    # shapes of passenger cars in units of length, width and height: sill, hood and trunk at 0.25 to 0.7 of the height,
+    # inclined windows, a roof narrower than the doors
     car_body = loft(
         (-0.50, 0.40, 0.42, 0.25, 0.60),
         (-0.46, 0.48, 0.48, 0.15, 0.68),
@@ -164,7 +164,7 @@ def street_furniture() -> dict[str, Mesh]:
         (0.36, 0.50, 0.45, 0.13, 0.60),
         (0.50, 0.42, 0.40, 0.15, 0.42),
     )
-    # rounded in front, as high as the windscreen's foot
+    # rounded in front, as high as the lower edge of the windshield
     bonnet = loft(
         (-0.5, 0.48, 0.45, 0.0, 1.0),
         (0.3, 0.49, 0.45, 0.0, 0.88),
@@ -173,11 +173,11 @@ def street_furniture() -> dict[str, Mesh]:
     )
     return {
         "wheeled bin": union([tub, box((1.0, 1.0, 0.07)).moved((0, 0, 0.93))]),
-        # meters across, 1 along y
+        # in meters across, unit length along y
         "bench": blocks(*seat, ((-0.22, 0, 0.52), (0.05, 1.0, 0.34))),
         "bench without back": blocks(*seat),
         "table": blocks(*table),
-        # on its square foot, half as wide as it is high
+        # on a square foot, half as wide as it is high
         "traffic cone": union([prism(8, top=0.15).scaled((0.2, 0.2, 1.0)), box((0.5, 0.5, 0.05))]),
         "pole": prism(7),
         "sign post": prism(5),
@@ -187,17 +187,17 @@ def street_furniture() -> dict[str, Mesh]:
     }
 
 
-# --- what people carry, wear and ride
+# --- props that people carry, wear and ride
 
 
 def bag() -> Mesh:
-    """Of size 1, hanging from the origin: wider below, its handles the topmost quarter."""
+    """A bag of size 1 that hangs from the origin: wider below, with the handles in the top quarter."""
     body = np.array([(-0.5, -0.5, -1), (0.5, -0.5, -1), (0.5, 0.5, -1), (-0.5, 0.5, -1)])
     return hull([body, body * [0.92, 0.7, 0] + [0, 0, -0.28], body * [0.25, 0.1, 0]])
 
 
 def pack() -> Mesh:
-    """A rucksack of size 1 that stands on the origin, its flat side to the back at x = 0, round behind."""
+    """A rucksack of size 1 on the origin, with the flat side that touches the back at x = 0, rounded behind."""
     rows = []
     for z, deep, wide in ((0.0, 0.8, 0.9), (0.12, 1.0, 1.0), (0.6, 0.95, 1.0), (0.9, 0.6, 0.85), (1.0, 0.25, 0.6)):
         half = wide / 2
@@ -207,20 +207,20 @@ def pack() -> Mesh:
 
 
 def ball() -> Mesh:
-    """Of radius 1 about the origin."""
+    """A ball of radius 1 around the origin."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, 6)[1:-1]
     return turned(tuple((float(np.sin(a)), float(np.cos(a))) for a in angles), 8, tips=(-1.0, 1.0))
 
 
 def umbrella() -> Mesh:
-    """Open: from the hand at the origin to 1 up; the canopy's diameter is 1, its rim at 0.72."""
+    """An open umbrella, from the hand at the origin to z = 1; the canopy has diameter 1, its rim is at z = 0.72."""
     shaft = tube(4).scaled((0.008, 0.008, 0.95))
     canopy = turned(((0.745, 0.47), (0.72, 0.5), (0.86, 0.33), (0.95, 0.12)), 8, tips=(0.84, 1.0))
     return union([shaft, canopy])
 
 
 def suitcase() -> Mesh:
-    """On wheels, pulled: the hand at (0, 0, 1), wheels at the origin, the case's height 0.68, its bar above."""
+    """A pulled suitcase: the hand at (0, 0, 1), wheels at the origin, the case up to z = 0.68, with a bar above."""
     case = box((0.28, 0.42, 0.62)).moved((-0.14, 0, 0.06))
     sides = [box((0.02, 0.02, 0.34)).moved((-0.02, y, 0.66)) for y in (-0.13, 0.13)]
     handle = box((0.03, 0.28, 0.03)).moved((-0.02, 0, 0.98))
@@ -228,7 +228,7 @@ def suitcase() -> Mesh:
 
 
 def pram() -> Mesh:
-    """Its handle at x = 0 and z = 1, the rest ahead of it; wheels on the ground."""
+    """A pram with the handle at x = 0 and z = 1 and the rest in front of it; wheels on the ground."""
     basket, hood = rectangle(0.30, 1.0, 0.18), rectangle(0.30, 0.62, 0.2)
     body = hull(layers(*((z, basket * s + [(1 - s) * 0.65, 0]) for z, s in ((0.48, 0.75), (0.78, 1.1)))))
     hood_mesh = hull(layers(*((z, hood * [w, 1] + [0.3 * (1 - w), 0]) for z, w in ((0.76, 1.2), (1.05, 0.7)))))
@@ -240,7 +240,7 @@ def pram() -> Mesh:
 
 
 def trolley() -> Mesh:
-    """A shopping trolley or a hand cart with a load: its handle at x = 0 and z = 1, 0.9 long and 0.5 wide."""
+    """A shopping trolley or a loaded hand cart with the handle at x = 0 and z = 1, 0.9 long and 0.5 wide."""
     load = hull(layers((0.45, rectangle(0.2, 0.9, 0.2)), (0.92, rectangle(0.08, 0.95, 0.26))))
     bed = box((0.85, 0.46, 0.05)).moved((0.52, 0, 0.16))
     rods = [rod((0.12, y, 0.18), (0.0, y, 1.0)) for y in (-0.24, 0.24)]
@@ -249,7 +249,7 @@ def trolley() -> Mesh:
 
 
 def wheelchair() -> Mesh:
-    """One sits 0.5 above the origin; without its foot rests."""
+    """A wheelchair without footrests; its seat is 0.5 above the origin."""
     panels = [((0.06, 0, 0.45), (0.46, 0.44, 0.05)), ((-0.2, 0, 0.5), (0.04, 0.44, 0.42))]
     for y in (-0.235, 0.235):
         panels += [((0.06, y, 0.68), (0.34, 0.05, 0.035)), ((-0.2, y, 0.2), (0.03, 0.03, 0.75))]
@@ -259,7 +259,8 @@ def wheelchair() -> Mesh:
 
 
 def bicycle() -> Mesh:
-    """On the ground, the saddle above the origin: frame, saddle and wheels; bars and pedals depend on the rider."""
+    """A bicycle on the ground with the saddle above the origin: frame, saddle and wheels. Handlebars and pedals are not
+    included, since they depend on the rider."""
     seat, head, low = (0.03, 0.78), (0.59, 0.82), (0.63, 0.7)
     tubes = [
         ((0.0, 0.94), CRANK),
@@ -289,13 +290,13 @@ def props() -> dict[str, Mesh]:
         "suitcase": suitcase(),
         "pram": pram(),
         "trolley": trolley(),
-        # a seat as high and wide as 1 that one sits on above the origin, its legs, and a back half as high again
+        # a seat of width 1 at height 1 above the origin, with legs, and a back up to 1.95
         "chair": blocks(((0.05, 0, 0.9), (0.46, 1.0, 0.1)), ((-0.2, 0, 1.0), (0.04, 1.0, 0.95)), *legs),
-        # the same without back on two supports
+        # the same without a back, on two supports
         "seat": blocks(((0.05, 0, 0.88), (0.4, 1.0, 0.12)), *(((0.05, y, 0), (0.3, 0.06, 0.88)) for y in (-0.4, 0.4))),
         "wheelchair": wheelchair(),
         "bicycle": bicycle(),
-        # for a head of half length and half width 1, their edges at z = 0
+        # for a head of half length 1 and half width 1, with the edge at z = 0
         "cap": turned(((0.0, 1.0), *crown), 10, tips=(0.0, 1.05)),
         "hat": turned(((-0.06, 1.5), (0.03, 1.5), (0.06, 1.0), *crown), 10, tips=(-0.06, 1.05)),
     }

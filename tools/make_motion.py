@@ -1,26 +1,26 @@
-r"""The file of captured motion that `--motion` takes, from the archives of motion capture as they are downloaded.
+r"""Creates the file of captured motion for `--motion` from downloaded motion capture archives.
 
     python tools/make_motion.py cmu/subjects --subjects 2 5 --out cmu_motion.npz
 
-FOLDER (several may be given) is searched for .amc beside its .asf, .bvh and .npz files. The file's layout is in
-`lidarpose.body.mocap.motion`: SMPL's 24 joints in meters, z up, at 10 frames a second. Positions are those of the mean
-adult body playing the motion; retargeting them once more moves a joint by 4 mm on average.
+FOLDER (several may be given) is searched for .amc files with their .asf, .bvh and .npz files. The layout of the created
+file is in `lidarpose.body.mocap.motion`: SMPL's 24 joints in meters, z up, at 10 frames per second. Positions are those
+of the mean adult body with the captured motion; retargeting them once more moves a joint by 4 mm on average.
 
-The bundled weights learned from subjects 2, 5, 13 and 14 of the CMU database, bd and dg of HDM05 and the first third of
-clips of eight people of ReActIdle, here in npz files whose clips are called 013_acted, 013_genuine, ...:
+The bundled weights were trained on subjects 2, 5, 13 and 14 of the CMU database, bd and dg of HDM05 and the first third
+of clips of eight people of ReActIdle, here in npz files with clips named 013_acted, 013_genuine, ...:
 
     python tools/make_motion.py FILES --subjects 2 5 13 14 bd dg 0 1 3 4 9 10 --without 014_acted 014_genuine \
         --first 0.3334 "*_acted" "*_genuine" --out wide_motion.npz
 
-The benches have poses of CMU 6 and 7, HDM05 bk and ReActIdle 014 and 015: leave these out of training. Nothing is
-downloaded here. Archives, and what a clip of theirs is called:
+The benches use poses of CMU 6 and 7, HDM05 bk and ReActIdle 014 and 015: exclude these from training. This script
+downloads nothing. Archives and the names of their clips:
 
     CMU         mocap.cs.cmu.edu, subjects/02/02.asf and 02_01.amc          002_01
     HDM05       resources.mpi-inf.mpg.de/HDM05, HDM_bd.asf and              bd_squat1Reps_001
                 HDM_bd_squat1Reps_001_120.amc
     others      .bvh of any common skeleton                                 the file's name
 
-A subject is the part of a clip's name before the first `_`; numbers may be given without their zeros.
+A subject is the part of a clip's name before the first `_`; numbers may be given without leading zeros.
 """
 
 import argparse
@@ -44,7 +44,7 @@ HZ = 10.0
 
 
 def clip_name(name: str) -> str:
-    """The clip's name of a file's: 02_01 -> 002_01, HDM_bd_squat1Reps_001_120 -> bd_squat1Reps_001."""
+    """The clip name for a file name: 02_01 -> 002_01, HDM_bd_squat1Reps_001_120 -> bd_squat1Reps_001."""
     if name.startswith("HDM_"):
         name = name.removeprefix("HDM_").removesuffix("_120")
     subject, separator, rest = name.partition("_")
@@ -52,7 +52,7 @@ def clip_name(name: str) -> str:
 
 
 def is_of(name: str, subjects: list[str]) -> bool:
-    """Whether a clip is of one of the subjects; of anybody where none is named."""
+    """Whether a clip is of one of the subjects; True if no subjects are given."""
     subject_names = {subject.zfill(3) if subject.isdecimal() else subject for subject in subjects}
     return not subject_names or name.partition("_")[0] in subject_names
 
@@ -65,17 +65,17 @@ def read_clips(
     fps: float | None = None,
     up: str | None = None,
 ) -> dict[str, np.ndarray]:
-    """Joints of the mean adult by the clip's name.
+    """Joints of the mean adult, by clip name.
 
     Args:
-        folders: searched for files of `SUFFIXES`.
-        subjects: whose clips are read; all clips if empty.
-        without: patterns of clips that are left out.
-        fps: frames a second of recordings that do not say it; None: 120, CMU's and HDM05's.
-        up: the recordings' up axis, None: as `load_motion` finds it.
+        folders: searched for files with `SUFFIXES`.
+        subjects: subjects whose clips are read; all clips if empty.
+        without: patterns of the names of clips that are left out.
+        fps: frames per second of recordings that do not state it; None: 120, as in CMU and HDM05.
+        up: the recordings' up axis; None: as determined by `load_motion`.
 
     Returns:
-        (frames, 24, 3) float32 m each, z up, at `HZ` frames a second, in the order of the names.
+        (frames, 24, 3) float32 m each, z up, at `HZ` frames per second, sorted by name.
 
     Raises:
         InputError: a folder or a subject is missing, a file cannot be read, or two clips have one name.
@@ -85,7 +85,7 @@ def read_clips(
         if not folder.is_dir():
             raise InputError(f"{folder}: expected a folder of {', '.join(SUFFIXES)} files; give the unpacked archive")
         for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES):
-            # an npz names its clips itself
+            # an npz file contains the names of its clips
             if path.suffix.lower() != ".npz" and not is_of(clip_name(path.stem), subjects):
                 continue
             motion = load_motion(path, hz=HZ, fps=fps, up=up)
@@ -114,7 +114,7 @@ def mean_adult(rotations: np.ndarray, translation: np.ndarray) -> np.ndarray:
 
 
 def first_share(words: list[str]) -> float:
-    """The share of `--first SHARE CLIP ...`. Raises InputError for something else."""
+    """The share in `--first SHARE CLIP ...`. Raises InputError if the value is invalid."""
     if not words:
         return 1.0
     with suppress(ValueError):

@@ -1,4 +1,4 @@
-"""What mkdocs does with two pages: index.md is the README, and reference.md lists every public name."""
+"""mkdocs hooks for two pages: index.md is the README, and reference.md lists all public names."""
 
 import re
 from pathlib import Path
@@ -21,6 +21,6 @@ def on_page_markdown(markdown: str, **_) -> str:
 
 
 def site_links(readme: str) -> str:
-    """The README with links as in the site: its pages without docs/, other files of the repository as plain text."""
+    """The README with the site's links: pages without docs/, and other files of the repository as plain text."""
     readme = re.sub(r"\[([^]]+)\]\((?!docs/|https?:)[^)]+\)", r"\1", readme)
     return readme.replace("](docs/cards)", "](cards/small.md)").replace("](docs/", "](")

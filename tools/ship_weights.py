@@ -1,12 +1,13 @@
-"""Makes a run's model a bundled checkpoint: float16, its card completed with what it scores; its ONNX twin beside; and
-what it says of the cloud in tests/golden_poses.json.
+"""Creates a bundled checkpoint from a run's model: float16, with the scores in its card; also writes its ONNX file, and
+its prediction for the cloud in tests/golden_poses.json.
 
 python benchmarks/heldout.py --motion cmu_motion.npz --weights RUN/model.safetensors --json scores.json
 python tools/ship_weights.py RUN/model.safetensors scores.json src/lidarpose/models/weights/tiny.safetensors
 python tools/ship_weights.py RUN/model.safetensors scores.json OUT --average OLD.safetensors 0.2
 
-The last one keeps a share of the weights that the run began with, which loses less of what they could (Wortsman et al.
-2022, Robust fine-tuning of zero-shot models). What the scores are of is made by the same command without scores: -.
+The last command averages with the weights that the run began with, by their share, which preserves more of their
+abilities (Wortsman et al. 2022, Robust fine-tuning of zero-shot models). With - instead of the scores, the same command
+writes only the checkpoint, which can then be scored.
 """
 
 import argparse
@@ -26,7 +27,7 @@ GOLDEN = Path(__file__).parents[1] / "tests" / "golden_poses.json"
 
 
 def average(network: nn.Module, old: nn.Module, share: float) -> None:
-    """Keeps a share of an older network's weights, in place. What the older one has not stays."""
+    """Interpolates to an older network's weights by `share`, in place. Weights missing in it do not change."""
     old_weights = old.state_dict()
     with torch.no_grad():
         for name, value in network.state_dict().items():
@@ -58,7 +59,7 @@ def main() -> None:
     card_scores["measured on"] = f"benchmarks/heldout.py, subjects {scores['subjects']}, seed {scores['seed']}, human15"
     note = {"note": options.note} if options.note else {}
     out = Path(options.out)
-    # both or none: twins of different weights would not load
+    # both files are made before either is written, since a checkpoint and an ONNX file of different weights do not load
     with tempfile.TemporaryDirectory() as folder:
         temporary_path = Path(folder) / out.name
         save_checkpoint(temporary_path, network, card=header.card | note | {"scores": card_scores}, half=True)

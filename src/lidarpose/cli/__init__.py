@@ -4,13 +4,13 @@
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command. Returns 0, or 2 after one line on stderr where the input is at fault."""
     try:
-        # here, so that a module of one command is imported without those of all others
+        # imported here, so that importing the module of one command does not import those of all others
         from lidarpose.cli.command_line import run
 
         return run(arguments)
     except KeyboardInterrupt:
         from lidarpose.cli.terminal import tell
 
-        # before the command runs, which says more
+        # interrupted before the command runs; later, `run` handles it with a more detailed message
         tell("lidarpose: stopped", error=True)
         return 130

@@ -31,7 +31,7 @@ def run(arguments: list[str] | None = None) -> int:
     parser = make_parser()
     options, unknown = parser.parse_known_args(_joined(sys.argv[1:] if arguments is None else arguments))
     if unknown:
-        # the command's own help tells its options
+        # the error points to the command's own help, which lists its options
         parser.prog = " ".join(filter(None, (parser.prog, options.command)))
         parser.error(f"unrecognized arguments: {' '.join(unknown)}")
     if options.command is None:
@@ -40,14 +40,14 @@ def run(arguments: list[str] | None = None) -> int:
     set_quiet(options.quiet)
     warnings.formatwarning = _warning_line
     with suppress(AttributeError, ValueError):
-        # names of files need not be text, nor has every terminal all letters; stderr does so by itself
+        # file names may contain invalid text, and terminals may lack characters; stderr escapes them by default
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:
         options.run(options)
         if sys.stdout is not None:
             sys.stdout.flush()
     except BrokenPipeError:
-        # whoever read our output has enough
+        # the reader of the output closed the pipe, e.g. head
         _drop_output()
     except ModuleNotFoundError as error:
         extra = "export" if options.command == "export" else None
@@ -60,14 +60,14 @@ def run(arguments: list[str] | None = None) -> int:
     except OSError as error:
         if error.filename is not None or not error.strerror:
             return _failed(error)
-        # what is written to files says which; this is the standard output
+        # errors of files have a file name, so this one is of the standard output
         _drop_output()
         return _failed(InputError(f"cannot write the output ({error.strerror}): send it elsewhere"))
     except MemoryError as error:
         reason = f" ({error})" if str(error) else ""
         return _failed(InputError(f"the memory is full{reason}: give less at once, as fewer points or people"))
     except KeyboardInterrupt as interrupt:
-        # training says how to go on
+        # training puts into the message how to resume
         return _ended(str(interrupt) or "stopped", getattr(interrupt, "status", 130))
     return 0
 
@@ -96,7 +96,7 @@ def _failed(error: Exception) -> int:
 
 class _Parser(argparse.ArgumentParser):
     def __init__(self, **settings: Any):
-        # --keep of another command would be taken for --keep-anchors
+        # otherwise --keep of another command would be accepted as an abbreviation of --keep-anchors
         super().__init__(**{"allow_abbrev": False} | settings)
 
     def error(self, message: str):

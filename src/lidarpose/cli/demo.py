@@ -14,7 +14,7 @@ from lidarpose.progress import Progress
 
 SENSORS = ("vlp-32c", "os1-128", "hdl-64e")
 PEOPLE_EACH = 4
-# milder than what the network learned from, so that most people can be seen by eye
+# difficulty of the scene, lower than in training, so that most people are recognizable by eye
 _HARD = 0.4
 
 
@@ -31,8 +31,8 @@ def run(folder: str | Path, *, seed: int, weights: str = DEFAULT) -> None:
     check_int("seed", seed, least=0)
     folder = Path(folder)
     names = ["index.html", *(f"{name}.png" for name in SENSORS)]
-    # a folder without write access is known at once; files are opened when there is something to write, since whoever
-    # is killed leaves them
+    # reports a missing write permission now; the files are opened only when their content is ready, since a killed
+    # process would leave temporary files
     for name in names:
         check_writable(folder / name)
     model = load(weights, tta=TTA)
@@ -57,7 +57,7 @@ def _report(model: Predictor, people: list) -> tuple[list[dict], dict[str, bytes
     from lidarpose.viz.html import render_report
 
     clouds = [person.sample.points for person in people]
-    # the sensor of a sample is the origin of its frame; the first call warms the network up
+    # the sensor is at the origin of a sample's frame; the first call is the warm-up
     model.predict(clouds[:2], sensor_origin=(0, 0, 0))
     start = time.perf_counter()
     poses = model.predict(clouds, sensor_origin=(0, 0, 0))

@@ -26,9 +26,9 @@ _OPTIONS = """
 --legacy  also score with the released code's arithmetic
 --sensor-unknown  hide the sensor's position
 """
-# of these, those of the detector too
+# those of `_OPTIONS` that also apply to the detector
 _OF_BOTH = ("limit", "seed", "sensor_unknown")
-# in place of a network: what finds people; and its own options
+# the name that selects the detector instead of a network, and the detector's own options
 DETECTOR = "detector"
 _DETECTOR = """
 --scans DIR&  a folder of SCAN.json of labeled people beside SCAN.pcd, .bin, .ply, .npy or another; may be repeated
@@ -62,9 +62,9 @@ $ lidarpose table evaluation/small
 --out FILE  write to FILE (default: print)
 """
 _TABLE_SUFFIXES = {"markdown": (".md", ".markdown", ".txt"), "json": (".json",)}
-# groups of rows that the terminal shows; the others are in scores.json
+# groups of rows printed to the terminal; the others are only in scores.json
 _SHOWN = ("condition", "family", "sensor", "plain", "joints", "body", "joint", "distance, m", "points", "hidden share")
-# metrics of these groups that it shows, besides those of everybody
+# metrics that are printed for these groups; for all people together, all metrics are printed
 _GROUP_METRICS = ("mpjpe", "turned_round", "pck_10cm")
 _TITLES = {
     **{"mpjpe": "MPJPE", "pa_mpjpe": "PA-MPJPE", "pck3": "PCK-3", "pck5": "PCK-5"},

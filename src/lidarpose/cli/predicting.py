@@ -13,14 +13,14 @@ from lidarpose.cli.terminal import add_command, is_file_name, tell
 from lidarpose.errors import InputError, counted, first_names
 from lidarpose.models import DEFAULT, NAMES
 
-# io.point_cloud.SUFFIXES, which a help text does not import
+# io.point_cloud.SUFFIXES, which is not imported just for a help text
 _FILES = ".pcd .ply .las .laz .npy .npz .csv .xyz .txt .bin"
-# what to try where somebody should have been found
+# advice if no person was found although there is one
 _NOBODY = (
     "if there should be: points need meters and z up (--up), a lower --min-score finds more, and predict --crop "
     "treats all points as one person"
 )
-# characters of an id in a warning
+# maximum characters of an id in a warning
 _LONGEST_ID = 40
 
 _FRAME = """
@@ -132,13 +132,13 @@ def output_paths(
     picture = base_path.with_suffix(".png") if options.picture else None
     page = base_path.with_suffix(".html") if options.html else None
     sources = [path for source in options.source for path in (glob.glob(source) or [source])]
-    # of a folder its point files are read, not what an earlier command wrote there
+    # for a folder, its point files are inputs, but not the results that an earlier command wrote there
     files = [file for path in sources if os.path.isdir(path) for file in list_folder(Path(path))]
     files = [file for file in files if file.suffix.lower() in SUFFIXES and not is_result(file)]
     inputs = (options.boxes, options.calib, options.weights, *(options.background or ()))
     for path in filter(None, (result, picture, page)):
         check_not_input(path, *sources, *files, *inputs)
-        # before the work
+        # checked before the work
         check_writable(path)
     return result, picture, page
 
@@ -175,7 +175,7 @@ def _reading(options: argparse.Namespace) -> dict[str, Any]:
     """How a scan is read and searched, for `predict` and `detect` alike."""
     names = ("sensor_origin", "up", "columns", "min_score", "max_people")
     background = options.background
-    # one file is of static points, or a folder; several are scans
+    # a single path is a file of static points or a folder; several paths are scans
     background = background[0] if background and len(background) == 1 else background
     reading = {name: getattr(options, name) for name in names}
     if options.up is None:

@@ -26,7 +26,7 @@ _FRAMES = """
 --every N  process every N-th frame
 --format {jsonl,csv,parquet}  format of NAME.poses.FORMAT (default jsonl)
 """
-# what a user reads of warnings that many frames have
+# maximum number of printed lines for the warnings of frames
 _MOST_WARNINGS = 8
 
 
@@ -114,7 +114,7 @@ def _predict_recording(
             on_line=on_line,
             tell=lambda text: tell(f"lidarpose: {text}"),
         )
-    # before views read single frames, which count anew
+    # read before the pictures below read single frames, which resets the counts in these warnings
     source_warnings = [f"{source.name}: {line}" for line in source.warnings]
     if tracks_picture is not None and picture is not None:
         write_atomic(picture, tracks_picture.draw(source, predictor.wanted, title=Path(source.name).name))
@@ -171,5 +171,5 @@ def _command(options: argparse.Namespace) -> dict[str, Any]:
 def _changed(path: Path) -> int:
     """When a file, or one in a folder, was changed last, ns."""
     files = [path, *(path.iterdir() if path.is_dir() else ())]
-    # a link in a folder may lead nowhere
+    # a folder may contain broken links
     return max(file.stat().st_mtime_ns for file in files if file.exists())

@@ -19,7 +19,7 @@ class _Help(argparse.HelpFormatter):
         return text if text.startswith("example") else super()._fill_text(text, width, indent)
 
 
-# what a user who names it expects as a file
+# suffixes by which a name is taken for a file instead of a folder
 _SUFFIXES = (
     "bin csv gz html jpg json jsonl las laz md mp4 npy npz onnx parquet pcd pdf pkl ply png pt safetensors tsv txt "
     "xlsx xml xyz yaml yml zip"
@@ -28,7 +28,7 @@ _SUFFIXES = (
 
 def is_file_name(text: str) -> bool:
     """Whether a path that is not there yet has a file's suffix and no / behind it."""
-    # os.path says no where a name is too long, which is an error when it is written
+    # unlike Path, os.path.isdir returns False if a name is too long; that is reported when the file is written
     is_folder = text.endswith(("/", os.sep)) or os.path.isdir(text)
     return not is_folder and Path(text).suffix[1:].lower() in _SUFFIXES.split()
 
@@ -40,10 +40,10 @@ def folder(text: str) -> str:
     return text
 
 
-# the metavar of an option tells its type; others are text
+# type of an option by its metavar; all others are text
 _TYPES: dict[str, Callable] = {"N": int, "K": int, "DIR": folder, "RUN": folder}
 _TYPES |= dict.fromkeys(("P", "M", "S", "HZ", "H", "SHARE"), float)
-# stands for a change of the scene
+# --keep is short for a change of the scene
 KEEP = "--keep R  laser mask: share R of patches that each sample keeps, the paper's r_keep; same as --set keep=R"
 
 

@@ -46,7 +46,7 @@ Trains on detections of the bundled detector in synthesized scans.{_RUN.replace(
 $ lidarpose train-verifier --scenes 5000
 $ lidarpose train-verifier runs/train-verifier-001 --resume
 """
-# a value of a setting from its text, by type; others are texts
+# functions that parse a setting from text, by type; other types stay text
 _BOOLS = {"true": True, "false": False}
 _PARSERS: dict[Any, Callable] = {
     int: int,
@@ -85,8 +85,8 @@ def _add(parser, kind: type[Recipe]) -> None:
 --tracker NAME  also log to tensorboard or wandb, if installed
 """
     add_options(parser, options)
-    # first the settings of this kind of training, then those that all have
-    kind_group = parser.add_argument_group(f"{kind.kind}")
+    # first the settings of this kind of training, then the common ones
+    kind_group = parser.add_argument_group(kind.kind)
     common_group = parser.add_argument_group("optimizer and run")
     if kind is Pretrain:
         add_options(kind_group, KEEP)
@@ -137,10 +137,10 @@ def _train(options: argparse.Namespace) -> None:
         if options.recipe is not None:
             raise InputError("a run keeps its recipe: leave --recipe away with --resume")
         folder = folder or latest(name)
-        # a run keeps its recipe: what is not said again stays
+        # a run keeps its recipe: only settings that are given again change
         run_recipe = kind(**(read_config(Path(folder), kind)[0].to_dict() | changes))
     else:
-        # as published, unless a recipe is named
+        # the published recipe of the model, unless a recipe is named
         model = changes.get("model") or model_of_size(changes.get("size", ""))
         recipe_name = options.recipe or recipe_of_model(kind, model)
         run_recipe = recipe(kind, recipe_name, **changes)

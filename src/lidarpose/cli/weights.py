@@ -41,7 +41,7 @@ $ lidarpose import dapt_waymo.safetensors waymo.safetensors --config waymo
 <out> OUT  the checkpoint to write (.safetensors)
 --config NAME  waymo, humanm3, lidarhuman26m, sloper4d, pretrain or paper (default: as stated in the file)
 """
-# of the detector's header
+# keys of the detector's header
 _CALIBRATION = ("default_score", "calibrated_on", "labeled_scans")
 
 
@@ -76,7 +76,7 @@ def installed() -> dict[str, Any]:
             "parameters": parameter_count(path),
             "bytes": path.stat().st_size,
             "onnx_bytes": bundled_path(name, ".onnx").stat().st_size,
-            # of all runs, those included that made the weights with which the last one began
+            # sums over all runs, including those that trained the initial weights of the last run
             "people_seen_in_all": sum(run.get("people_seen", 0) for run in runs),
             "hours_in_all": round(sum(run.get("hours", 0) for run in runs), 2),
             "last_run": {key: card[key] for key in ("command", "people_seen", "hours", "note") if key in card},
@@ -141,7 +141,7 @@ def _torch() -> str:
     if find_spec("torch") is None:
         return "not installed, training and --device need it: in the clone, pip install '.[train]'"
     try:
-        # torch may be installed and still fail to load its libraries
+        # torch may be installed and still fail to load its shared libraries
         import torch
 
         device = (

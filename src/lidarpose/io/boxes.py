@@ -1,7 +1,7 @@
-"""People's boxes: a detector's JSON, arrays of seven numbers, and KITTI's labels with their calibration.
+"""Boxes around people: detector output as JSON, arrays of seven numbers per box, and KITTI labels with calibration.
 
-JSON is `{"people": [{"center": [x, y, z], "size": [l, w, h], "yaw": r, "id": ...}]}` or the bare list; an entry may be
-the row [x, y, z, l, w, h, yaw] too. `Boxes` writes it.
+JSON is `{"people": [{"center": [x, y, z], "size": [l, w, h], "yaw": r, "id": ...}]}` or only the list. An entry may
+also be a row [x, y, z, l, w, h, yaw]. `Boxes` writes this JSON.
 """
 
 import difflib
@@ -26,14 +26,14 @@ from lidarpose.sample import FARTHEST, Box, box_id
 if TYPE_CHECKING:
     from lidarpose.inference.results import Poses
 
-# nobody writes more than two full turns in radians; 30, 90 or 180 are degrees
+# no yaw in radians exceeds two full turns; values such as 30, 90 or 180 are degrees
 _MAX_YAW = 4 * math.pi
 
 _FORM = '{"people": [{"center": [x, y, z], "size": [l, w, h]}]}'
 
-# KITTI's classes of people; a cyclist's box holds the bicycle too
+# KITTI's classes of people; a cyclist's box includes the bicycle
 _KITTI_PEOPLE = ("Pedestrian", "Person_sitting", "Cyclist")
-# how far a calibration's rotations may be from orthogonal: files keep seven digits
+# tolerance on the orthogonality of a calibration's rotations: the files store seven digits
 _ROTATION_TOLERANCE = 1e-3
 
 _Content = dict | list | tuple | np.ndarray | Box
@@ -42,9 +42,12 @@ SCHEMA = "lidarpose.boxes/1"
 
 
 class Boxes(list[Box]):
-    """People's boxes in a scan, detected ones surest first: a list of `Box`. source: the file; warnings: lines about
-    the scan; detector: its version where they were detected; up: the scan's up axis or direction, see
-    `rotation_from_up`, by default that of the boxes, z where none says it."""
+    """The boxes around the people in a scan: a list of `Box`, detections in order of descending score.
+
+    source: the file; warnings: lines about the scan; detector: the version of the detector, if the boxes are
+    detections; up: the scan's up axis or direction, see `rotation_from_up`, by default that of the boxes, or z if no
+    box has one.
+    """
 
     def __init__(
         self,
@@ -57,7 +60,7 @@ class Boxes(list[Box]):
     ):
         boxes = list(boxes)
         up = _common_up(boxes) if up is None else up
-        # a box that is picked out of these says too what was up
+        # each box stores the up axis too, so that a box taken out of this list keeps it
         super().__init__(box if (box.up or "z") == up else replace(box, up=up) for box in boxes)
         self.source, self.warnings, self.detector, self.up = source, tuple(warnings), detector, up
 
@@ -75,7 +78,7 @@ class Boxes(list[Box]):
 
     def to_dict(self) -> dict:
         """The document of the schema lidarpose.boxes/1, which `read_boxes` reads."""
-        # "up" stands beside the people
+        # "up" is a key of the document, next to "people"
         boxes = [replace(box, up=None) for box in self]
         people = [{"id": box.id, **box.to_dict(), "score": box.score, "mounted": box.mounted} for box in boxes]
         return {
@@ -90,35 +93,35 @@ class Boxes(list[Box]):
         }
 
     def to_json(self) -> str:
-        """`to_dict` as JSON, people a line each."""
+        """`to_dict` as JSON, one line per person."""
         return lined_json(self.to_dict(), "people") + "\n"
 
     def save(self, path: str | os.PathLike) -> None:
-        """Writes `to_json` to a .json, whole or not at all."""
+        """Writes `to_json` to a .json file atomically."""
         check_suffix(path, ".json")
         write_atomic(path, self.to_json())
 
 
 def read_boxes(source: "str | os.PathLike | _Content | Poses", *, calib: str | os.PathLike | None = None) -> Boxes:
-    """The boxes of people, in the frame of the points, meters and radians.
+    """Reads the boxes around people, in the frame of the points, in meters and radians.
 
     Args:
-        source: a file, its content, or boxes. A file is JSON, a .npy array (n, 7), or a KITTI label (`label_2/N.txt`,
-            of which pedestrians, sitting people and cyclists are read, moved to the LiDAR's frame). Content is
-            `{"people": [...]}` or the bare list, of which each entry is a `Box`, a row [x, y, z, l, w, h, yaw] or a
-            dict: `center` [x, y, z], `size` [length, width, height], `yaw` about z (0 where it is absent), and as id
-            `id`, else `track`, else None, and `score` (0 to 1), `mounted` (true or false) and `up` where they are that;
-            other keys are ignored. A pose stands for its `box`, as in what `predict` writes, and `Poses` for those of
-            their people. An array or tensor (n, 7) has such rows.
-        calib: KITTI's calibration file; None for `../calib/N.txt` beside a label.
+        source: a file, its content, or boxes. A file is JSON, a .npy array (n, 7), or a KITTI label file
+            (`label_2/N.txt`, of which pedestrians, sitting people and cyclists are read and transformed to the LiDAR
+            frame). Content is `{"people": [...]}` or only the list. Each entry is a `Box`, a row
+            [x, y, z, l, w, h, yaw] or a dict with the keys `center` [x, y, z], `size` [length, width, height] and `yaw`
+            about z (0 if absent). The box's id is `id`, else `track`, else None. `score` (0 to 1), `mounted` (true or
+            false) and `up` are read if their values are valid; other keys are ignored. For a pose, as `predict` writes
+            it, its `box` is read, and for `Poses` the boxes of all people. An array or tensor (n, 7) holds such rows.
+        calib: KITTI's calibration file; None for `../calib/N.txt` relative to the folder of the label file.
 
     Returns:
-        A `Box` for each entry, in order, and with them `up`, which `detect` and `predict` write: what is up in the
-        scan. No people is legal.
+        A `Box` for each entry, in order, and the scan's up axis `up`, which `detect` and `predict` write. There may be
+        no people.
 
     Raises:
         InputError: one line that names the file, the entry (counted from 0, as in JSON paths) and the key. Two entries
-            of one id are an error, since results are told apart by it.
+            with the same id are an error, since results are identified by it.
     """
     source = to_numpy(source)
     if hasattr(source, "people"):
@@ -130,7 +133,7 @@ def read_boxes(source: "str | os.PathLike | _Content | Poses", *, calib: str | o
         boxes = [_box(entry, f"people[{i}]") for i, entry in enumerate(_entries(content))]
         first_index: dict[str, int] = {}
         for i, box in enumerate(boxes):
-            # a table and `poses["1"]` do not tell 1 from "1"
+            # tables and `poses["1"]` do not distinguish 1 from "1"
             if box.id is not None and first_index.setdefault(str(box.id), i) != i:
                 actual = f"{_show(box.id)}, which people[{first_index[str(box.id)]}] has too"
                 raise FormatError(
@@ -143,7 +146,7 @@ def read_boxes(source: "str | os.PathLike | _Content | Poses", *, calib: str | o
 
 
 def _up(content: object) -> str | None:
-    """What is up by a document of ours, None by anything else."""
+    """The up axis that a lidarpose document states, None for any other content."""
     up: object
     if isinstance(content, Boxes):
         up = content.up
@@ -159,7 +162,7 @@ def _up(content: object) -> str | None:
 
 
 def _common_up(boxes: Sequence[Box]) -> str:
-    """What is up by those of the boxes that say it, z where none does. Raises InputError where they differ."""
+    """The up axis of the boxes that have one, z if none has one. Raises InputError if they differ."""
     directions = sorted({box.up for box in boxes if box.up is not None})
     if len(directions) > 1:
         names = ", ".join(directions)
@@ -190,12 +193,12 @@ def _load_file(path: str | os.PathLike, calib: str | os.PathLike | None) -> obje
         text = data.decode("utf-8-sig")
         return _read_kitti(path, text, calib) if _is_kitti(text) else json.loads(text)
     except InputError:
-        # of the calibration
+        # raised while reading the calibration
         raise
     except json.JSONDecodeError as error:
         start = error.doc.lstrip()[:1]
         if start and start not in "{[":
-            # a table of another tool, as CSV
+            # a table from another tool, e.g. CSV
             raise FormatError(f"JSON {_FORM} or a KITTI label", "text", "write the boxes so") from None
         where = f"line {error.lineno}, column {error.colno}"
         raise FormatError(f"is not JSON: {error.msg} at {where}; correct it there") from None
@@ -209,14 +212,14 @@ def _load_file(path: str | os.PathLike, calib: str | os.PathLike | None) -> obje
 
 
 def _is_kitti(text: str) -> bool:
-    """Whether the first line has a label's values: class, truncation, occlusion, angle, 4 of the picture, 7 of the box,
-    and a score where it is a result."""
+    """Whether the first line has the values of a KITTI label: class, truncation, occlusion, angle, 4 of the image box,
+    7 of the 3D box, and in a result file a score."""
     words = text.lstrip().partition("\n")[0].split()
     return len(words) in (15, 16) and _parse_numbers(words[1:], len(words) - 1) is not None
 
 
 def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | None) -> list[list[float]]:
-    """Rows [x, y, z, l, w, h, yaw] in the LiDAR's frame of the people in a label."""
+    """Rows [x, y, z, l, w, h, yaw] in the LiDAR frame, one for each person in a label file."""
     people = []
     for number, line in enumerate(text.splitlines(), 1):
         words = line.split()
@@ -239,7 +242,7 @@ def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | N
     R_rect_velo, t_rect_velo = _read_calibration(calib)
     rows = []
     for height, width, length, x, y, z, rotation_y in people:
-        # the camera's y points down and a label's place is the middle of the box's bottom
+        # the camera's y axis points down, and a label's location is the center of the box's bottom face
         center = R_rect_velo.T @ (np.array([x, y - height / 2, z]) - t_rect_velo)
         forward = R_rect_velo.T @ np.array([math.cos(rotation_y), 0, -math.sin(rotation_y)])
         rows.append([*center.tolist(), length, width, height, math.atan2(forward[1], forward[0])])
@@ -247,7 +250,7 @@ def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | N
 
 
 def _read_calibration(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
-    """R (3, 3) and t (3,) m from the LiDAR's frame to that of the rectified camera 0, in which labels are."""
+    """R (3, 3) and t (3,) m from the LiDAR frame to the frame of the rectified camera 0, in which labels are given."""
     text = read_bytes(path, expected="KITTI's calibration").decode("utf-8", "replace")
     lines = {words[0].rstrip(":"): words[1:] for words in map(str.split, text.splitlines()) if words}
     matrices = []
@@ -265,7 +268,7 @@ def _read_calibration(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _parse_numbers(words: list[str], count: int) -> list[float] | None:
-    """The finite numbers that `count` words say, else None."""
+    """The words as `count` finite numbers, else None."""
     try:
         return _as_numbers(map(float, words), count)
     except ValueError:
@@ -286,7 +289,7 @@ def _box(entry: object, where: str) -> Box:
         raise FormatError(f"{where}: expected {expected}, got {_show(entry)}")
     id = _id(entry, where)
     if "box" in entry and "center" not in entry:
-        # of somebody who was posed
+        # an entry of a pose result, whose box is nested
         if not isinstance(entry["box"], dict):
             raise FormatError(f"{where}.box: expected a box, got {_show(entry['box'])}: a cloud of one person has none")
         entry, where = entry | entry["box"], f"{where}.box"
@@ -300,7 +303,7 @@ def _box(entry: object, where: str) -> Box:
         raise FormatError(f"{where}.yaw: expected a finite number in radians, got {_show(entry['yaw'])}")
     if abs(yaw) > _MAX_YAW:
         raise FormatError(f"{where}.yaw: expected radians, got {yaw:g}; if it is in degrees, multiply by pi / 180")
-    # of other detectors a score may be anything, and nothing depends on it
+    # scores of other detectors may have any scale; nothing depends on them, so that invalid ones are ignored
     score = _number(entry.get("score"))
     up = None
     with suppress(InputError):
@@ -330,7 +333,7 @@ def _triple(entry: dict, key: str, where: str, *, meaning: str) -> list[float]:
 
 
 def _as_numbers(values: Any, count: int) -> list[float] | None:
-    """The `count` finite numbers of anything that can be looped over but text and keys, else None."""
+    """The `count` finite numbers of any iterable except text and dicts, else None."""
     try:
         values = [_number(value) for value in values] if not isinstance(values, str | bytes | dict) else []
     except TypeError:
@@ -339,7 +342,7 @@ def _as_numbers(values: Any, count: int) -> list[float] | None:
 
 
 def _number(value: Any) -> float | None:
-    """The value as a float that a place or an angle may have, else None. Truth values and texts are no numbers."""
+    """The value as a float in the range of coordinates and angles, else None. Booleans and text are not numbers."""
     if isinstance(value, bool | np.bool_ | str | bytes):
         return None
     try:
@@ -362,7 +365,7 @@ def _id(entry: dict, where: str) -> str | int | None:
 
 
 def _keys(entry: dict, expected_key: str) -> str:
-    """What the entry has instead of the wanted key, with the nearest spelling."""
+    """The keys that the entry has instead of the expected one, with the closest spelling as a hint."""
     if not entry:
         return "got {}"
     names = [str(key) for key in entry]

@@ -1,4 +1,4 @@
-"""Reading a user's file and writing results so that a crash never leaves half a file.
+"""Reading a user's file, and writing results atomically, so that a crash never leaves a partial file.
 
 Every failure that the user can cause is an `InputError` of one line that names the file and the remedy.
 """
@@ -19,14 +19,14 @@ from typing import Any
 
 from lidarpose.errors import InputError, MissingExtra
 
-# a frame's number, as files are named and lines begin
+# a frame number, as in file names and at the beginning of lines
 FRAME_NUMBER = re.compile("[0-9]{1,12}")
-# bytes: a name may have 255 on the usual file systems, of which the temporary name needs some itself
+# bytes of the target's name kept in the temporary name: usual file systems allow 255 in all, and the prefix needs some
 _MAX_KEPT_NAME = 100
 
-# how the names of temporary files begin; with process ids in version 0.2
+# prefix of the names of temporary files; version 0.2 used process ids
 _TEMPORARY = r"\.(?:[0-9a-f]{16}|\d+-\d+)-"
-# in a folder while a process writes there
+# this file exists in a folder while a process writes there
 LOCK = ".lock"
 
 _REMEDIES = {
@@ -41,14 +41,14 @@ _REMEDIES = {
 }
 
 
-# an archive may unpack to so many bytes, or to so many times its size: points take a tenth at the very least
+# an archive may unpack to this many bytes or to this multiple of its size: real points compress to a tenth at best
 _UNPACKED_BYTES, _UNPACKED_RATIO = 64 * 2**20, 32
 
 
 class FormatError(Exception):
     """What is wrong with a file's content and what to do, without the file's name, which its reader adds.
 
-    A whole sentence, or three parts: what was expected, what came, and the remedy.
+    The message is a whole sentence, or has three parts: what was expected, what the file contains, and the remedy.
     """
 
     def __init__(self, problem: str, came: object = None, remedy: str = ""):
@@ -62,12 +62,12 @@ def shorten(text: str, limit: int = 80) -> str:
 
 
 def one_line(text: str) -> str:
-    """The text as one line that any terminal can print: what would break the line or steer the terminal is escaped."""
+    """The text as one line that any terminal can print: line breaks and control characters are escaped."""
     return encodable("".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.splitlines())))
 
 
 def encodable(text: str) -> str:
-    """The text with what is no character, as names from a disk or from JSON may hold, escaped."""
+    """The text with lone surrogates escaped, which file names and JSON may contain."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 
@@ -77,23 +77,23 @@ def file_error(path: object, problem: object) -> InputError:
 
 
 def unreadable(path: object, error: OSError) -> InputError:
-    """The error for a file that the system does not let us read."""
+    """The error for a file that the operating system refuses to read."""
     return file_error(path, f"cannot be read ({error.strerror or error}); check the path and its rights")
 
 
 def listed(paths: str | os.PathLike | Iterable[str | os.PathLike]) -> list[str | os.PathLike]:
-    """Paths or names as a list; one alone is one, not a list of letters. Raises InputError for anything else."""
+    """Paths or names as a list; a single string is one path, not a list of letters. Raises InputError otherwise."""
     if isinstance(paths, bytes) or not isinstance(paths, str | os.PathLike | Iterable):
         raise InputError(f"expected a path, or several, got {type(paths).__name__}: name a file or folder")
     return [paths] if isinstance(paths, str | os.PathLike) else list(paths)
 
 
 def check_not_input(out: str | os.PathLike, *inputs: object) -> None:
-    """Raises InputError where the file to write is one of those that are read, by whatever name. Inputs that are no
-    paths, or of files that are not there, do not count."""
+    """Raises InputError if the output file is one of the input files, also under another name. Inputs that are not
+    paths, or whose files do not exist, are ignored."""
     for source in inputs:
         is_same = False
-        # a bare number, for one, would be taken for an open file's handle
+        # os.fspath rejects numbers, which samefile would take for open file descriptors
         with suppress(OSError, TypeError, ValueError):
             is_same = os.path.samefile(out, os.fspath(source))  # type: ignore[call-overload]
         if is_same:
@@ -101,18 +101,19 @@ def check_not_input(out: str | os.PathLike, *inputs: object) -> None:
 
 
 def content_digest(path: str | os.PathLike, *, expected: str) -> str:
-    """The SHA-256 of a file, in hexadecimal digits. expected and errors: as of `read_bytes`."""
+    """The SHA-256 of a file, in hexadecimal digits. expected and errors: as in `read_bytes`."""
     return hashlib.sha256(read_bytes(path, expected=expected)).hexdigest()
 
 
 def read_bytes(path: str | os.PathLike, *, expected: str, most: int | None = None) -> bytes:
-    """The content of a regular, non-empty file of at most `most` bytes; `expected` says what it should be ("a JSON
-    file", ...).
+    """The content of a regular, non-empty file of at most `most` bytes.
+
+    `expected` describes the file in error messages ("a JSON file", ...).
 
     Raises InputError for a missing, empty, too large or unreadable file, a folder, a device or a pipe.
     """
     try:
-        # a bare number would be taken for an open file's handle
+        # os.fspath rejects numbers, which stat and open would take for open file descriptors
         path = os.fspath(path)
         mode, size = os.stat(path).st_mode, os.stat(path).st_size
         if stat.S_ISDIR(mode):
@@ -141,7 +142,7 @@ def read_bytes(path: str | os.PathLike, *, expected: str, most: int | None = Non
 
 
 def read_json(path: str | os.PathLike, *, expected: str) -> Any:
-    """The content of a JSON file. expected and errors: as of `read_bytes`; what is no JSON is an InputError too."""
+    """The content of a JSON file. expected and errors: as in `read_bytes`; invalid JSON is an InputError, too."""
     data = read_bytes(path, expected=expected)
     try:
         return json.loads(data.decode("utf-8-sig"))
@@ -150,8 +151,8 @@ def read_json(path: str | os.PathLike, *, expected: str) -> Any:
 
 
 def lined_json(document: dict[str, Any], list_key: str, *inner_keys: str, indent: str = "") -> str:
-    """A document as JSON: a line for each key and for each entry of the list at `list_key`, which with an inner key is
-    itself such a document."""
+    """A document as JSON: one line for each key and for each entry of the list at `list_key`. If inner keys are given,
+    each entry is itself formatted so, with the first of them as its `list_key`."""
     lines = []
     for key, value in document.items():
         text = json.dumps(value)
@@ -164,9 +165,10 @@ def lined_json(document: dict[str, Any], list_key: str, *inner_keys: str, indent
 
 
 def check_unpacked(packed: int, unpacked: int) -> None:
-    """Raises FormatError where so many packed bytes would unpack to more than a file of real data does.
+    """Raises FormatError if `packed` bytes would unpack to more bytes than a file of real data does.
 
-    The environment variable LIDARPOSE_MAX_UNPACKED raises the number of bytes that are unpacked in any case.
+    The environment variable LIDARPOSE_MAX_UNPACKED sets the number of bytes that may be unpacked from a file of any
+    size.
     """
     limit = os.environ.get("LIDARPOSE_MAX_UNPACKED", str(_UNPACKED_BYTES))
     if not (limit.isascii() and limit.isdecimal()):
@@ -179,7 +181,7 @@ def check_unpacked(packed: int, unpacked: int) -> None:
 
 
 def _nearest(path: str | os.PathLike) -> str:
-    """What to do about a missing file: the nearest name in its folder, or that the folder itself is missing."""
+    """A hint about a missing file: the most similar name in its folder, or that the folder itself is missing."""
     if not path:
         return "; give its name"
     folder, name = os.path.split(os.path.abspath(os.fsdecode(path)))
@@ -194,18 +196,17 @@ def _nearest(path: str | os.PathLike) -> str:
 
 
 def check_writable(path: str | os.PathLike) -> None:
-    """Raises InputError where `atomic_path` would, for what is known long before there is something to write. Leaves
-    nothing behind."""
+    """Raises InputError if `atomic_path` would, to be called long before the content is ready. Leaves no files."""
     with suppress(_Abandoned), atomic_path(path):
         raise _Abandoned
 
 
 class _Abandoned(Exception):
-    """Nothing is to be written after all."""
+    """Ends the block of `atomic_path` without writing the file."""
 
 
 def check_suffix(path: str | os.PathLike, *suffixes: str) -> None:
-    """Raises InputError where a file's name says another format than it gets."""
+    """Raises InputError if a file's suffix does not match the format that is written to it."""
     try:
         name = os.fsdecode(path).lower()
     except TypeError as error:
@@ -216,13 +217,13 @@ def check_suffix(path: str | os.PathLike, *suffixes: str) -> None:
 
 @contextmanager
 def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
-    """Yields a temporary path in the folder of `path`; it becomes `path` when the block ends well.
+    """Yields a temporary path in the folder of `path`, which is renamed to `path` when the block ends without an error.
 
-    The temporary name ends in the last part of `path`'s name, suffix included, so that libraries which choose a
-    format by the suffix work. Any exception in the block removes the temporary file, and the folders made for it,
-    and leaves an older file at `path` as it was. A link is followed. Missing parent folders are created.
+    The temporary name ends in the last part of `path`'s name, including the suffix, so that libraries that choose a
+    format by the suffix work. Any exception in the block removes the temporary file and the folders created for it,
+    and leaves an older file at `path` unchanged. Links are followed. Missing parent folders are created.
 
-    Raises InputError where the folder cannot be written, is full, or `path` is a folder or a device.
+    Raises InputError if the folder is not writable or the disk is full, or if `path` is a folder or a device.
     """
     try:
         target = Path(os.path.realpath(path))
@@ -233,21 +234,21 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
         mode = target.stat().st_mode
         if stat.S_ISDIR(mode):
             raise file_error(path, "is a folder; give the name of a file to write")
-        # replacing a device such as /dev/null by a file would break the machine when run as root
+        # replacing a device such as /dev/null with a file would break the machine when run as root
         if not stat.S_ISREG(mode):
             raise file_error(path, "is a device or pipe; give the name of a file to write")
 
     new_folders: list[Path] = []
-    # a character that is cut in two is left out
+    # a multi-byte character that the cut splits is dropped
     name_end = target.name.encode("utf-8", "ignore")[-_MAX_KEPT_NAME:].decode("utf-8", "ignore")
-    # random: containers on one disk have the same process ids
+    # a random name, since containers that share a disk may have the same process ids
     temporary = target.parent / f".{secrets.token_hex(8)}-{name_end}"
     try:
         for folder in (*reversed(target.parent.parents), target.parent):
             if not folder.is_dir():
                 folder.mkdir(exist_ok=True)
                 new_folders.append(folder)
-        # made at once, so that a folder without write access is known before hours of work go into the block
+        # created now, so that a missing write permission is reported before hours of work in the block
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666 if mode is None else 0o600))
     except OSError as error:
         _remove(temporary, new_folders)
@@ -257,7 +258,7 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
         with open(temporary, "r+b") as file:
             os.fsync(file.fileno())
         if mode is not None:
-            # whoever may not read the old content may not read the new
+            # the new file keeps the permissions of the old one
             with suppress(OSError):
                 os.chmod(temporary, stat.S_IMODE(mode))
         os.replace(temporary, target)
@@ -270,7 +271,7 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def write_atomic(path: str | os.PathLike, data: bytes | str) -> None:
-    """Writes `data` (text as UTF-8) to `path` in one step: readers see the old content or the new, never a part.
+    """Writes `data` (text as UTF-8) to `path` in one step: readers see either the old or the new content.
 
     Creates missing parent folders. Raises InputError as `atomic_path` does.
     """
@@ -280,15 +281,15 @@ def write_atomic(path: str | os.PathLike, data: bytes | str) -> None:
 
 
 def write_all_atomic(contents: Mapping[Path, bytes]) -> None:
-    """Writes several files, all of them or none. Raises InputError as `atomic_path` does."""
+    """Writes several files, either all of them or none. Raises InputError as `atomic_path` does."""
     with ExitStack() as stack:
         for path, content in contents.items():
             stack.enter_context(atomic_path(path)).write_bytes(content)
 
 
 def is_unused(folder: Path, names: str) -> bool:
-    """Whether a folder is missing, or holds nothing but what killed processes left of files with such names (a regular
-    expression)."""
+    """Whether a folder is missing, or contains only files that killed processes left: locks, and temporary files for
+    names that match the regular expression `names`."""
     return (
         not folder.exists()
         or folder.is_dir()
@@ -298,18 +299,18 @@ def is_unused(folder: Path, names: str) -> bool:
 
 @contextmanager
 def locked(folder: Path, names: str, *, busy: str, wait: float = 0.0) -> Iterator[None]:
-    """Keeps other processes from writing into a folder, and removes what killed ones left of files.
+    """Locks a folder against writing by other processes, and removes temporary files that killed processes left.
 
-    The folder is made, and removed again where nothing came into it. A process that was killed keeps nobody out. A file
-    system that knows no locks goes without.
+    The folder is created if it is missing; such a folder is removed at the end if it is still empty. The lock of a
+    killed process does not block others. On file systems without locks nothing is locked.
 
     Args:
-        names: Of the files that are written there and in its subfolders, a regular expression.
-        busy: What to say where another process holds the lock for longer than `wait` seconds.
+        names: A regular expression for the names of the files that are written there and in subfolders.
+        busy: The error message if another process holds the lock for longer than `wait` seconds.
 
     Raises:
-        InputError: Where the folder is in use, or cannot be written.
-        MissingExtra: Without filelock.
+        InputError: The folder is in use or not writable.
+        MissingExtra: filelock is not installed.
     """
     lock = _file_lock(folder / LOCK)
     is_new = not folder.exists()
@@ -321,7 +322,7 @@ def locked(folder: Path, names: str, *, busy: str, wait: float = 0.0) -> Iterato
         yield
         _remove_leftovers(folder, names)
     finally:
-        # Windows does not let go of a file that is open
+        # Windows does not delete open files
         with suppress(OSError):
             (folder / LOCK).unlink()
         lock.release()
@@ -332,15 +333,16 @@ def locked(folder: Path, names: str, *, busy: str, wait: float = 0.0) -> Iterato
 
 @contextmanager
 def exclusive_lock(path: Path, on_busy: Callable[[], None]) -> Iterator[None]:
-    """Keeps other processes from what a file in a folder that is there stands for, and waits until they are done. The
-    file stays; else as `locked`.
+    """Holds the lock file `path`, after waiting for other processes to release it.
+
+    The folder must exist, and the lock file is not removed; otherwise like `locked`.
 
     Args:
-        on_busy: Called before another process is waited for.
+        on_busy: Called before waiting for another process.
 
     Raises:
-        InputError: Where the file cannot be written.
-        MissingExtra: Without filelock.
+        InputError: The file is not writable.
+        MissingExtra: filelock is not installed.
     """
     lock = _file_lock(path)
     if not _acquired(lock, 0.0):
@@ -362,7 +364,8 @@ def _file_lock(path: Path) -> Any:
 
 
 def _acquired(lock: Any, wait: float) -> bool:
-    """Whether a lock is held within so many seconds, below 0 for any number; True where the file system knows none."""
+    """Whether the lock could be acquired within `wait` seconds, without limit below 0; True on file systems without
+    locks."""
     from filelock import Timeout
 
     try:
@@ -383,13 +386,13 @@ def _remove_leftovers(folder: Path, names: str) -> None:
 
 
 def _is_about(error: OSError, temporary: Path) -> bool:
-    """Whether an error of the block came from writing the temporary file, not from something else it did."""
+    """Whether an error in the block of `atomic_path` came from writing the temporary file."""
     names = {os.fsdecode(n) for n in (error.filename, error.filename2) if isinstance(n, str | bytes | os.PathLike)}
     return str(temporary) in names or error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 
 
 def write_error(path: object, folder: Path, error: OSError) -> InputError:
-    """The error of a file that cannot be written into a folder, with what to do."""
+    """The error for a file that cannot be written into a folder, with the remedy."""
     remedy = _REMEDIES.get(error.errno or 0, "choose another folder")
     return file_error(path, f"cannot write into the folder {folder} ({error.strerror or error}); {remedy}")
 
@@ -403,7 +406,7 @@ def _remove(temporary: Path, new_folders: list[Path]) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Makes the new name itself survive a power cut, where the system can (not on Windows)."""
+    """Flushes the folder to disk, so that the new file name survives a power failure (not supported on Windows)."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

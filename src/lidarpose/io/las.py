@@ -1,6 +1,6 @@
-"""LAS and LAZ, the formats of surveyors. Source: ASPRS, LAS Specification 1.4 - R15, 2.4 to 2.6.
+"""LAS and LAZ, the formats of surveying. Source: ASPRS, LAS Specification 1.4 - R15, 2.4 to 2.6.
 
-Where a point stands is the same in all point formats, so LAS needs no library. LAZ is unpacked by lazrs.
+All point formats store the coordinates at the same place, so LAS needs no library. LAZ is unpacked by lazrs.
 """
 
 import io
@@ -12,18 +12,18 @@ from lidarpose.errors import missing_extra
 from lidarpose.io.files import FormatError, check_unpacked
 from lidarpose.io.text import check_bytes
 
-# of version 1.2 and older; 1.4 counts its points at the end of a longer one
+# header bytes of version 1.2 and older, and of 1.4, whose longer header has a 64-bit number of points
 _HEADER, _HEADER_1_4 = 227, 375
 _POINT_FORMATS = range(11)
-# set in the number of the point format where points are packed
+# this bit of the point format's number is set if the points are compressed
 _PACKED = 0x80
-# the record that says how: of whom, and which
+# user id and record id of the record that describes the compression
 _LASZIP = (b"laszip encoded", 22204)
 _WITH_TIME, _WITH_COLOR = (1, 3, 4, 5, 6, 7, 8, 9, 10), (2, 3, 5, 7, 8, 10)
 
 
 def parse_las(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
-    """x y z (n, 3) float64 in the file's unit, the names of the columns, and no warnings; raises FormatError."""
+    """x y z (n, 3) float64 in the file's unit, the column names, and an empty tuple of warnings; raises FormatError."""
     if len(data) < _HEADER or data[:4] != b"LASF":
         raise FormatError("a LAS header", f"another or a damaged one of {len(data)} bytes", "copy it again")
     version = tuple(data[24:26])
@@ -48,7 +48,7 @@ def parse_las(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]
 
 
 class _Unseekable(io.RawIOBase):
-    """Bytes to be read once: lazrs then leaves out the table of chunks, whose announced length it would allocate."""
+    """A stream without seeking: lazrs then skips the chunk table, for which it would allocate the announced length."""
 
     def __init__(self, data: bytes):
         self._file = io.BytesIO(data)
@@ -58,7 +58,8 @@ class _Unseekable(io.RawIOBase):
 
 
 def _unpack(data: bytes, start: int, size: int, num_points: int) -> bytes:
-    """The points of a LAZ file as those of a LAS file. lazrs trusts what a file announces, so that is checked here."""
+    """The point records of a LAZ file, decompressed as in a LAS file. lazrs does not validate the sizes that a file
+    announces, so this module does."""
     try:
         import lazrs
     except ModuleNotFoundError as error:
@@ -74,7 +75,7 @@ def _unpack(data: bytes, start: int, size: int, num_points: int) -> bytes:
             try:
                 record_data = data[offset - length : offset]
                 lazrs.LasZipDecompressor(_Unseekable(data[start:]), record_data).decompress_many(points)
-            # a damaged file may stop lazrs in the middle, by an error that is no Exception
+            # a damaged file may make lazrs panic, which raises an error that is not an Exception
             except BaseException as error:
                 if isinstance(error, KeyboardInterrupt | SystemExit):
                     raise

@@ -1,4 +1,4 @@
-"""NumPy's files, without running anything that is pickled in them and without memory for what they only announce.
+"""NumPy files, read without unpickling anything and without allocating memory for sizes that are only announced.
 
 https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html
 """
@@ -16,33 +16,33 @@ import numpy as np
 from lidarpose.io.files import FormatError, check_unpacked, file_error, read_bytes, shorten
 from lidarpose.io.text import check_bytes
 
-# how numpy compresses
+# the compression methods that numpy uses
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-# bytes of a header, of which numpy reads 10,000
+# bytes read for a header; numpy accepts headers of up to 10,000
 _LONGEST_HEADER = 2**14
 
 
 def read_npz(
     path: str | os.PathLike, wanted: Iterable[str], *, expected: str
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Arrays of an npz file, without running anything that is pickled in it.
+    """Reads arrays of an npz file, without unpickling anything.
 
     Args:
-        wanted: Names of the arrays to read; those that are missing are left out.
-        expected: As of `read_bytes`.
+        wanted: Names of the arrays to read; missing ones are left out.
+        expected: As in `read_bytes`.
 
     Returns:
-        The arrays by name, and all names in the file, sorted.
+        The arrays by name, and the sorted names of all arrays in the file.
 
     Raises:
-        InputError: For a missing, damaged or truncated file, Python objects among the arrays, too large a file.
+        InputError: The file is missing, damaged, truncated or too large, or an array holds Python objects.
     """
     data = read_bytes(path, expected=expected)
     try:
         with open_npz(data) as (archive, members):
             present_names = [name for name in wanted if name in members]
             contents = unpack(archive, [members[name] for name in present_names], len(data))
-            # copied, since what lies in a file's bytes cannot be written to
+            # copied, since arrays backed by the file's bytes are read-only
             arrays = {name: load_array(content).copy() for name, content in zip(present_names, contents, strict=True)}
             return arrays, sorted(members)
     except FormatError as problem:
@@ -53,18 +53,18 @@ def read_npz(
 
 @contextmanager
 def open_npz(data: bytes):
-    """Yields the archive in a file's bytes and its members by the names of arrays; raises FormatError."""
+    """Yields the archive in a file's bytes and its members by array name; raises FormatError."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             members = [member for member in archive.infolist() if member.filename.endswith(".npy")]
-            # numpy writes no others, and zipfile unpacks them without bounds
+            # numpy writes no other methods, and zipfile unpacks those without a size limit
             if other_members := [member for member in members if member.compress_type not in _METHODS]:
                 actual = f"another compression of {shorten(other_members[0].filename)}"
                 raise FormatError("an npz that is stored or deflated", actual, "save it with numpy.savez_compressed")
             yield archive, {member.filename.removesuffix(".npy"): member for member in members}
     except (FormatError, MemoryError):
         raise
-    # zipfile and zlib raise many kinds for a damaged archive
+    # zipfile and zlib raise many kinds of errors for a damaged archive
     except Exception as error:
         reason = shorten(str(error))
         raise FormatError(
@@ -73,27 +73,27 @@ def open_npz(data: bytes):
 
 
 def unpack(archive: zipfile.ZipFile, members: list[zipfile.ZipInfo], size: int) -> Iterator[bytes]:
-    """The content of each member of an archive of `size` bytes, of no more bytes than are announced; raises
-    FormatError where those are too many."""
+    """Yields the content of each member of an archive of `size` bytes, up to the announced number of bytes. Raises
+    FormatError if too many are announced."""
     packed_size = min(size, sum(member.compress_size for member in members))
     check_unpacked(packed_size, sum(member.file_size for member in members))
     for member in members:
         with archive.open(member) as file:
-            # read() would unpack everything before it looks at the announced size
+            # read() without a size would unpack everything before it checks the announced size
             yield file.read(max(member.file_size, 1))
 
 
 def member_header(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> tuple[tuple[int, ...], np.dtype]:
-    """(shape, dtype) of a member, of which no more is unpacked."""
+    """(shape, dtype) of a member; only its header is unpacked."""
     with archive.open(member) as file:
         return array_header(io.BytesIO(file.read(_LONGEST_HEADER)))[:2]
 
 
 def array_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype, Literal["C", "F"]]:
-    """(shape, dtype, order) of a .npy stream, which is left at its first value."""
+    """(shape, dtype, order) of a .npy stream; afterwards the stream is positioned at the first value."""
     try:
         version = np.lib.format.read_magic(file)
-        # version 3 differs from 2 by the characters that field names may have
+        # version 3 differs from 2 only in the characters allowed in field names
         read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, is_fortran, dtype = read_header(file)
         return shape, dtype, "F" if is_fortran else "C"

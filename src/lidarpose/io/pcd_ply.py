@@ -1,4 +1,4 @@
-"""Formats with a header that says where x, y and z are: PCD of any version, and the vertices of PLY.
+"""Formats whose header describes the position of x, y and z: PCD of any version, and the vertices of PLY.
 
 https://pointclouds.org/documentation/tutorials/pcd_file_format.html, http://paulbourke.net/dataformats/ply/
 """
@@ -22,16 +22,16 @@ _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": "
 
 
 def _columns(data: bytes, num_points: int, types: Sequence[str], starts: Sequence[int], steps: Sequence[int]):
-    """x y z (n, 3) of bytes: the type of each, where its first value begins, and how far it is to the next one."""
+    """x y z (n, 3) from bytes: of each the type, the byte offset of the first value, and the stride to the next one."""
     layouts = zip(types, starts, steps, strict=True)
     return np.stack([np.ndarray(num_points, kind, data, start, step) for kind, start, step in layouts], axis=-1)
 
 
 def parse_pcd(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
-    """x y z (n, 3), the names of the fields, and no warnings; raises FormatError."""
+    """x y z (n, 3), the field names, and an empty tuple of warnings; raises FormatError."""
     header, encoding, start = _pcd_header(data)
     names = tuple(header.get("FIELDS") or header.get("COLUMNS") or ())
-    # the older versions of the format leave out COUNT
+    # older versions of the format have no COUNT
     sizes, types, count_words = (header.get(key, ["1"] * len(names)) for key in ("SIZE", "TYPE", "COUNT"))
     if not len(sizes) == len(types) == len(count_words) == len(names):
         actual = f"{len(names)} fields, {len(sizes)} sizes, {len(types)} types and {len(count_words)} counts"
@@ -58,7 +58,7 @@ def parse_pcd(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]
         check_bytes(data, start, num_points * row_size, num_points)
         starts, steps = [start + offset for offset in offsets], [row_size] * 3
     else:
-        # field by field: all x, then all y
+        # stored field by field: all x, then all y
         data = _decompress(data, start, num_points * row_size, num_points)
         starts, steps = [num_points * offset for offset in offsets], [widths[i] for i in xyz_indices]
     return _columns(data, num_points, [f"<{formats[i]}" for i in xyz_indices], starts, steps), names, ()
@@ -77,7 +77,7 @@ def _pcd_header(data: bytes) -> tuple[dict[str, list[str]], str, int]:
 
 
 def _decompress(data: bytes, start: int, size: int, num_points: int) -> bytes:
-    """The `size` bytes of an LZF body, which begins with its packed and its unpacked size (uint32)."""
+    """The `size` decompressed bytes of an LZF body, which begins with its packed and its unpacked size (uint32)."""
     from lzf import decompress
 
     check_bytes(data, start, 8, num_points)
@@ -97,7 +97,7 @@ def _decompress(data: bytes, start: int, size: int, num_points: int) -> bytes:
 
 
 def parse_ply(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
-    """x y z (n, 3) of the vertices, the names of their properties, and no warnings; raises FormatError."""
+    """x y z (n, 3) of the vertices, their property names, and an empty tuple of warnings; raises FormatError."""
     encoding, elements, body_start = _ply_header(data)
     start, skip_lines = body_start, 0
     for name, num_points, properties in elements:
@@ -129,7 +129,7 @@ def _ply_header(data: bytes) -> tuple[str, list[tuple[str, int, list[tuple[str, 
     start = re.match(rb"ply[ \t]*(\r\n|\n|\r)", data)
     if start is None:
         raise FormatError("a PLY header", f"{shorten(repr(data[:16]))}", "is it another format?")
-    # with the first line's kind of line end, since binary rows may begin with a byte that looks like one
+    # requires the line ending of the first line, since binary rows may begin with a byte that looks like a line ending
     end = re.compile(rb"[\r\n]end_header[ \t]*" + start.group(1)).search(data)
     if end is None:
         raise FormatError("a PLY header with an end_header line", "none", "it is cut off, export it again")

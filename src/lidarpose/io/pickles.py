@@ -1,9 +1,10 @@
-"""Reading pickles of data without running them: SMPL's `.pkl`, SLOPER4D's and Human-M3's labels.
+"""Reading pickled data without executing the pickles: SMPL's `.pkl`, labels of SLOPER4D and Human-M3.
 
-A pickle may call any function of the machine it is read on. Here Python's own unpickler gets a stand-in for every name
-on a list and an error for every other one. What a call of such a name means is decided below, so nothing of the file
-is ever imported or called. Memory and time stay in proportion to the size of the file: an instruction, of a byte or
-more, takes at most 0.3 kB, what is copied is counted, and so are keys whose hashes a file can choose.
+A pickle may call any function of the machine that reads it. Here Python's own unpickler gets a stand-in object for
+each name on an allowlist, and an error for every other name. The code below decides what a call of an allowed name
+does, so nothing named in the file is ever imported or called. Memory and time stay proportional to the file size: an
+instruction, which has at least one byte, takes at most 0.3 kB, and both copied data and keys whose hashes a file can
+choose are counted.
 """
 
 import io
@@ -21,20 +22,21 @@ import numpy as np
 
 from lidarpose.io.files import FormatError, file_error, read_bytes, shorten
 
-# larger files do not hold labels or a body; they would be in memory three times
+# larger files are not labels or body models, and their content would be in memory three times
 MAX_BYTES = 4 * 2**30
-# how deep lists and dicts may be nested (chosen: data sets have less than ten levels)
+# maximum nesting depth of lists and dicts (chosen: data sets have less than ten levels)
 MAX_DEPTH = 100
-# sparse matrices become dense ones, together of at most so many numbers: SMPL-X's largest has 0.6 million
+# maximum number of values in all sparse matrices together, which are made dense: SMPL-X's largest has 0.6 million
 MAX_DENSE = 20_000_000
-# keys without text have hashes that a file can make equal: so many cost a second at most, whatever they are
+# a file can make the hashes of keys without text collide: these numbers of keys take a second at most in any case
 MAX_NUMBER_KEYS, MAX_TUPLE_KEYS = 20_000, 1_000
-# a tuple is hashed whenever it is looked up
+# a tuple is hashed again at every lookup, so its length is limited, too
 MAX_KEY_PARTS = 16
-# arrays and lists are copied out of the file, some of them twice or three times: Python 2 kept them as text
+# limit on copied bytes: this constant plus this multiple of the file size. Arrays and lists are copied out of the file,
+# some of them two or three times, since Python 2 stored them as text
 _FREE_COPIES, _COPIES = 4096, 8
 
-# values without parts
+# types of values without parts
 _PLAIN = frozenset({type(None), bool, int, float, complex, str, bytes})
 _CONTAINERS = (list, tuple, set, frozenset, dict)
 _REMEDY = "copy it again, or ask for npz"
@@ -42,7 +44,7 @@ _REMEDY = "copy it again, or ask for npz"
 
 @dataclass(frozen=True)
 class Unread:
-    """Stands for a class or function "module.name", or for an object of it that holds no numbers which can be read."""
+    """Stands for a class or function "module.name", or for an instance of it that has no readable numbers."""
 
     name: str
 
@@ -50,11 +52,12 @@ class Unread:
 def load_pickle(path: str | os.PathLike) -> Any:
     """The data of a pickle: dicts, lists, tuples, sets, numbers, text, bytes and numpy arrays.
 
-    chumpy's arrays and scipy's csc and csr matrices come as (dense) arrays, strings of Python 2 as latin-1 text,
-    OrderedDict and defaultdict as dict, an expression of chumpy as `Unread`.
+    chumpy arrays and scipy's csc and csr matrices are returned as (dense) arrays, Python 2 strings as latin-1 text,
+    OrderedDict and defaultdict as dict, and chumpy expressions as `Unread`.
 
-    Raises InputError, on one line: a file that is missing, empty, cut off, damaged or over 4 GiB; a class or function
-    that is not on the list, by its name; data that contains itself, or that grows far beyond the file's size.
+    Raises a one-line InputError if the file is missing, empty, cut off, damaged or over 4 GiB, if it names a class or
+    function that is not on the allowlist (the message names it), or if its data contains itself or grows far beyond
+    the file size.
     """
     data = read_bytes(path, expected="a pickle", most=MAX_BYTES)
     if data.startswith(b"PK\x03\x04"):
@@ -69,7 +72,7 @@ def load_pickle(path: str | os.PathLike) -> Any:
         raise file_error(path, "does not fit in memory: ask for npz, or split it") from None
     except (EOFError, struct.error):
         raise file_error(path, f"is cut off: the pickle has no end; {_REMEDY}") from None
-    # a damaged file can make the unpickler and numpy raise anything
+    # a damaged file can make the unpickler and numpy raise any exception
     except Exception as error:
         reason = shorten(str(error)) or type(error).__name__
         raise file_error(path, f"is damaged or no pickle ({reason}): {_REMEDY}") from None
@@ -77,7 +80,7 @@ def load_pickle(path: str | os.PathLike) -> Any:
 
 @dataclass(frozen=True)
 class _Name(Unread):
-    """A name on the list, as the unpickler calls it: nothing else that it meets can be called."""
+    """A callable for a name on the allowlist; no other object that the unpickler creates can be called."""
 
     run: Callable[[str, tuple], object]
 
@@ -87,17 +90,17 @@ class _Name(Unread):
 
 @dataclass(frozen=True, eq=False)
 class _Stub(Unread):
-    """What a call made that still lacks its state; `value` is set with the state."""
+    """The result of a call that does not have its state yet; `value` is set with the state."""
 
     args: tuple
     value: Any = None
 
 
 class _Memo(dict):
-    """The unpickler's memo, in which what has got its state is the value that it became."""
+    """The unpickler's memo, which returns the final value for a stub that has received its state."""
 
     def __setitem__(self, key: int, value: object) -> None:
-        # larger ones could share one hash
+        # larger keys could all have the same hash
         if key >= 2**32:
             raise TypeError("a number of more than 32 bits in the memo")
         super().__setitem__(key, value)
@@ -108,13 +111,13 @@ class _Memo(dict):
 
 
 class _DataUnpickler(pickle._Unpickler):
-    """Python's unpickler, in which every instruction that calls, sets a state or hashes is one that knows plain data.
+    """Python's unpickler with safe versions of all instructions that call, set a state or hash: they accept plain data.
 
-    The pure Python class, since it takes no memory for announced sizes and lets instructions be replaced.
+    The base is the pure Python class, since it does not allocate announced sizes and its instructions can be replaced.
     """
 
     dispatch: ClassVar[dict[int, Any]] = dict(pickle._Unpickler.dispatch)
-    # Python's own, which its type stubs leave out
+    # attributes of the base class that are missing in its type stubs
     append: Callable[[object], None]
     pop_mark: Callable[[], list]
     stack: list[Any]
@@ -125,7 +128,7 @@ class _DataUnpickler(pickle._Unpickler):
         self.copies_left = _FREE_COPIES + _COPIES * len(data)
         self.dense_left = MAX_DENSE
         self.key_share = 0.0
-        # tuples as keys, one of each hash
+        # tuples that were used as keys, one for each hash
         self.tuples: dict[int, tuple] = {}
 
     def find_class(self, module: str, name: str) -> _Name:
@@ -141,11 +144,11 @@ class _DataUnpickler(pickle._Unpickler):
         raise FormatError("its pickle wants a class by a registered number, which only its maker has: ask for npz")
 
     def call(self, name: str, args: tuple) -> object:
-        """What the named function or class would return, or a stub where that lacks its state."""
+        """What the named function or class would return, or a stub if the result still needs its state."""
         if name in _NEW and args and isinstance(args[0], _Name):
             name, args = args[0].name, ()
         if name in _DICTS:
-            # a defaultdict's first is what makes its values
+            # the first argument of a defaultdict is its factory
             pairs = next((part for part in args if not isinstance(part, _Name)), ())
             pairs = pairs.items() if type(pairs) is dict else pairs
             result: Any = self.dict_of([part for key, value in pairs for part in (key, value)])
@@ -161,7 +164,7 @@ class _DataUnpickler(pickle._Unpickler):
         return self.within_budget(result)
 
     def set_state(self) -> None:
-        """The stub on the stack becomes what it stands for."""
+        """Replaces the stub on the stack with the value that its state describes."""
         state, stub = self.stack.pop(), self.stack[-1]
         if type(stub) is not _Stub or stub.value is not None:
             raise TypeError(f"a state of a {type(stub).__name__}")
@@ -174,20 +177,20 @@ class _DataUnpickler(pickle._Unpickler):
             value = self.within_budget(_chumpy(stub.name, state))
         else:
             value = _dense(stub.name, state, self.dense_left)
-            # many entries may add up in one number
+            # the entries count as well, since many of them may be added into one number
             self.dense_left -= value.size + state["data"].size
         self.stack[-1] = value
         object.__setattr__(stub, "value", value)
 
     def within_budget(self, value: Any) -> Any:
-        """The value, once it is sure that all values together do not outgrow the file."""
+        """Returns the value; raises FormatError if all values together exceed the limit for the file's size."""
         self.copies_left -= getattr(value, "nbytes", None) or (len(value) if hasattr(value, "__len__") else 0)
         if self.copies_left < 0:
             raise FormatError(f"has arrays of more than {_COPIES} times its size: ask for npz")
         return value
 
     def dict_of(self, items: list) -> dict:
-        """A dict of keys and values by turns."""
+        """A dict from a list of alternating keys and values."""
         return dict(zip(self.keys(items[::2]), items[1::2], strict=True))
 
     def fill(self, kind: type[set] | type[dict], items: Any) -> None:
@@ -206,8 +209,8 @@ class _DataUnpickler(pickle._Unpickler):
         self.append(frozenset(self.keys(items)))
 
     def keys(self, items: Iterable[Any]) -> Iterable[Any]:
-        """The items, once each can be a key: a nested one could overflow the interpreter's stack, and numbers can be
-        made to share one hash, which takes time by the square of their count."""
+        """Returns the items after checking that each is a safe key: a nested key could overflow the interpreter's
+        stack, and numbers can be chosen to have the same hash, which takes quadratic time."""
         for item in items:
             if type(item) is str and item:
                 continue
@@ -219,8 +222,8 @@ class _DataUnpickler(pickle._Unpickler):
                     raise TypeError(f"a {type(item).__name__} as a key")
                 if type(part) is int and abs(part) >= 2**63:
                     raise TypeError("a number of more than 64 bits as a key")
-            # text is hashed with a secret, and so are tuples with text, but those that differ in numbers alone can
-            # share one hash
+            # text is hashed with a secret seed, and so are tuples with text, but tuples that differ only in their
+            # numbers can have the same hash
             has_text = any(isinstance(part, str | bytes) and part for part in parts)
             if has_text and (parts is not item or self.tuples.setdefault(hash(item), item) == item):
                 continue
@@ -238,21 +241,21 @@ _DataUnpickler.dispatch |= {
     pickle.ADDITEMS[0]: lambda self: self.fill(set, self.keys(self.pop_mark())),
     pickle.SETITEM[0]: lambda self: self.fill(dict, self.dict_of([self.stack.pop(-2), self.stack.pop()])),
     pickle.SETITEMS[0]: lambda self: self.fill(dict, self.dict_of(self.pop_mark())),
-    # Python's own takes the announced memory before it reads
+    # Python's own instruction allocates the announced size before it reads
     pickle.BYTEARRAY8[0]: pickle._Unpickler.dispatch[pickle.BINBYTES8[0]],
 }
 
 
 def _check_levels(value: Any, levels: dict[int, int | None], depth: int = 0) -> int:
-    """How many levels of containers a value has. levels: by id, of those seen before, None while they are counted.
+    """The number of container levels of a value. levels: those of the values seen before by id, None during counting.
 
-    Raises FormatError for too many, for a container in itself, and for an object that never got its state.
+    Raises FormatError for too many levels, a container that contains itself, and an object that never got its state.
     """
     if type(value) is _Stub and not value.name.startswith("chumpy."):
         raise FormatError(f"has a {value.name} without content: {_REMEDY}")
     parts: Iterable[Any] = ()
     if type(value) in _CONTAINERS:
-        # keys have no parts that have parts
+        # keys are skipped: `keys` allows only plain values and flat tuples
         parts = value.values() if isinstance(value, dict) else value
     elif isinstance(value, np.ndarray) and value.dtype.kind == "O":
         parts = value.flat
@@ -269,7 +272,7 @@ def _check_levels(value: Any, levels: dict[int, int | None], depth: int = 0) -> 
     return count
 
 
-# names of Python 2 and of numpy 2 as those of Python 3 and of the older numpy
+# maps module names of Python 2 and of numpy 2 to those of Python 3 and of older numpy versions
 _MODULES = {
     "__builtin__": "builtins",
     "copy_reg": "copyreg",
@@ -296,17 +299,17 @@ def _dtype(code: object, order: object) -> np.dtype:
 
 
 def _array(data: Any, dtype: object, shape: object, order: object = "C") -> np.ndarray:
-    """order: "C", "F", or whether it is Fortran's."""
+    """order: "C", "F", or a boolean that is true for Fortran order."""
     if not isinstance(dtype, np.dtype) or not isinstance(shape, tuple) or any(type(n) is not int for n in shape):
         raise FormatError(f"has an array without type or shape: {_REMEDY}")
     layout: Literal["C", "F"] = "F" if order in ("F", True) else "C"
-    # Python 2 kept the content as text
+    # Python 2 stored the content as text
     data = data.encode("latin1") if isinstance(data, str) else data
     is_object = dtype.kind == "O"
     expected: Any = list if is_object else bytes
     if not isinstance(data, expected):
         raise FormatError(f"has an array of a {type(data).__name__}: {_REMEDY}")
-    # the product of thousands of numbers would take long
+    # the product of thousands of numbers would take too long
     if len(shape) > 64 or len(data) != math.prod(shape) * (1 if is_object else dtype.itemsize):
         actual = f"{shorten(str(shape[:64]))} with {len(data)} {'items' if is_object else 'bytes'}"
         raise FormatError(f"has an array of the shape {actual}: {_REMEDY}")
@@ -319,7 +322,7 @@ def _array(data: Any, dtype: object, shape: object, order: object = "C") -> np.n
 
 
 def _encode(text: object = b"", encoding: object = "latin1") -> bytes:
-    """How Python 3 writes bytes for Python 2: as text and its encoding."""
+    """Restores bytes that Python 3 pickled for Python 2 as text and its encoding."""
     if isinstance(text, bytes):
         return text
     if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
@@ -327,17 +330,17 @@ def _encode(text: object = b"", encoding: object = "latin1") -> bytes:
     return text.encode("latin1")
 
 
-# what can be made at once, without a state
+# callables whose result needs no state
 _CALLS: dict[str, Callable[..., object]] = {
     "numpy.core.multiarray.scalar": lambda dtype, data: _array(data, dtype, ())[()],
     "numpy.core.numeric._frombuffer": _array,
     "_codecs.encode": _encode,
     "builtins.bytes": _encode,
     "builtins.bytearray": _encode,
-    # no text: the same long one could be parsed again and again
+    # arithmetic instead of complex() on the arguments rejects text: the same long text could be parsed again and again
     "builtins.complex": lambda real, imaginary: complex(1.0 * real, 1.0 * imaginary),
 }
-# what may be named, not called
+# names that may be referenced but not called
 _CLASSES = ("numpy.ndarray", "builtins.object", *_NEW)
 _KNOWN = {"numpy.dtype", _RECONSTRUCT, *_CLASSES, *_DICTS, *_ITEMS, *_CALLS}
 
@@ -346,7 +349,7 @@ _KNOWN = {"numpy.dtype", _RECONSTRUCT, *_CLASSES, *_DICTS, *_ITEMS, *_CALLS}
 
 
 def _chumpy(name: str, state: Any) -> np.ndarray | Unread:
-    """A Ch holds its numbers as `x`; a Select is a choice from another, by flat indices."""
+    """The numbers of a chumpy object: a Ch stores them as `x`; a Select picks entries of an array by flat indices."""
     source, indices = state.get("a"), state.get("idxs")
     if name == "chumpy.reordering.Select" and isinstance(source, np.ndarray) and isinstance(indices, np.ndarray):
         selection = source.flat[indices.astype(np.int64)]
@@ -356,7 +359,7 @@ def _chumpy(name: str, state: Any) -> np.ndarray | Unread:
 
 
 def _dense(name: str, state: Any, max_numbers: int) -> np.ndarray:
-    """A compressed sparse matrix, of at most so many numbers: indptr (lines + 1,), indices and data (entries,)."""
+    """A sparse matrix of at most `max_numbers` values as dense: indptr (lines + 1,), indices and data (entries,)."""
     try:
         rows, columns = map(operator.index, state.get("_shape", state.get("shape")))
         starts, indices, data = (state[part] for part in ("indptr", "indices", "data"))

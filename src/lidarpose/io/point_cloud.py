@@ -1,12 +1,12 @@
 """Point clouds from files: PCD, PLY, LAS, raw float32, NumPy and text.
 
-The suffix, in any case, says the format. Coordinates stay as they are in the file (meters are assumed, nothing is
-turned or scaled), in float64, since float32 rounds map coordinates such as UTM's to half a meter. Columns other than
-x, y and z are named in `Cloud.fields` and otherwise ignored.
+The suffix, in upper or lower case, determines the format. Coordinates are not changed (meters are assumed, nothing is
+rotated or scaled). They are float64, since float32 rounds map coordinates such as UTM to half a meter. Columns other
+than x, y and z are listed in `Cloud.fields` and otherwise ignored.
 
-What a header announces is checked against the file before numpy, pandas or LZF decode it. A parser takes a file's bytes
-and returns its x y z (n, 3), the names of its columns and warnings; it raises `FormatError`, to which `read_points`
-adds the file's name.
+The sizes in a header are checked against the file before numpy, pandas or LZF decode it. A parser takes a file's bytes
+and returns x y z (n, 3), the column names and warnings; it raises `FormatError`, to which `read_points` adds the file
+name.
 """
 
 import os
@@ -26,23 +26,24 @@ from lidarpose.io.text import FEW_ROWS, is_image, is_transposed, numbered, parse
 KITTI_FIELDS = ("x", "y", "z", "intensity")
 NUSCENES_FIELDS = ("x", "y", "z", "intensity", "ring")
 
-# meters; no coordinate on Earth is larger (earth-centered ones reach 6.4e6), misread bytes mostly are
+# meters; no coordinate on Earth is larger (earth-centered ones reach 6.4e6), but most misread bytes are
 _MAX_PLAUSIBLE = 1e7
-# share of the rows beyond that at which raw bytes are taken for something else than float32 rows
+# if more than this share of the rows exceeds `_MAX_PLAUSIBLE`, raw bytes are not float32 rows
 _MAX_IMPLAUSIBLE_SHARE = 0.01
 # beams are numbered from 0; no LiDAR has more
 _MAX_BEAMS = 256
-# of raw bytes, rows of another width are taken where their columns are so much narrower, in the mean logarithm: 0.5 and
-# more where the other width is right, below 0.05 where it is wrong, of synthetic sweeps and people of 20 rows and more
+# raw bytes are read as rows of another number of columns if that decreases the mean logarithm of the columns' standard
+# deviations by this much. In synthetic sweeps and people of 20 and more rows, the decrease is 0.5 or more if the other
+# number is right, and below 0.05 if it is wrong
 _NARROWER = 0.4
-# x, y, z, intensity, beam and time, or colors
+# rows of six values have x, y, z, intensity, beam and time, or x, y, z and colors; considered from 20 rows on
 _SIX, _FEWEST_ROWS = 6, 20
-# no LiDAR sees farther, m; a column of constants is as wide as noise, m
+# m; no LiDAR has a longer range; added to each column's standard deviation, as if constant columns had noise
 _FAR, _NARROWEST = 1e3, 1e-3
 
-# suffixes of files of many scans
+# suffixes of files with many scans
 RECORDINGS = (".mcap", ".bag", ".db3", ".pcap", ".pcapng")
-# the first bytes of what users rename by mistake, with the remedy; long enough never to be float32 coordinates
+# first bytes of other formats that users rename by mistake, with the remedy; too long to occur as float32 coordinates
 _FOREIGN = {
     rb"\x1f\x8b\x08[\x00-\x1f]": "is gzip-compressed: unpack it first (gunzip)",
     rb"PK\x03\x04": "is a zip archive: unpack it first",
@@ -69,9 +70,9 @@ _MAGIC = {
 class Cloud:
     """A point cloud as read from a file.
 
-    points (n, 3) float64, x y z in the file's own frame and unit, all finite, n > 0; num_dropped, the rows left out
-    because a coordinate was NaN, infinite or missing; fields, the names of all the file's columns; warnings, lines
-    for the user.
+    points: (n, 3) float64, x y z in the file's own frame and unit, all finite, n > 0; num_dropped: number of rows
+    dropped because a coordinate was NaN, infinite or missing; fields: names of all columns of the file; warnings:
+    lines for the user.
     """
 
     points: np.ndarray
@@ -80,12 +81,12 @@ class Cloud:
     warnings: tuple[str, ...] = ()
 
     def __array__(self, dtype=None, copy=None) -> np.ndarray:
-        """The points, so that the cloud itself can be predicted."""
+        """The points, so that the cloud itself can be passed to `predict`."""
         return np.array(self.points, dtype, copy=copy)
 
 
 def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud:
-    """Reads a point cloud; the suffix says the format.
+    """Reads a point cloud; the suffix determines the format.
 
     .pcd (ascii, binary, binary_compressed), .ply (the vertices; ascii, binary of either byte order), .las, .laz (all
     point formats), .npy ((n, 3+) or records with x, y, z), .npz (`points`, else `xyz`, else its only (n, 3+) array),
@@ -94,13 +95,13 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
     those beyond 1e9 m and, if there is more than one of them, at 0,0,0.
 
     Args:
-        columns: values a row of a .bin, x y z first; other formats ignore it. Where it is None, rows have 4 (KITTI) or,
-            where the size or the values say so, 5 (nuScenes), 3 or 6, which a warning tells; `.pcd.bin`, nuScenes' own
-            suffix, means 5.
+        columns: values per row of a .bin file, x y z first; other formats ignore it. With None, rows have 4 values
+            (KITTI) or, if the file size or the values indicate it, 5 (nuScenes), 3 or 6, which a warning reports;
+            `.pcd.bin`, nuScenes' own suffix, means 5.
 
     Raises:
-        InputError: one line that names the file, what was expected, what came and what to do, also for a file without
-            one finite point. MissingExtra: .laz without the extra `recordings`.
+        InputError: one line that names the file, what was expected, what was found and the remedy, also for a file
+            without any finite point. MissingExtra: .laz without the extra `recordings`.
     """
     if columns is not None:
         columns = check_int("columns", columns, least=3, hint=" (x y z first)")
@@ -109,7 +110,7 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
     suffix = os.path.splitext(name)[1]
     try:
         _refuse_foreign(data, suffix)
-        # of bytes that are no valid numbers, which are dropped and counted below, and of files as old as Python 2
+        # silences warnings about invalid numbers, which are dropped and counted below, and about files of Python 2
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             if suffix == ".bin":
@@ -140,7 +141,7 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
 
 
 def _refuse_foreign(data: bytes, suffix: str) -> None:
-    """Refuses content that is plainly something else than the suffix says, and suffixes nobody here can read."""
+    """Raises FormatError for content that clearly has another format than the suffix, and for unsupported suffixes."""
     for content_suffix, pattern in _MAGIC.items():
         if re.match(pattern, data):
             if content_suffix != suffix.replace(".laz", ".las"):
@@ -165,7 +166,7 @@ def _refuse_foreign(data: bytes, suffix: str) -> None:
 
 
 def _parse_bin(data: bytes, columns: int | None):
-    # printable bytes alone may be a few float32: 837282 is " jLI"
+    # printable bytes alone do not suffice, since a few float32 may be printable: 837282 is " jLI"
     if re.fullmatch(rb"[\t\r\n -~]+", data[:1024]) and re.search(rb"[0-9][\s,;]+[-+.]?[0-9]", data[:1024]):
         raise FormatError("raw float32 rows", "text", "rename it to .txt or .csv")
     notes: tuple[str, ...] = ()
@@ -191,7 +192,7 @@ def _parse_bin(data: bytes, columns: int | None):
 
 
 def _guess_columns(data: bytes) -> tuple[int, tuple[str, ...]]:
-    """(values a row, warnings): KITTI's 4 but where the size or the content speaks for nuScenes' 5, for 3, or for 6."""
+    """(values per row, warnings): KITTI's 4 unless the size or the content indicates nuScenes' 5, 3, or 6."""
     four, five = len(KITTI_FIELDS), len(NUSCENES_FIELDS)
     candidates = [columns for columns in (four, five, 3) if len(data) % (4 * columns) == 0]
     if len(data) % (4 * _SIX) == 0 and len(data) >= 4 * _SIX * _FEWEST_ROWS:
@@ -200,18 +201,18 @@ def _guess_columns(data: bytes) -> tuple[int, tuple[str, ...]]:
     reason, alternative = "the size divides by 5 values and not by 4" if guess == five else "", four
     values = np.frombuffer(data[: len(data) // 4 * 4], "<f4")
     if five in candidates:
-        # a fifth value that is always a beam number is no accident, misaligned meters are not whole
+        # a fifth value that is always a beam number is not a coincidence: misaligned meters are not whole numbers
         ring = values.reshape(-1, five)[:, -1]
         if ((ring >= 0) & (ring < _MAX_BEAMS) & (ring == np.floor(ring))).all() and ring.any():
             guess, candidates, reason = five, [five], "every fifth value is a beam number"
     if len(candidates) > 1:
         widths = {columns: _width(values.reshape(-1, columns)) for columns in candidates}
         if _SIX in widths:
-            # two rows of 3 are a row of 6 as wide
+            # rows of 3 read as rows of 6 have columns of the same spread, so 6 needs a clear advantage over 3
             widths[_SIX] += _NARROWER
         narrowest = min(candidates, key=widths.__getitem__)
         if guess not in candidates:
-            # of a size that neither 4 nor 5 divides
+            # neither 4 nor 5 divides the size
             if narrowest == _SIX:
                 guess, reason, alternative = _SIX, "rows of 3 would mix its columns up", 3
         elif widths[narrowest] < widths[guess] - _NARROWER:
@@ -226,8 +227,8 @@ def _guess_columns(data: bytes) -> tuple[int, tuple[str, ...]]:
 
 
 def _width(rows: np.ndarray) -> float:
-    """How wide the columns of rows are on average: least for the right number of columns, since any other mixes x, y, z
-    and the rest in all of them. Infinite where nothing is a number."""
+    """Mean logarithm of the columns' standard deviations. It is smallest for the right number of columns, since any
+    other number mixes x, y, z and the rest in all columns. Infinite if no value is a number."""
     spread = np.nanstd(np.clip(rows, -_FAR, _FAR), axis=0, dtype=np.float64)
     return float(np.nan_to_num(np.log(spread + _NARROWEST).mean(), nan=np.inf))
 
@@ -240,7 +241,7 @@ def _parse_npy(data: bytes):
 
 
 def _parse_npz(data: bytes):
-    """Of the array `points`, else `xyz`, else the only one of their shape."""
+    """Reads the array `points`, else `xyz`, else the only array with the shape of points."""
     with open_npz(data) as (archive, members):
         keys = [key for key in ("points", "xyz") if key in members]
         for key, member in members.items() if not keys else ():

@@ -1,4 +1,4 @@
-"""Columns and lines: which columns are x, y and z, files of text decoded by pandas, and ascii PCD and PLY bodies."""
+"""Text formats: finds the columns x, y and z, and reads text files with pandas and the bodies of ascii PCD and PLY."""
 
 import csv
 import io
@@ -11,14 +11,14 @@ import numpy as np
 
 from lidarpose.io.files import FormatError, shorten
 
-# a table of so few rows and so many columns holds points as columns
+# a table of at most this many rows and more than this many columns has a point per column
 FEW_ROWS, _MANY_COLUMNS = 5, 50
-# what stands in text for a value that is not there, in the usual exports, in any case
+# how the usual exports write a missing value, in lower or upper case
 _MISSING = ("", "na", "n/a", "nan", "-nan", "+nan", "null", "none", "<na>")
 
 
 def pick_xyz(names: Sequence[str]) -> list[int]:
-    """The positions of x, y and z among column names, in any case, with or without a unit."""
+    """The positions of x, y and z among column names, in lower or upper case, with or without a unit."""
     plain_names = _plain(names)
     if not has_xyz(names):
         actual = shorten(" ".join(names)) or "none"
@@ -32,7 +32,7 @@ def has_xyz(names: Sequence[str]) -> bool:
 
 
 def _plain(names: Sequence[str]) -> list[str]:
-    """Names of columns in lower case, without units ("x [m]"); the axes of ParaView and VeloView as x, y and z."""
+    """Column names in lower case, without units ("x [m]"); the axis names of ParaView and VeloView as x, y and z."""
     plain_names = []
     for name in names:
         name = re.sub(r" ?[\[(]m[\])]$", "", name.strip().lower())
@@ -42,12 +42,13 @@ def _plain(names: Sequence[str]) -> list[str]:
 
 
 def numbered(columns: int) -> tuple[str, ...]:
-    """The names of columns that have none."""
+    """Default names for unnamed columns."""
     return ("x", "y", "z", *(f"column_{i}" for i in range(4, columns + 1)))
 
 
 def is_transposed(shape: tuple[int, ...]) -> bool:
-    """Whether an array of this shape (rows, columns) holds points as columns: no format has so many values a point."""
+    """Whether an array of this shape (rows, columns) has a point per column: no format has that many values per
+    point."""
     return len(shape) == 2 and 3 <= shape[0] <= FEW_ROWS and shape[1] > _MANY_COLUMNS
 
 
@@ -57,23 +58,23 @@ def is_image(shape: tuple[int, ...]) -> bool:
 
 
 def parse_count(text: str, what: str) -> int:
-    """A number of a header, at most 18 digits."""
+    """A whole number in a header, of at most 18 digits."""
     if not re.fullmatch(r"[0-9]{1,18}", text):
         raise FormatError(f"a whole number as the header's {what}", f"{shorten(text)!r}", "export it again")
     return int(text)
 
 
 def check_bytes(data: bytes, start: int, size: int, num_points: int) -> None:
-    """Raises FormatError where fewer than `size` bytes follow `start`."""
+    """Raises FormatError if fewer than `size` bytes follow `start`."""
     if len(data) - start < size:
         num_bytes = max(len(data) - start, 0)
         raise FormatError(f"is cut off: expected {size} bytes for {num_points} points, got {num_bytes}; copy it again")
 
 
 def parse_rows(text: str, num_rows: int, columns: list[int], num_cells: int, *, skip: int = 0) -> np.ndarray:
-    """The columns at three positions, (n, 3), of the `num_rows` lines of `num_cells` numbers after the first `skip`.
+    """The three given columns, (n, 3), of `num_rows` lines with `num_cells` numbers each, after `skip` other lines.
 
-    Blank lines do not count. Raises FormatError for fewer lines and for the first line that does not fit.
+    Blank lines do not count. Raises FormatError if there are fewer lines, and for the first line that does not fit.
     """
     lines = (" ".join(line.split()) for line in io.StringIO(text))
     rows = list(itertools.islice(filter(None, lines), skip, skip + num_rows))
@@ -90,19 +91,19 @@ def parse_rows(text: str, num_rows: int, columns: list[int], num_cells: int, *, 
 
 
 def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
-    """x y z (n, 3), the names of the columns, and no warnings; raises FormatError."""
-    # .pts and others begin with the number of their points
+    """x y z (n, 3), the column names, and an empty tuple of warnings; raises FormatError."""
+    # .pts and other formats begin with the number of points
     text = re.sub(r"\A[0-9]{1,18}[ \t]*\n(?=[ \t]*[-+.\d]\S*(?:[ \t,;]+[-+.\d]\S*){2})", "\n", decode(data))
     names, num_skipped, has_header, separator, decimal = _find_columns(text)
-    # lines that are blank but for a comment would count as rows without values; what is looked for behind keeps every
-    # blank of a long run from being tried as the first
+    # lines with only a comment would count as rows without values; the lookbehind keeps the regular expression from
+    # starting at every blank of a long run
     text = re.sub(r"(?m)^[ \t]+$", "", re.sub(r"(?<![ \t])[ \t]*#.*", "", text))
     parts = text.split("\n", num_skipped)
-    # pandas knows double quotes alone; within a number a quote is something else
+    # pandas supports only double quotes, so single quotes around cells are removed, but not those within a cell
     body = re.sub(r"(?<![^,;\s])'|'(?![^,;\s])", "", parts[num_skipped]) if len(parts) > num_skipped else ""
-    # 1e-05 on the first line and 0,5 on a later one
+    # finds decimal commas that the first line does not show: 1e-05 there and 0,5 on a later line
     if separator != "," and "," in body:
-        # blanks in a cell, none that could be its edge: in a long run of them each could be either
+        # blanks allowed within a cell, except those that could be a separator: a long run would be matched in many ways
         edge, blanks = separator or r"[ \t]", {None: "", "\t": " *"}.get(separator, r"[ \t]*")
         if re.search(rf"(?m)(?:^|{edge}){blanks}[-+]?\d*,\d+(?:[eE][-+]?\d+)?{blanks}(?:{edge}|$)", body):
             decimal = ","
@@ -127,7 +128,7 @@ def _find_columns(text: str) -> tuple[Sequence[str], int, bool, str | None, str]
     else:
         raise FormatError("has no points; expected lines of x y z: was it saved completely?")
     separator, decimal = _separator(first_line)
-    # CloudCompare marks its header by slashes
+    # CloudCompare starts its header with slashes
     cells = _split(first_line.removeprefix("//").strip(), separator)
     where = f"on line {num_skipped + 1}, {shorten(first_line)!r}"
     if not all(_is_number(cell, decimal) for cell in cells):
@@ -136,7 +137,7 @@ def _find_columns(text: str) -> tuple[Sequence[str], int, bool, str | None, str]
         return cells, num_skipped + 1, True, separator, decimal
     if len(cells) < 3:
         raise FormatError("at least 3 columns x y z", f"{len(cells)} {where}", "export x, y and z")
-    # a comment above names them where it has as many words with x, y and z: numpy.savetxt writes its header so
+    # a comment above the rows is their header if it has as many words, among them x, y and z, as numpy.savetxt writes
     for words in (_split(comment, mark) for mark in (None, ",", ";")):
         if len(words) == len(cells) and has_xyz(words):
             return words, num_skipped, False, separator, decimal
@@ -144,7 +145,7 @@ def _find_columns(text: str) -> tuple[Sequence[str], int, bool, str | None, str]
 
 
 def _check_width(body: str, names: Sequence[str], separator: str | None, num_skipped: int) -> None:
-    """Raises FormatError where the first row has more cells than the header names: any of them could be x then."""
+    """Raises FormatError if the first row has more cells than the header has names: any of them could be x then."""
     for number, line in enumerate(io.StringIO(body), num_skipped + 1):
         if line.strip():
             cells = _split(line.strip(), separator)
@@ -158,7 +159,7 @@ def _check_width(body: str, names: Sequence[str], separator: str | None, num_ski
 
 
 def decode(data: bytes) -> str:
-    """UTF-8 text whose lines end in \\n; raises FormatError."""
+    """Decodes UTF-8 text and converts its line endings to \\n; raises FormatError."""
     if data.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise FormatError("text in UTF-8", "UTF-16", "save it as UTF-8")
     try:
@@ -180,7 +181,8 @@ def _wrong_line(
     num_skipped: int = 0,
     where: str = "",
 ) -> FormatError:
-    """The error for lines that a library refused: the first one without numbers in `columns`, else its reason."""
+    """The error for lines that a library rejected: names the first line without numbers in `columns`, else its
+    reason."""
     for number, line in enumerate(lines, num_skipped + 1):
         cells = _split(line.strip(), separator)
         if line.strip() and not all(i < len(cells) and _is_number(cells[i], decimal) for i in columns):
@@ -190,7 +192,7 @@ def _wrong_line(
 
 
 def _read_csv(text: str, columns: list[int], *, separator: str | None, decimal: str, num_skipped: int) -> np.ndarray:
-    """The columns at three positions as (n, 3) float64; missing values are NaN. Separator None is any run of blanks."""
+    """The three given columns as (n, 3) float64; missing values are NaN. Separator None means any run of blanks."""
     import pandas as pd
 
     style: dict[str, Any] = {"separator": separator, "decimal": decimal}
@@ -203,7 +205,7 @@ def _read_csv(text: str, columns: list[int], *, separator: str | None, decimal: 
             dtype=np.float64,
             skipinitialspace=True,
             decimal=decimal,
-            # pandas knows only some of them, and tells cases apart
+            # pandas recognizes only some of them, and is case-sensitive
             na_values=[case(word) for case in (str.lower, str.upper, str.capitalize) for word in _MISSING],
             engine="c",
         )
@@ -217,17 +219,17 @@ def _read_csv(text: str, columns: list[int], *, separator: str | None, decimal: 
 def _split(line: str, separator: str | None) -> list[str]:
     cells = line.split(separator)
     if '"' in line:
-        # a separator in quotes separates nothing
+        # a separator in quotes does not separate cells
         line = " ".join(cells) if separator is None else line
         cells = next(csv.reader([line], delimiter=separator or " ", skipinitialspace=True))
     return [cell.strip().strip("\"'").strip() for cell in cells]
 
 
 def _separator(line: str) -> tuple[str | None, str]:
-    """(what separates the cells of a line, None for blanks; the decimal mark)."""
+    """(separator of the cells in a line, None for blanks; decimal mark)."""
     if ";" in line:
         return ";", "," if "," in line else "."
-    # 1,5 2,5 3,5 has its commas within the numbers, 1, 2, 3 after them
+    # in 1,5 2,5 3,5 the commas are decimal marks, in 1, 2, 3 they are separators
     words = line.split()
     if "," in line and len(words) >= 3 and all(re.fullmatch(r"[-+]?\d+(,\d+)?([eE][-+]?\d+)?", w) for w in words):
         return None, ","

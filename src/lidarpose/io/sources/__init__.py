@@ -1,7 +1,7 @@
-"""Recordings of every kind as frames: folders of point files, datasets as they lie on disk, bags and packets.
+"""Recordings of all kinds as frames: folders of point files, datasets in their original layout, bags and packets.
 
-`open_source` finds out what a path holds. The reader of a format makes a `Recording` of it, whose frames are decoded
-one at a time when a `FrameSource` asks for them.
+`open_source` detects the format of a path. The reader of that format creates a `Recording`, whose frames are decoded
+one at a time when a `FrameSource` is iterated.
 """
 
 import glob
@@ -29,9 +29,9 @@ from lidarpose.io.sources.nuscenes import open_nuscenes
 
 __all__ = ["RECORDINGS", "DamagedFrame", "Frame", "FrameSource", "is_single_scan", "open_source"]
 
-# of `RECORDINGS`, the module whose `open_recording(path, options)` reads it
+# for each suffix in `RECORDINGS`, the module whose `open_recording(path, options)` reads it
 _READERS = {".mcap": "rosbag", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "ouster", ".pcapng": "ouster"}
-# when a part of a ROS 1 recording began
+# the start time in the name of a part of a ROS 1 recording
 _DATE = re.compile(r"_\d{4}(-\d\d){5}(?=_\d+\.bag$)")
 
 
@@ -46,28 +46,28 @@ def open_source(
     end: float | None = None,
     every: int = 1,
 ) -> FrameSource:
-    """Opens files, folders, patterns or recordings as frames in the order of time.
+    """Opens files, folders, patterns or recordings as frames in chronological order.
 
-    Point files are a frame each, sorted by the numbers in their names, so that frame_2 is before frame_10; names that
-    end in seconds since 1970, or in milli-, micro- or nanoseconds, tell their times.
+    Each point file is one frame. They are sorted by the numbers in their names, so that frame_2 is before frame_10.
+    Names that end in seconds since 1970, or in milli-, micro- or nanoseconds, give the frames' times.
 
     Args:
-        paths: one or many of: point files, folders of them, patterns such as "drive/*.pcd", recordings (.mcap .bag .db3
-            .pcap, folders of ROS 2 bags), folders of KITTI and nuScenes. Several recordings follow each other.
-        columns: values a row of .bin files, see `read_points`.
-        topic: which of a recording's topics is read, where it has several with points; of nuScenes, the scene.
-        meta: the JSON file of an Ouster sensor; None for the one of the recording's name beside it.
-        rate: frames a second where there are no times, and instead of those that names tell; 10 by default.
+        paths: one or several of: point files, folders of them, patterns such as "drive/*.pcd", recordings (.mcap .bag
+            .db3 .pcap, folders of ROS 2 bags), folders of KITTI and nuScenes. Several recordings are concatenated.
+        columns: values per row of .bin files, see `read_points`.
+        topic: the topic to read if a recording has several with points; for nuScenes, the scene.
+        meta: the JSON file of an Ouster sensor; None for the file next to the recording with the same stem.
+        rate: frames per second if there are no times, replacing times from file names; 10 by default.
         start: s from the first frame.
-        end: the same.
-        every: only each so many-th frame.
+        end: s from the first frame.
+        every: read only every n-th frame.
 
     Returns:
-        Its frames, one in memory at a time, as often as wanted.
+        The frames, with one in memory at a time; they can be iterated repeatedly.
 
     Raises:
-        InputError: nothing there, or nothing that holds points.
-        MissingExtra: a format that needs the extra `recordings`.
+        InputError: the path does not exist, or nothing in it has points.
+        MissingExtra: the format needs the extra `recordings`.
     """
     if columns is not None:
         columns = check_int("columns", columns, least=3, hint=" (x y z first)")
@@ -85,7 +85,7 @@ def open_source(
 
 
 def is_single_scan(paths: str | os.PathLike | Sequence[str | os.PathLike]) -> bool:
-    """Whether that is one plain point file, or a name of none: one scan, not frames."""
+    """Whether `paths` is a single point file or a missing file, i.e. one scan instead of frames."""
     path_list = listed(paths)
     if len(path_list) != 1 or os.path.isdir(path_list[0]):
         return False
@@ -94,7 +94,7 @@ def is_single_scan(paths: str | os.PathLike | Sequence[str | os.PathLike]) -> bo
 
 
 def _matches(path: str | os.PathLike) -> list[Path]:
-    """The paths that a path or pattern names, in natural order."""
+    """The paths that match a path or pattern, in natural order."""
     if not isinstance(path, str | os.PathLike):
         raise InputError(f"expected paths, got {type(path).__name__} among them: name files or folders")
     if os.path.exists(path):
@@ -108,13 +108,13 @@ def _matches(path: str | os.PathLike) -> list[Path]:
 
 
 def _open_all(name: str, paths: Sequence[Path], options: ReadingOptions) -> Recording:
-    """Files of points are one recording together, anything else is one of its own."""
+    """Opens all point files together as one recording, and every other path as a recording of its own."""
     files = [path for path in paths if path.is_file() and path.suffix.lower() not in RECORDINGS]
     parts: list[Recording] = [open_files(name, files, options)] if files else []
     problems: list[InputError] = []
     recordings = sorted(set(paths) - set(files), key=natural_key)
     if not files and _are_parts(recordings):
-        # a part that is damaged is left out below
+        # if a part is damaged, the parts are opened one by one below, without it
         with suppress(InputError):
             return import_module("lidarpose.io.sources.rosbag").open_parts(name, recordings, options)
     for path in recordings:
@@ -130,7 +130,7 @@ def _open_all(name: str, paths: Sequence[Path], options: ReadingOptions) -> Reco
 
 
 def _are_parts(paths: Sequence[Path]) -> bool:
-    """Whether they are one ROS recording that its recorder split: NAME_0, NAME_1, and so on."""
+    """Whether the paths are one ROS recording that the recorder split: NAME_0, NAME_1, and so on."""
     if len(paths) < 2 or _READERS.get(suffix := paths[0].suffix) != "rosbag":
         return False
     names = [_DATE.sub("", str(path)) for path in paths]
@@ -139,7 +139,7 @@ def _are_parts(paths: Sequence[Path]) -> bool:
 
 
 def _open_folder(folder: Path, options: ReadingOptions) -> Recording:
-    # what rosbag2 writes
+    # rosbag2 writes metadata.yaml
     if any(path.name == "metadata.yaml" for path in list_folder(folder)):
         return _open_recording(folder, options, "rosbag")
     dataset = open_kitti(folder) or open_nuscenes(folder, options)

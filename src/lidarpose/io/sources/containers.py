@@ -1,7 +1,7 @@
-"""Messages of MCAP, ROS 1 bag and rosbag2's SQLite files, in the order of the file.
+"""Messages of MCAP, ROS 1 bag and rosbag2's SQLite files, in file order.
 
-Files are walked from the front: what a killed recorder left is read without the index at its end. Formats: MCAP format
-specification; ROS bag format 2.0; rosbag2_storage_sqlite3.
+Files are read from the front, so that a file of a killed recorder is readable without the index at its end. Formats:
+MCAP format specification; ROS bag format 2.0; rosbag2_storage_sqlite3.
 """
 
 import bz2
@@ -21,7 +21,7 @@ from lidarpose.io.files import FormatError, check_unpacked, shorten
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _CUT_OFF = "is cut off: what was recorded up to there is read, if there is anything"
-# bytes of a message in SQLite, packed or not
+# maximum bytes of a message in SQLite, compressed or not
 _MAX_MESSAGE = 2**28
 
 _TABLES = "SELECT COUNT(*) FROM sqlite_master WHERE type = 'table' AND name IN ('messages', 'topics')"
@@ -29,7 +29,7 @@ _MESSAGES = "messages JOIN topics ON topic_id = topics.id"
 
 
 class Message(NamedTuple):
-    """A message as it is stored. time: ns, when it was recorded."""
+    """A message as stored. time: ns, when it was recorded."""
 
     topic: str
     time: int
@@ -38,7 +38,7 @@ class Message(NamedTuple):
 
 @dataclass
 class Topic:
-    """type: name of the messages' type; encoding: "cdr", "ros1" or another; count: messages."""
+    """type: name of the message type; encoding: "cdr", "ros1" or another; count: number of messages."""
 
     type: str
     encoding: str
@@ -46,7 +46,7 @@ class Topic:
 
 
 def unpack(data: bytes, compression: str, size: int) -> bytes:
-    """A chunk unpacked to at most `size` bytes; to fewer where `data` is cut off. Raises FormatError."""
+    """Unpacks a chunk to at most `size` bytes, or fewer if `data` is cut off. Raises FormatError."""
     decompressor: Any
     if compression == "bz2":
         decompressor = bz2.BZ2Decompressor()
@@ -55,7 +55,7 @@ def unpack(data: bytes, compression: str, size: int) -> bytes:
 
         decompressor = LZ4FrameDecompressor()
     elif compression == "zstd":
-        # both come with rosbags
+        # rosbags installs lz4 and backports.zstd
         zstd = import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
         decompressor = zstd.ZstdDecompressor()
     else:
@@ -67,7 +67,7 @@ def unpack(data: bytes, compression: str, size: int) -> bytes:
 
 
 class _Bytes:
-    """Bytes of a file up to an end; none are asked for that are not there."""
+    """The next `left` bytes of a file; reading more raises FormatError before anything is allocated."""
 
     def __init__(self, file: BinaryIO, left: int):
         self.file, self.left = file, left
@@ -95,10 +95,11 @@ class _Bytes:
 class RecordFile(ABC):
     """A file of records, some of which are chunks of records.
 
-    topics: by name; num_damaged, damage: chunks that could not be unpacked since reading last began, and why.
+    topics: by name; num_damaged, damage: number of chunks that could not be unpacked since reading last began, and the
+    reason.
 
     Raises:
-        FormatError: Another file, or damaged before its first topic.
+        FormatError: The file has another format, or is damaged before its first topic.
     """
 
     MAGIC: bytes
@@ -107,7 +108,7 @@ class RecordFile(ABC):
         self.path = path
         self.topics: dict[str, Topic] = {}
         self.num_damaged, self.damage = 0, ""
-        # of MCAP: names of types
+        # only for MCAP: names of types by schema id
         self._schemas: dict[int, str] = {}
         with open(path, "rb") as file:
             if file.read(len(self.MAGIC)) != self.MAGIC:
@@ -118,12 +119,12 @@ class RecordFile(ABC):
                 for kind, topic, *_ in self._by_topic(file):
                     self.topics[topic].count += kind == "message"
             except FormatError:
-                # `messages` raises it where the file ends
+                # ignored here: `messages` raises it again where the readable part ends
                 if not self.topics:
                     raise FormatError("is cut off or damaged before its first message; record it anew") from None
 
     def _has_index(self, file: BinaryIO) -> bool:
-        """Whether the file ends with an index of its topics, which is read."""
+        """Reads the topics from the index at the end of the file. Returns whether the file has one."""
         try:
             start = self._index_start(file)
             for kind, topic, count, *_ in self._by_topic(file, start) if start else ():
@@ -133,7 +134,7 @@ class RecordFile(ABC):
         return any(topic.count for topic in self.topics.values())
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
-        """Those of some topics. Raises FormatError where the file is damaged; what is before it has come."""
+        """The messages of the given topics. Raises FormatError at a damaged position, after the messages before it."""
         self.num_damaged = 0
         with open(self.path, "rb") as file:
             for kind, topic, *content in self._by_topic(file):
@@ -142,7 +143,7 @@ class RecordFile(ABC):
                     yield Message(topic, time, stream.take(size))
 
     def _by_topic(self, file: BinaryIO, start: int = 0) -> Iterator[tuple]:
-        """Messages and counts as of `_records` from a place on, with the topic for the id. Fills `topics`."""
+        """Messages and counts of `_records` from byte `start` on, with the topic instead of the id. Fills `topics`."""
         channels: dict[Any, str] = {}
         start = start or len(self.MAGIC)
         size = file.seek(0, 2)
@@ -158,7 +159,7 @@ class RecordFile(ABC):
             raise FormatError(f"is damaged ({error}): what is before that is read") from None
 
     def _unpacked(self, stream: _Bytes, compression: str, size: int, unpacked_size: int) -> Iterator[tuple]:
-        """The records of a compressed chunk. One that cannot be unpacked costs itself."""
+        """The records of a compressed chunk. A chunk that cannot be unpacked is skipped."""
         is_cut = size > stream.left
         packed_data = stream.take(min(size, stream.left))
         try:
@@ -173,12 +174,12 @@ class RecordFile(ABC):
 
     @abstractmethod
     def _index_start(self, file: BinaryIO) -> int:
-        """Where the index begins, 0 if there is none."""
+        """The byte at which the index begins, 0 if there is none."""
 
     @abstractmethod
     def _records(self, stream: _Bytes, is_chunk: bool = False) -> Iterator[tuple]:
-        """Records, those in chunks too: ("channel", id, topic, type, encoding), ("count", id, messages), and
-        ("message", id, time ns, size, stream); what is not taken from the stream is skipped."""
+        """Records, also those in chunks: ("channel", id, topic, type, encoding), ("count", id, messages), and
+        ("message", id, time ns, size, stream). Bytes that the caller does not take from the stream are skipped."""
 
 
 class McapFile(RecordFile):
@@ -186,7 +187,7 @@ class McapFile(RecordFile):
     _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _STATISTICS, _DATA_END = 2, 3, 4, 5, 6, 11, 15
 
     def _index_start(self, file):
-        # the footer, and the magic after it
+        # the footer record and the magic after it
         file.seek(max(file.seek(0, 2) - 37, 0))
         footer = file.read()
         is_whole = footer.endswith(self.MAGIC) and footer[0] == self._FOOTER
@@ -261,7 +262,7 @@ def _text(data: bytes) -> str:
 
 
 def _fields(data: bytes) -> dict[bytes, bytes]:
-    """The fields of a ROS 1 record's header."""
+    """The fields in the header of a ROS 1 record."""
     stream = _Bytes(BytesIO(data), len(data))
     fields = {}
     while stream.left:
@@ -271,13 +272,13 @@ def _fields(data: bytes) -> dict[bytes, bytes]:
 
 
 class SqliteFile:
-    """A file of rosbag2's SQLite storage. topics, num_damaged, damage, messages and errors: as of `RecordFile`."""
+    """A file of rosbag2's SQLite storage. topics, num_damaged, damage, messages and errors: as in `RecordFile`."""
 
     def __init__(self, path: Path):
         self.path = path
         self.num_damaged, self.damage = 0, ""
         self.topics: dict[str, Topic] = {}
-        # SQLite says of a file without rights no more than of a damaged one
+        # raises OSError for an unreadable file, which SQLite does not distinguish from a damaged one
         path.open("rb").close()
         try:
             with closing(self._connect()) as connection:
@@ -292,18 +293,18 @@ class SqliteFile:
         for name, type_, encoding in connection.execute("SELECT name, type, serialization_format FROM topics"):
             self.topics[str(name)] = Topic(str(type_), str(encoding))
         counts = f"SELECT name, COUNT(*) FROM {_MESSAGES} GROUP BY name"
-        # of a damaged file the messages tell
+        # ignored here: `messages` reports a damaged file
         with suppress(sqlite3.Error):
             for name, count in connection.execute(counts):
                 self.topics[str(name)].count = count
 
     def _connect(self) -> sqlite3.Connection:
-        # unless a recorder left its journal, nothing is written beside the file
+        # immutable, so that SQLite writes nothing next to the file, unless the recorder left its journal (-wal)
         mode = "ro" if self.path.with_name(self.path.name + "-wal").exists() else "ro&immutable=1"
-        # a recording that goes on is begun in one thread and read in another, one after the other
+        # a recording may be opened in one thread and read further in another, but never in both at the same time
         address = f"{self.path.absolute().as_uri()}?mode={mode}"
         connection = sqlite3.connect(address, uri=True, check_same_thread=False)
-        # a file that is shorter than its header says is refused otherwise
+        # otherwise SQLite rejects a file that is shorter than its header says
         connection.execute("PRAGMA writable_schema=ON")
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MAX_MESSAGE)
         connection.text_factory = _text
@@ -317,7 +318,7 @@ class SqliteFile:
                 for name, time, data in connection.execute(query, tuple(topics)):
                     data = data if isinstance(data, bytes) else b""
                     if data.startswith(_ZSTD):
-                        # what cannot be unpacked cannot be decoded either
+                        # a message that cannot be unpacked stays as it is, and decoding it fails later
                         with suppress(FormatError):
                             data = unpack(data, "zstd", _MAX_MESSAGE)
                     yield Message(str(name), time if isinstance(time, int) else 0, data)

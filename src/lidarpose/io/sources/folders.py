@@ -1,4 +1,4 @@
-"""Point files as frames: which of a folder are read, in which order, and which times their names tell."""
+"""Point files as frames: which files of a folder are read, in which order, and the times in their names."""
 
 import os
 import re
@@ -11,31 +11,31 @@ from lidarpose.io.files import file_error, shorten
 from lidarpose.io.point_cloud import SUFFIXES, read_points
 from lidarpose.io.sources.frame import IndexedRecording, ReadingOptions, Sweep
 
-# files of text may be notes, tables or labels: they are points where nothing else is
+# text files may be notes, tables or labels: they are read as points only if the folder has no other points
 _TEXT = (".csv", ".txt", ".xyz")
-# of files without a header the width of a row is taken from the first that can be read, among so many
+# the number of columns of .bin files is taken from the first readable one among at most this many
 _MOST_TRIED = 10
 
 # a name that ends in seconds since 1970, with or without a fraction, or in milli-, micro- or nanoseconds
 _TIME = re.compile(r"(.*\D|)(\d{10}|\d{13}|\d{16}|\d{19})(?:(?<!\d{11})([._])(\d{1,9}))?")
-# 2001 to 2033; 16 digits that are a date are larger
+# 2001 to 2033; 16 digits that are a date and time give larger values
 _FIRST_TIME, _LAST_TIME = 1e9, 2e9
 
 
 def is_result(path: Path) -> bool:
-    """Whether a file's name is that of a table of joints, which `lidarpose predict` writes."""
+    """Whether a file has the name of a table of joints, as `lidarpose predict` writes it."""
     return path.name.endswith(".poses.csv")
 
 
 def natural_key(path: str | os.PathLike) -> tuple:
-    """To sort names by the numbers in them: frame_2 before frame_10."""
+    """A sort key for names by the numbers in them: frame_2 before frame_10."""
     name = os.fspath(path)
     parts = re.split(r"([0-9]+)", name)
     return [int(part) if i % 2 else part.lower() for i, part in enumerate(parts)], name
 
 
 def list_folder(folder: Path) -> list[Path]:
-    """What is in a folder, but for hidden names, in natural order. Raises InputError."""
+    """The entries of a folder except hidden ones, in natural order. Raises InputError."""
     try:
         return sorted((path for path in folder.iterdir() if not path.name.startswith(".")), key=natural_key)
     except OSError as error:
@@ -45,11 +45,11 @@ def list_folder(folder: Path) -> list[Path]:
 def scan_files(folder: Path, other: Sequence[str] = ()) -> tuple[list[Path], list[str]]:
     """The point files of a folder in natural order, and warnings.
 
-    Poses that `lidarpose predict` wrote there are none. Files of suffixes in `other` count where there are no
-    points but in text, text where nothing else is. Of text, and of scans that are there in several formats, those
-    of the commonest suffix are taken.
+    Tables of poses that `lidarpose predict` wrote are not point files. Files with a suffix in `other` are taken if the
+    folder has no point files except text, and text files if it has no others. Of text files, and of scans that are
+    present in several formats, only those of the most frequent suffix are taken.
 
-    Raises InputError, which says what is there, where there is none.
+    Raises InputError, which describes the folder's content, if there are no such files.
     """
     entries = list_folder(folder)
     suffixes = {path: path.suffix.lower() for path in entries if path.is_file() and not is_result(path)}
@@ -71,7 +71,7 @@ def scan_files(folder: Path, other: Sequence[str] = ()) -> tuple[list[Path], lis
 
 
 def describe(entries: Sequence[Path]) -> str:
-    """What a folder holds, for an error."""
+    """A description of a folder's content for an error message."""
     if not entries:
         return "an empty folder"
     folders = [path.name for path in entries if path.is_dir()]
@@ -83,8 +83,8 @@ def describe(entries: Sequence[Path]) -> str:
 
 
 def open_files(name: str, paths: Sequence[Path], options: ReadingOptions) -> IndexedRecording:
-    """Point files, a frame each, in natural order or, where their names are plainly times, in that of time. Where
-    columns are not known they are those of the first .bin file."""
+    """Opens point files as one frame each, in natural order, or in chronological order if their names are clearly
+    times. If `columns` is not given, it is taken from the first readable .bin file."""
     paths, times = in_order(paths)
     suffixes = sorted({path.suffix.lower() for path in paths})
     warnings = [f"mixes {', '.join(suffixes)} files: one sensor is assumed"] if len(suffixes) > 1 else []
@@ -109,20 +109,21 @@ def open_files(name: str, paths: Sequence[Path], options: ReadingOptions) -> Ind
 
 
 def scan_id(path: Path) -> str:
-    """A file's name without its suffix, .pcd.bin being one."""
+    """A file's name without its suffix; .pcd.bin is one suffix."""
     return path.stem.removesuffix(".pcd") if path.suffix.lower() == ".bin" else path.stem
 
 
 def in_order(paths: Sequence[Path]) -> tuple[list[Path], list[float] | None]:
-    """Paths in natural order, and None; or in that of times, in s since 1970, where the names are plainly such."""
+    """Paths in natural order, and None; or paths in chronological order, and their times in s since 1970, if the names
+    are clearly times."""
     sorted_paths = sorted(paths, key=natural_key)
     matches = [_TIME.fullmatch(scan_id(path)) for path in sorted_paths]
     parts = [match.groups() for match in matches if match]
-    # of 1700000000_5 and 1700000000_10 nobody knows whether nanoseconds or tenths follow
+    # in 1700000000_5 and 1700000000_10 the last part may be nanoseconds or a decimal fraction
     if len(parts) < len(sorted_paths) or len({len(part) for *_, mark, part in parts if mark == "_"}) > 1:
         return sorted_paths, None
     seconds = [_seconds(digits, part or "") for _, digits, _, part in parts]
-    # 1700000000.5 is later than 1700000000.25, though 5 is before 25
+    # sorted by value: 1700000000.5 is later than 1700000000.25, although 5 is before 25 in natural order
     rows = sorted(range(len(sorted_paths)), key=lambda row: (natural_key(parts[row][0]), seconds[row]))
     times = [seconds[row] for row in rows]
     is_rising = all(earlier < later for earlier, later in zip(times, times[1:], strict=False))
@@ -136,7 +137,7 @@ def _seconds(digits: str, fraction: str) -> float:
 
 
 def _columns_of(paths: Sequence[Path]) -> tuple[int | None, list[str]]:
-    """Values a row of raw float32, and what was assumed, by the first file that can be read."""
+    """The values per row of raw float32 files, and warnings about the guess, from the first readable file."""
     for path in paths[:_MOST_TRIED]:
         try:
             cloud = read_points(path)

@@ -1,4 +1,4 @@
-"""Frames, and the sources that they come from: what every kind of recording is made into."""
+"""Frames and frame sources, the common interface of all kinds of recordings."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -13,20 +13,21 @@ from lidarpose.errors import InputError, LidarPoseError, MissingExtra, check_fin
 from lidarpose.geometry import is_rotation
 from lidarpose.io.files import FormatError, file_error, one_line, shorten
 
-# frames a second where a source has no times
+# frames per second if a source has no times
 DEFAULT_RATE = 10.0
-# seconds since 1970 are known to 0.2 microseconds
+# s; seconds since 1970 have a float64 resolution of 0.2 microseconds
 _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sweep:
-    """What a sensor saw in one turn, as the reader of a format decodes it.
+    """The points of one sensor revolution, as the reader of a format decodes them.
 
     Args:
-        points: (n, 3) m in the recording's frame, most often the sensor's; rows that are NaN or 0, 0, 0 are no returns.
-        T_world_sensor: (4, 4) m, or None where the sensor's pose is not known; z of the world is up.
-        origin: (3,) m, the sensor's place in the points' frame; None where it is not known.
+        points: (n, 3) m in the recording's frame, usually the sensor's; rows that are NaN or 0, 0, 0 are missing
+            returns.
+        T_world_sensor: (4, 4) m, or None if the sensor pose is unknown; the world's z axis points up.
+        origin: (3,) m, the sensor position in the points' frame; None if unknown.
         ring: (n,) the beam of each point, or None.
         warnings: lines about this frame.
     """
@@ -40,16 +41,16 @@ class Sweep:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Frame(Sweep):
-    """One frame of a source: a `Sweep` without the rows that are no returns, and its place in the source.
+    """One frame of a source: a `Sweep` without the rows of missing returns, and its position in the source.
 
     Args:
-        points: (n, 3) float64 m, finite. Of frames that you make `predict_recording` drops what is no return.
+        points: (n, 3) float64 m, finite. In frames that users create, `predict_recording` drops missing returns.
         index: its number in the source, from 0; damaged frames count.
         id: its name in the source, e.g. the stem of its file.
-        time: s; from `index` and the rate where the source has no times.
+        time: s; computed from `index` and the rate if the source has no times.
 
     Raises:
-        InputError: `T_world_sensor` is no rigid transform (4, 4).
+        InputError: `T_world_sensor` is not a rigid transform (4, 4).
     """
 
     index: int
@@ -75,7 +76,7 @@ class Frame(Sweep):
 
 @dataclass(frozen=True, kw_only=True)
 class DamagedFrame:
-    """A frame that cannot be read, and why: one line. The frames after it are read."""
+    """A frame that cannot be read. error: the reason, on one line. The frames after it are still read."""
 
     index: int
     id: str
@@ -83,12 +84,12 @@ class DamagedFrame:
     error: str
 
 
-# ---- what the readers of each format make
+# ---- interface of the readers of each format
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReadingOptions:
-    """How recordings are read: columns, topic and meta as of `open_source`; name_times: whether names tell times."""
+    """How recordings are read: columns, topic, meta as in `open_source`; name_times: whether file names give times."""
 
     columns: int | None = None
     topic: str | None = None
@@ -98,8 +99,8 @@ class ReadingOptions:
 
 @dataclass(frozen=True, eq=False)
 class LazyFrame:
-    """A frame that is there but not decoded: its name, its time in s if recorded, and `read`, which decodes it and
-    raises InputError or FormatError where it is damaged."""
+    """A frame that is not decoded yet: its name, its time in s if recorded, and `read`, which decodes it and raises
+    InputError or FormatError if it is damaged."""
 
     id: str
     time: float | None
@@ -107,11 +108,11 @@ class LazyFrame:
 
 
 class Recording(Protocol):
-    """What the reader of a format makes of a file or folder: frames not yet decoded, as often as wanted.
+    """A file or folder as the reader of its format opens it: frames not yet decoded, which can be iterated repeatedly.
 
-    `name` is that of the file or folder, `count` the number of frames if it is known before they are read; `warnings`
-    are lines about the whole, some only known after iterating. An InputError after the first frame ends the recording
-    there, and becomes a damaged frame.
+    `name` is the name of the file or folder, `count` the number of frames if it is known before reading; `warnings`
+    are lines about the whole recording, some only known after iterating. An InputError after the first frame ends the
+    recording there, and becomes a damaged frame.
     """
 
     @property
@@ -130,7 +131,7 @@ class Recording(Protocol):
 class IndexedRecording:
     """A recording whose frames can be read in any order.
 
-    ids and, where recorded, times in s of all frames; read(i) decodes frame i.
+    ids: of all frames; times: s, of all frames, None if not recorded; read(i) decodes frame i.
     """
 
     name: str
@@ -149,8 +150,9 @@ class IndexedRecording:
 
 
 class ChainedRecording:
-    """Several recordings one after the other. Ids begin with that of the recording, a path in the folder `name`; times
-    are dropped unless all have them. One that breaks off ends with a damaged frame, and the next follows."""
+    """Several recordings, one after the other. Frame ids begin with the recording's path in the folder `name`; times
+    are dropped unless all recordings have them. A recording that breaks off ends with a damaged frame, after which the
+    next recording follows."""
 
     def __init__(self, name: str, parts: Sequence[Recording], warnings: Sequence[str] = ()):
         self.name = name
@@ -187,7 +189,7 @@ class ChainedRecording:
 
 
 def _has_times(part: Recording) -> bool:
-    """Whether its frames have times; True of one that has no frame to say so."""
+    """Whether the recording's frames have times; True if it has no readable first frame."""
     try:
         first_frame = next(part.lazy_frames(0), None)
     except InputError:
@@ -199,20 +201,20 @@ def _refuse(error: InputError) -> Sweep:
     raise error
 
 
-# ---- the source that users see
+# ---- public source
 
 
 class FrameSource:
-    """The frames of a recording within a span of time, of every so many: in order, one in memory at a time, as often as
-    wanted.
+    """The frames of a recording, optionally within a time range and only every n-th: in order, one in memory at a time,
+    iterable repeatedly.
 
     Args:
-        rate: frames a second, where frames have no times; 10 by default.
+        rate: frames per second if frames have no times; 10 by default.
         start, end: s from the first frame. The first frame past `end` ends the source.
-        every: only frames whose index is a multiple of it.
+        every: read only frames whose index is a multiple of this.
 
     Raises:
-        InputError: an option that makes no sense, or a recording without frames.
+        InputError: an option has an invalid value, or the recording has no frames.
     """
 
     def __init__(
@@ -248,7 +250,7 @@ class FrameSource:
 
     @property
     def count(self) -> int | None:
-        """Frames, damaged ones too; None where only reading will tell."""
+        """Number of frames, including damaged ones; None if it is unknown before reading."""
         count = self.recording.count
         if count is None or self.start is None and self.end is None:
             return None if count is None else -(-count // self.every)
@@ -262,7 +264,7 @@ class FrameSource:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Lines about the source as a whole, as far as it was read."""
+        """Lines about the source as a whole, for the part read so far."""
         jump_notes = (
             [f"time jumps back {self._num_back} times: the order of the recording is kept"] if self._num_back else []
         )
@@ -272,14 +274,14 @@ class FrameSource:
         return self.frames()
 
     def _place(self, time: float) -> int:
-        """-1 before the span of time that is read, 0 in it, 1 after it."""
+        """-1 for a time before the range that is read, 0 in it, 1 after it."""
         elapsed = time - (self._first_time or 0.0)
         if self.end is not None and elapsed > self.end + _ROUNDING:
             return 1
         return -1 if self.start is not None and elapsed < self.start - _ROUNDING else 0
 
     def frames(self, first: int = 0) -> Iterator[Frame | DamagedFrame]:
-        """The frames from index `first` on, without reading those before."""
+        """The frames from index `first` on, without decoding those before."""
         self._num_back = 0
         last_time = -np.inf
         index = first - 1
@@ -305,7 +307,7 @@ def _read(lazy_frame: LazyFrame, index: int, time: float | None) -> Frame | Dama
     try:
         sweep = lazy_frame.read()
         points = np.asarray(sweep.points, np.float64)
-        # finite, and not 0, 0, 0
+        # false for NaN, infinity and 0, 0, 0
         distance = np.abs(points) @ np.ones(3)
         is_return = (distance > 0) & (distance < np.inf)
         ring = None if sweep.ring is None else sweep.ring[is_return]

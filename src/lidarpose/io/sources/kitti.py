@@ -1,4 +1,4 @@
-"""KITTI's recordings as they lie on disk: raw drives, and sequences of the odometry benchmark and SemanticKITTI.
+"""KITTI recordings in their original layout: raw drives, and sequences of the odometry benchmark and SemanticKITTI.
 
 Sources: Geiger et al., Vision meets Robotics: The KITTI Dataset, IJRR 2013, and the development kits of both.
 """
@@ -17,14 +17,15 @@ from lidarpose.io.point_cloud import KITTI_FIELDS, read_points
 from lidarpose.io.sources.folders import scan_files
 from lidarpose.io.sources.frame import IndexedRecording, Sweep
 
-# m, the Earth's as the development kit of raw data has it
+# m; the Earth's radius in the development kit of the raw data
 _EARTH_RADIUS = 6378137.0
 
 
 def open_kitti(folder: Path) -> IndexedRecording | None:
-    """A raw drive or an odometry sequence, or the folder of scans in one; None for any other folder.
+    """Opens a raw drive or an odometry sequence, or the folder of scans in one; None for any other folder.
 
-    The world is z up: of a drive, east, north and up from where it begins; of a sequence, the sensor's first frame.
+    The world's z axis points up. For a drive, the axes are east, north and up from its start; for a sequence, the
+    world is the sensor's first frame.
     """
     folder = folder.absolute()
     for drive in (folder, *folder.parents[:2]):
@@ -88,14 +89,14 @@ def _recording(folder: Path, files: Sequence[Path], times, notes: list[str], T_w
 
 
 class _Oxts:
-    """Poses by the drive's GPS and inertial unit: one small file a frame, read when its frame is."""
+    """Poses from the drive's GPS and inertial unit: one small file per frame, read together with the frame."""
 
     def __init__(self, folder: Path, T_imu_velo: np.ndarray, stamps: np.ndarray | None):
         self.folder = folder
         self.T_imu_velo = T_imu_velo
         self.stamps = stamps
         imu_stamps = _timestamps(folder / "timestamps.txt")
-        # of drives that are not synchronized, by the nearest time
+        # set for unsynchronized drives, whose poses are matched by the nearest time
         self.own = (
             imu_stamps if imu_stamps is not None and stamps is not None and len(imu_stamps) != len(stamps) else None
         )
@@ -110,7 +111,7 @@ class _Oxts:
 
     def _position(self, values: np.ndarray) -> np.ndarray:
         latitude, longitude = np.radians(values[:2])
-        # damaged values are no place
+        # damaged values give a non-finite position
         with np.errstate(all="ignore"):
             north = np.log(np.tan(np.pi / 4 + latitude / 2))
         return np.array([*(self.scale * _EARTH_RADIUS * np.array([longitude, north])), values[2]])
@@ -129,7 +130,7 @@ class _Oxts:
 
 
 def _numbers(files: Sequence[Path]) -> list[int]:
-    """The frame's number of each file: scans may be missing, their lines in tables are not."""
+    """The frame number of each file: if scans are missing, the tables still have lines for them."""
     if all(re.fullmatch("[0-9]+", path.stem) for path in files):
         return [int(path.stem) for path in files]
     return list(range(len(files)))
@@ -147,7 +148,7 @@ def _timestamps(path: Path) -> np.ndarray | None:
     """Lines such as "2011-09-26 13:02:25.594360375" as s since 1970; NaN for empty ones; None for a damaged file."""
     lines = [line.strip() or "NaT" for line in (_text(path) or "?").strip().split("\n")]
     try:
-        # numpy warns of what looks like a time zone
+        # numpy only warns about text that looks like a time zone
         with warnings.catch_warnings(action="error"):
             moments = np.array(lines, "datetime64[ns]")
     except (ValueError, Warning):
@@ -156,7 +157,7 @@ def _timestamps(path: Path) -> np.ndarray | None:
 
 
 def _table(path: Path, columns: int) -> np.ndarray | None:
-    """(n, columns) finite numbers, or None where the file holds something else."""
+    """(n, columns) finite numbers, or None if the file has other content."""
     text = _text(path)
     try:
         table = np.array([line.split() for line in (text or "").splitlines() if line.strip()], float)
@@ -166,7 +167,7 @@ def _table(path: Path, columns: int) -> np.ndarray | None:
 
 
 def _calibration(path: Path) -> dict[str, np.ndarray]:
-    """Lines "KEY: numbers"."""
+    """The numbers of a file with lines "KEY: numbers", by key."""
     entries = {}
     for line in (_text(path) or "").splitlines():
         key, _, values = line.partition(":")
@@ -180,7 +181,7 @@ def _calibration(path: Path) -> dict[str, np.ndarray]:
 
 
 def _transform(values: np.ndarray) -> np.ndarray:
-    """(4, 4) of the first three rows (12,)."""
+    """The transform (4, 4) from its first three rows (12,)."""
     return rigid_transform(values.reshape(3, 4)[:, :3], values.reshape(3, 4)[:, 3])
 
 

@@ -1,4 +1,4 @@
-"""nuScenes as it lies on disk: the sweeps of its LiDAR, scene by scene, with the sensor's poses.
+"""nuScenes in its original layout: the sweeps of its LiDAR, scene by scene, with sensor poses.
 
 Source: Caesar et al., nuScenes: A Multimodal Dataset for Autonomous Driving, CVPR 2020, and the schema of its
 development kit.
@@ -21,9 +21,10 @@ _TABLES = ("sample_data", "sample", "scene", "ego_pose", "calibrated_sensor", "s
 
 
 def open_nuscenes(folder: Path, options: ReadingOptions) -> IndexedRecording | None:
-    """The sweeps of one scene (topic), or of all in the order of time; None for a folder that is not nuScenes'.
+    """Opens the sweeps of one scene (topic), or of all scenes in chronological order; None if it is not nuScenes.
 
-    folder: the data's, or that of its tables (v1.0-mini, ...) where it has several.
+    folder: the folder of the data, or, if that has several versions, the folder of one version's tables (v1.0-mini,
+    ...).
     """
     if (folder / "sample_data.json").is_file():
         root, versions = folder.absolute().parent, [folder]
@@ -63,7 +64,7 @@ def open_nuscenes(folder: Path, options: ReadingOptions) -> IndexedRecording | N
 
 
 def _sweeps(version: Path, scene: str | None) -> list[dict[str, Any]]:
-    """Of each sweep its id, file, time in s and pose, None for a damaged one, in order."""
+    """The id, file, time in s and pose (None if damaged) of each sweep, in order."""
     tables = {
         name: json.loads(read_bytes(version / f"{name}.json", expected="a table of nuScenes")) for name in _TABLES
     }
@@ -83,7 +84,7 @@ def _sweeps(version: Path, scene: str | None) -> list[dict[str, Any]]:
             sweeps.append(sweep | {"time": row["timestamp"] / 1e6})
     if not sweeps:
         raise file_error(version, f"expected sweeps of {_CHANNEL} in sample_data.json, got none: download it again")
-    # scenes may overlap where two cars drove at once
+    # scenes overlap in time if two cars drove at once
     scene_starts: dict[str, float] = {}
     for sweep in sweeps:
         scene_starts[sweep["scene"]] = min(sweep["time"], scene_starts.get(sweep["scene"], np.inf))
@@ -91,8 +92,8 @@ def _sweeps(version: Path, scene: str | None) -> list[dict[str, Any]]:
 
 
 def _pose(*rows: Any) -> np.ndarray | None:
-    """(4, 4) of transforms one in the other, each a translation in m and a quaternion w, x, y, z; None where a row is
-    missing or damaged."""
+    """(4, 4), the product of the rows' transforms, each a translation in m and a quaternion w, x, y, z; None if a row
+    is missing or damaged."""
     pose = np.eye(4)
     for row in rows:
         try:

@@ -1,7 +1,7 @@
-"""Packets of Ouster sensors as frames, by the published packet formats and the sensor's metadata.
+"""Packets of Ouster sensors as frames, decoded with the published packet formats and the sensor's metadata.
 
-Formats and geometry: Ouster firmware user manual, "Lidar Data" and "Coordinate Frames and XYZ Calculation". Of dual
-returns the first one of each pixel is taken.
+Formats and geometry: Ouster firmware user manual, "Lidar Data" and "Coordinate Frames and XYZ Calculation". With dual
+returns, the first return of each pixel is used.
 """
 
 import json
@@ -20,8 +20,8 @@ from lidarpose.io.sources import velodyne
 from lidarpose.io.sources.frame import ReadingOptions, Recording, Sweep
 from lidarpose.io.sources.pcap import PacketRecording
 
-# bytes of a pixel, by profile. Ranges come first: of RNG15 in 15 bits and steps of 8 mm, of others in 19 (LEGACY 20)
-# bits and mm
+# bytes of a pixel, by profile. The range comes first: for RNG15 in 15 bits and steps of 8 mm, for others in 19 bits
+# (LEGACY 20) and mm
 _PIXEL_BYTES = {
     "LEGACY": 12,
     "RNG19_RFL8_SIG16_NIR16": 12,
@@ -37,20 +37,21 @@ _PIXEL_BYTES = {
     "FUSA_RNG15_RFL8_NIR8_DUAL": 8,
 }
 _MAX_COLUMNS, _MAX_BEAMS, _MAX_PACKET, _MAX_NUMBER = 4096, 256, 65507, 1e9
-# of sensors whose metadata does not hold it
+# lidar_to_sensor_transform, mm, of sensors whose metadata does not contain it
 _LIDAR_TO_SENSOR = (-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 36.18, 0, 0, 0, 1)
 _COLUMNS_PER_PACKET = 16
-# datagrams in which the port that the metadata names is looked for
+# number of datagrams that are searched for the port in the metadata
 _NUM_PEEKED = 2000
 
 
 def open_recording(path: Path, options: ReadingOptions) -> Recording:
-    """Opens a capture of an Ouster sensor, whose metadata is a JSON file: the one that is named (meta), else the one of
-    the same stem beside it; without one, of a Velodyne sensor.
+    """Opens a capture of an Ouster sensor, or, if there is no metadata, of a Velodyne sensor.
+
+    The Ouster metadata is the JSON file `meta`, else the one next to the capture with the same stem.
 
     Raises:
-        InputError: No capture, of another sensor, or an Ouster's without its metadata.
-        MissingExtra: A Velodyne's without the library that decodes it.
+        InputError: The file is not a capture, is of another sensor, or is of an Ouster sensor without metadata.
+        MissingExtra: The capture is of a Velodyne sensor, and the library that decodes it is not installed.
     """
     metadata = options.meta or path.with_suffix(".json")
     if options.meta is None and not metadata.exists():
@@ -59,14 +60,14 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
 
 
 class OusterFormat:
-    """How a sensor's packets are laid out, and where its beams point: what its metadata says.
+    """The layout of a sensor's packets and the directions of its beams, from the sensor's metadata.
 
-    columns, columns_per_packet, beams: of a frame, a packet, a column; window: first and last column that is sent;
-    serial: the sensor's number or None; packet: dtype of a packet with `columns`, each with `time` ns, `id`, `status`
-    and `range` (beams,).
+    columns: columns of a frame; columns_per_packet: columns of a packet; beams: beams of a column; window: first and
+    last column that is sent; serial: the sensor's serial number or None; packet: dtype of a packet with `columns`, each
+    with `time` ns, `id`, `status` and `pixels` (beams,), which have a `range`.
 
     Raises:
-        InputError: No metadata of a sensor.
+        InputError: The file is not a sensor's metadata.
     """
 
     def __init__(self, path: Path):
@@ -123,8 +124,8 @@ class OusterFormat:
         return np.dtype([columns] if self.is_legacy else [("header", "V32"), columns, ("footer", "V32")])
 
     def _aim(self, metadata: dict[str, Any], altitude: np.ndarray, azimuth: np.ndarray) -> None:
-        """Directions (columns, beams, 3) and starts (columns, 3) m of the beams in the sensor's frame; a range counts
-        from `reach` mm in front of its start."""
+        """Computes directions (columns, beams, 3) and starts (columns, 3) m of the beams in the sensor frame. A
+        measured range is `reach` mm longer than the distance from the start."""
         beam_to_lidar = _numbers(metadata, "beam_to_lidar_transform", np.eye(4)).reshape(4, 4)
         radial_offset, vertical_offset = beam_to_lidar[0, 3], beam_to_lidar[2, 3]
         if "beam_to_lidar_transform" not in metadata:
@@ -149,7 +150,7 @@ class OusterFormat:
         self.starts = np.stack(starts, axis=-1) @ R.T / 1000 + self.origin
 
     def header(self, packet: bytes) -> tuple[int, int | None]:
-        """A packet's frame id, and the sensor's serial number where it holds it."""
+        """A packet's frame id, and the sensor's serial number if the packet contains it."""
         id_offset, size, serial_offset = (10, 2, None) if self.is_legacy else (4, 4, 11) if self.is_fusa else (2, 2, 7)
         frame_id = int.from_bytes(packet[id_offset : id_offset + size], "little")
         return frame_id, None if serial_offset is None else int.from_bytes(
@@ -157,16 +158,16 @@ class OusterFormat:
         )
 
     def num_sent(self, step: int = 1) -> int:
-        """Columns that a whole turn is sent in, or groups of `step` of them."""
+        """Number of columns that are sent in a full revolution, or of groups of `step` columns."""
         first, last = (column // step for column in self.window)
         total = -(-self.columns // step)
         return last - first + 1 if self.window[0] <= self.window[1] else min(total - first + last + 1, total)
 
     def decode(self, packets: list[bytes]) -> Sweep:
-        """The sweep that a frame's packets hold; ring is the number of the beam, from the top."""
+        """The sweep in a frame's packets; ring is the beam number, from the top."""
         columns = np.frombuffer(b"".join(packets), self.packet)["columns"].reshape(-1)
         columns = columns[(columns["status"] & 1 == 1) & (columns["id"] < self.columns)]
-        # of packets that came twice, once
+        # duplicate packets are used once
         ids, first_indices = np.unique(columns["id"], return_index=True)
         ranges = (columns["pixels"]["range"][first_indices] & self.mask).astype(np.int64) * self.unit
         (returns,) = np.nonzero(ranges.ravel())
@@ -180,7 +181,7 @@ class OusterFormat:
 
 
 class OusterRecording(PacketRecording):
-    """A capture of an Ouster sensor's packets, with its metadata.
+    """A capture of an Ouster sensor's packets, decoded with the sensor's metadata.
 
     Args:
         path: the capture.
@@ -196,10 +197,10 @@ class OusterRecording(PacketRecording):
         self._serial: int | None = None
 
     def _find_flow(self) -> tuple[bytes, int]:
-        """Whose packets are read: those to the port that the metadata names, else the first."""
+        """The flow whose packets are read: the one to the port in the metadata, else the first with lidar packets."""
         sizes: Counter[int] = Counter()
         flow = None
-        # a capture that is cut off raises at its end
+        # a capture that is cut off raises InputError at its end
         with suppress(InputError):
             for k, datagram in enumerate(self.capture):
                 sizes[len(datagram.payload)] += 1
@@ -237,7 +238,7 @@ class OusterRecording(PacketRecording):
             yield time, partial(self.format.decode, packets)
 
     def _packets_of_turns(self) -> Iterator[tuple[float, list[bytes]]]:
-        """(time of capture, packets) of each turn of the sensor."""
+        """(time of capture, packets) of each revolution of the sensor."""
         self._num_lost = self._num_sent = 0
         packets_per_turn = self.format.num_sent(self.format.columns_per_packet)
         packets: list[bytes] = []
@@ -245,11 +246,11 @@ class OusterRecording(PacketRecording):
         start_time, num_turns = 0.0, 0
         for datagram in self.packets():
             frame_id, self._serial = self.format.header(datagram.payload)
-            # late, of the turn before, which counts it as lost
+            # a late packet of the previous revolution, which has already counted it as lost
             if frame_id == previous_id:
                 continue
             if packets and (frame_id != current_id or len(packets) >= 2 * packets_per_turn):
-                # the first turn and the last one began or ended outside of the capture
+                # losses are not counted in the first and the last revolution: the capture has only a part of them
                 if num_turns:
                     self._num_sent += packets_per_turn
                     self._num_lost += max(packets_per_turn - len(packets), 0)
@@ -266,7 +267,7 @@ class OusterRecording(PacketRecording):
 
 
 def _flat(metadata: dict[str, Any]) -> dict[str, Any]:
-    """Keys of all sections as one; newer sensors sort into sections what older ones hold at the top."""
+    """The keys of all sections in one dict: newer sensors group into sections what older ones have at the top level."""
     sections = [_flat(value) for value in metadata.values() if isinstance(value, dict)]
     top_level = {key: value for key, value in metadata.items() if not isinstance(value, dict)}
     return {key: value for section in (*sections, top_level) for key, value in section.items()}

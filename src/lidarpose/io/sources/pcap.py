@@ -1,4 +1,4 @@
-"""UDP datagrams of packet captures: pcap of either byte order and resolution, and pcapng.
+"""UDP datagrams in packet captures: pcap of either byte order and time resolution, and pcapng.
 
 Formats: draft-ietf-opsawg-pcap, draft-ietf-opsawg-pcapng, RFC 791 and 8200 (fragments), RFC 768.
 """
@@ -13,7 +13,7 @@ from lidarpose.errors import InputError
 from lidarpose.io.files import FormatError, file_error, unreadable
 from lidarpose.io.sources.frame import LazyFrame, Sweep
 
-# magic of a pcap file: byte order, ticks a second
+# magic of a pcap file: byte order, ticks per second
 _MAGIC = {
     b"\xd4\xc3\xb2\xa1": ("<", 1e6),
     b"\xa1\xb2\xc3\xd4": (">", 1e6),
@@ -21,12 +21,12 @@ _MAGIC = {
     b"\xa1\xb2\x3c\x4d": (">", 1e9),
 }
 _PCAPNG = b"\x0a\x0d\x0d\x0a"
-# bytes; no capture holds larger packets
+# bytes; captures have no larger packets
 _MAX_PACKET = 2**20
-# datagrams whose fragments are waited for, and the bytes of one
+# maximum number of incomplete datagrams that wait for fragments, and maximum bytes of a datagram
 _MAX_PENDING, _MAX_DATAGRAM = 64, 65535
 _VLAN = (0x8100, 0x88A8, 0x9100)
-# link type: where its header tells the EtherType, and its length; raw IP has none
+# link type: offset of the EtherType in its header, and the header's length; raw IP has no header
 _ETHERNET = 1
 _LINKS = {_ETHERNET: (12, 14), 113: (14, 16), 276: (0, 20), 0: (None, 4), 108: (None, 4), 101: (None, 0)}
 _LINKS |= {link: (None, 0) for link in (12, 14, 228, 229)}
@@ -34,7 +34,7 @@ _IP = (0x0800, 0x86DD)
 
 
 class Datagram(NamedTuple):
-    """What one UDP datagram carries. time: s, of the capture; flow: source address and destination port."""
+    """The payload of one UDP datagram. time: s, of the capture; flow: source address and destination port."""
 
     time: float
     flow: tuple[bytes, int]
@@ -42,12 +42,12 @@ class Datagram(NamedTuple):
 
 
 class Capture:
-    """The UDP datagrams of a capture, as often as wanted.
+    """The UDP datagrams of a capture, iterable repeatedly.
 
-    num_cut: datagrams of which the capture holds only a part, or not all fragments, since iterating last began.
+    num_cut: number of datagrams that were captured only in part or without all fragments, since iterating last began.
 
     Raises:
-        InputError: No capture; while iterating, where the file is cut off.
+        InputError: The file is not a capture; while iterating, where the file is cut off or damaged.
     """
 
     def __init__(self, path: Path):
@@ -82,7 +82,7 @@ class Capture:
             raise damage
 
     def _datagram(self, time: float, ip: memoryview, pending: dict) -> Datagram | None:
-        """The datagram that a packet holds, or completes."""
+        """The datagram that a packet contains or completes, or None."""
         part = _udp_part(ip)
         if part is None:
             return None
@@ -100,12 +100,12 @@ class Capture:
         return None
 
     def _reassembled(self, key: tuple, offset: int, has_more: bool, data: bytes, pending: dict) -> bytes:
-        """The whole datagram where this fragment is the last one missing, else nothing."""
+        """The whole datagram if this fragment was the last missing one, else empty bytes."""
         parts = pending.setdefault(key, {})
         parts[offset] = data, has_more
         size = sum(len(part) for part, _ in parts.values())
         if size > _MAX_DATAGRAM or len(pending) > _MAX_PENDING:
-            # the oldest one never comes, or fragments overlap
+            # fragments overlap, or the oldest datagram is given up
             pending.pop(key if size > _MAX_DATAGRAM else next(iter(pending)))
             self.num_cut += 1
         last_offset = max(parts)
@@ -116,11 +116,11 @@ class Capture:
 
 
 class PacketRecording(ABC):
-    """A capture of one sensor's packets. A `Recording`; a frame is one turn of the sensor.
+    """A capture of one sensor's packets. A `Recording`; a frame is one revolution of the sensor.
 
     Args:
         path: the capture.
-        packet_bytes: the size of the sensor's packets; those of the flow that comes first are read.
+        packet_bytes: the size of the sensor's packets; by default those of the first flow with this size are read.
     """
 
     count = None
@@ -135,10 +135,10 @@ class PacketRecording(ABC):
 
     @abstractmethod
     def sweeps(self) -> Iterator[tuple[float, Callable[[], Sweep]]]:
-        """Of each turn its time, s, and what decodes it."""
+        """The time, s, of each revolution and a function that decodes it."""
 
     def packets(self) -> Iterator[Datagram]:
-        """The sensor's, as far as the capture can be read."""
+        """The sensor's packets, as far as the capture can be read."""
         self.num_other, self._damage, flow = 0, None, self.flow
         try:
             for datagram in self.capture:
@@ -188,7 +188,7 @@ def _read_pcap(file: BinaryIO) -> Iterator[tuple[float, int, bytes]]:
 
 def _read_pcapng(file: BinaryIO) -> Iterator[tuple[float, int, bytes]]:
     order = "<"
-    # link type and ticks a second of each interface
+    # link type and ticks per second of each interface
     interfaces: list[tuple[int, float]] = []
     while file.peek(1):  # type: ignore[attr-defined]
         kind = _take(file, 4)
@@ -213,7 +213,7 @@ def _read_pcapng(file: BinaryIO) -> Iterator[tuple[float, int, bytes]]:
 
 
 def _ticks(options: bytes, order: str) -> float:
-    """Ticks a second of an interface, from its options."""
+    """Ticks per second of an interface, from its options."""
     offset = 0
     while offset + 5 <= len(options):
         code, size = struct.unpack_from(order + "HH", options, offset)
@@ -232,7 +232,7 @@ def _check_link(link: int) -> None:
 
 
 def _ip_packet(packet: bytes, link: int) -> memoryview:
-    """The IP packet in one of a link; empty where it holds something else."""
+    """The IP packet in a link-layer packet; empty if that has another content."""
     type_offset, start = _LINKS[link]
     view = memoryview(packet)
     if type_offset is not None:
@@ -246,13 +246,13 @@ def _ip_packet(packet: bytes, link: int) -> memoryview:
 
 
 def _udp_part(ip: memoryview):
-    """(source, key, offset, whether more fragments follow, data, its length by the header) of a packet of UDP, or
-    None."""
+    """(source, key, offset, whether more fragments follow, data, data length in the header) of an IP packet with UDP,
+    else None."""
     version = ip[0] >> 4 if ip else 0
     if version == 4 and len(ip) >= 20:
         start, kind, addresses = (ip[0] & 15) * 4, ip[9], bytes(ip[12:20])
         total, number, flags = struct.unpack_from(">HHH", ip, 2)
-        # cards that cut packets up themselves leave the length open
+        # network cards with segmentation offload leave the length 0
         total = total or len(ip)
         offset, has_more = (flags & 0x1FFF) * 8, bool(flags & 0x2000)
     elif version == 6 and len(ip) >= 40:

@@ -1,7 +1,7 @@
-"""Point clouds of ROS recordings: sensor_msgs/PointCloud2 in MCAP, ROS 1 bags and rosbag2's SQLite files.
+"""Point clouds in ROS recordings: sensor_msgs/PointCloud2 in MCAP, ROS 1 bags and rosbag2's SQLite files.
 
-Messages are decoded by the library rosbags. The sensor's pose comes from the recording's transforms (tf), where they
-join the clouds' frame to a world's.
+Messages are decoded with the library rosbags. The sensor pose comes from the recording's transforms (tf), if they
+connect the clouds' frame to a world frame.
 """
 
 from bisect import bisect_left
@@ -24,35 +24,35 @@ from lidarpose.io.sources.frame import LazyFrame, ReadingOptions, Sweep
 _FILES: dict[str, type[RecordFile] | type[SqliteFile]] = {".mcap": McapFile, ".bag": Ros1File, ".db3": SqliteFile}
 _CLOUD = ("sensor_msgs/msg/PointCloud2", "sensor_msgs/PointCloud2")
 _TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf2_msgs/TFMessage", "tf/tfMessage")
-# of a PointField
+# data types of a PointField
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-# names under which drivers publish a point's beam
+# names of the fields in which drivers publish a point's beam
 _RING = ("ring", "channel", "line", "laser_id")
-# frames that stand still; the first is preferred (REP 105)
+# fixed frames; the first is preferred (REP 105)
 _WORLDS = ("map", "world", "odom")
-# frames of the vehicle or the world, in which the sensor's own place is not the origin
+# frames of the vehicle or the world, whose origin is not the sensor position
 _NO_SENSORS = (*_WORLDS, "earth", "base_link", "base_footprint", "base")
 
-# a sensor's pose is interpolated between transforms that are at most so far apart, ns
+# ns; the sensor pose is interpolated only between transforms that are not farther apart
 _MAX_GAP = 10**9
-# clouds wait for transforms that are recorded after them: so many, and so long, ns
+# clouds wait for transforms that are recorded after them: maximum number of waiting clouds, and maximum wait, ns
 _MAX_WAITING, _MAX_WAIT = 16, 10**9
 # m; no sensor is farther from the origin of its world
 _MAX_PLAUSIBLE = 1e9
-# of a quaternion that is a rotation
+# minimum norm of a valid quaternion
 _MIN_NORM = 1e-3
-# transforms that are kept of each frame
+# maximum number of transforms stored for each frame
 _MAX_KEPT = 1000
 
 
 def open_recording(path: Path, options: ReadingOptions) -> "BagRecording":
-    """Opens a .mcap, .bag or .db3 file, or a folder that rosbag2 made.
+    """Opens a .mcap, .bag or .db3 file, or a folder that rosbag2 wrote.
 
-    The topic of the clouds is by default the only one with clouds, or the one with most.
+    By default, the topic is the one with most clouds.
 
     Raises:
-        InputError: No such recording, no point clouds in it, or no such topic.
-        MissingExtra: Without the library that decodes messages.
+        InputError: The recording does not exist, has no point clouds, or does not have the topic.
+        MissingExtra: The library that decodes messages is not installed.
     """
     files = [path]
     if path.is_dir():
@@ -65,7 +65,7 @@ def open_recording(path: Path, options: ReadingOptions) -> "BagRecording":
 
 
 def open_parts(name: str, files: list[Path], options: ReadingOptions) -> "BagRecording":
-    """Opens the files of one recording, which follow each other. Errors are those of `open_recording`."""
+    """Opens consecutive files of one recording. Raises the same errors as `open_recording`."""
     _decoders()
     return BagRecording(name, [_open_file(file) for file in files], options.topic)
 
@@ -80,11 +80,11 @@ def _open_file(path: Path) -> RecordFile | SqliteFile:
 
 
 class BagRecording:
-    """The clouds of a topic. A `Recording`; a frame is one message, and its time the one in its header.
+    """The clouds of a topic. A `Recording`; a frame is one message, with the time in its header.
 
     Args:
-        files: what the recording consists of, in order.
-        topic: None for the one with most clouds.
+        files: the files of the recording, in order.
+        topic: None for the topic with most clouds.
     """
 
     def __init__(self, name: str, files: list[RecordFile | SqliteFile], topic: str | None):
@@ -142,13 +142,13 @@ class BagRecording:
         return lines
 
     def lazy_frames(self, first: int = 0) -> Iterator[LazyFrame]:
-        # clouds before the first are placed too: the world is chosen by them
+        # the poses of clouds before `first` are computed, too, since they determine the world frame
         return islice(self._all_frames(), first, None)
 
     def _all_frames(self) -> Iterator[LazyFrame]:
         self._num_frames = self._num_posed = 0
         transforms = TransformTree()
-        # clouds that wait for the pose of their sensor
+        # clouds that wait for their sensor pose
         pending_clouds: deque[_Cloud] = deque()
         index = delay = 0
         for message in self._messages():
@@ -170,7 +170,7 @@ class BagRecording:
             raise self._damage
 
     def _decode(self, message: Message) -> Any:
-        """The content of a message, or None where it is damaged."""
+        """The content of a message, or None if it is damaged."""
         name = _CLOUD[0] if message.topic == self.topic else _TRANSFORMS[0]
         try:
             return _decoders()[self.topics[message.topic].encoding](message.data, name)
@@ -178,7 +178,7 @@ class BagRecording:
             return None
 
     def _messages(self) -> Iterator[Message]:
-        """Clouds and transforms of all files. Where one of them is damaged, the next one goes on."""
+        """Clouds and transforms of all files. After a damaged position, reading continues with the next file."""
         self._damage = None
         for file in self.files:
             try:
@@ -189,7 +189,8 @@ class BagRecording:
                 self._damage = unreadable(file.path, error)
 
     def _pose(self, transforms: "TransformTree", cloud: "_Cloud", is_last: bool) -> np.ndarray | None:
-        """T_world_sensor at a cloud's time. The world is chosen once: the first of `_WORLDS`, or, at last, another."""
+        """T_world_sensor at a cloud's time. The world is chosen once: the first of `_WORLDS`, or the next available one
+        if the cloud cannot wait longer (`is_last`)."""
         poses = transforms.poses(cloud.frame_id, cloud.stamp)
         if self._world is None:
             available_worlds = [world for world in _WORLDS if world in poses]
@@ -205,8 +206,11 @@ class BagRecording:
 
 
 class _Cloud:
-    """A message with a cloud: recorded and stamp, ns, when it was recorded and when it was measured, as far as its
-    header tells; of a damaged message, `delay` ns before it was recorded, as the one before."""
+    """A message with a cloud.
+
+    recorded: ns, when it was recorded; stamp: ns, when it was measured according to its header, or `recorded` if the
+    header has no time. For a damaged message, stamp is `delay` ns before `recorded`, like that of the previous cloud.
+    """
 
     def __init__(self, index: int, message: Message, content: Any, delay: int):
         self.index = index
@@ -228,7 +232,7 @@ class _Cloud:
 
 @cache
 def _decoders() -> dict[str, Callable[[bytes, str], Any]]:
-    """What decodes messages of each encoding."""
+    """The function that decodes messages, for each encoding."""
     try:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ModuleNotFoundError as error:
@@ -244,7 +248,7 @@ def decode_cloud(cloud: Any) -> tuple[np.ndarray, np.ndarray | None]:
     Fields may lie anywhere in a point, in any number type and either byte order; rows may be padded.
 
     Raises:
-        FormatError: No x, y, z, or a layout that does not fit the data.
+        FormatError: The cloud has no x, y, z, or its layout does not fit its data.
     """
     names = {field.name.lower(): field for field in reversed(cloud.fields)}
     ring = next((name for name in _RING if name in names), None)
@@ -262,7 +266,7 @@ def decode_cloud(cloud: Any) -> tuple[np.ndarray, np.ndarray | None]:
     formats = [order + _DATATYPES[names[name].datatype] for name in field_names]
     offsets = [names[name].offset for name in field_names]
     point = np.dtype({"names": field_names, "formats": formats, "offsets": offsets, "itemsize": cloud.point_step})
-    # of a single row the step is often left out
+    # the row step of a single row is often not set
     row_step = cloud.row_step if cloud.height > 1 else cloud.width * cloud.point_step
     required_bytes = row_step * (cloud.height - 1) + cloud.width * cloud.point_step
     if row_step < cloud.width * cloud.point_step or required_bytes > len(cloud.data):
@@ -278,19 +282,19 @@ def decode_cloud(cloud: Any) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 class TransformTree:
-    """The transforms of a recording as far as it was read: which frame is where in which other."""
+    """The transforms between frames in the part of a recording that has been read."""
 
     def __init__(self):
-        # child -> parent, times ns (empty where it never moves), and (translation m, quaternion x y z w) at each
+        # child -> parent, times ns (empty for a static transform), and (translation m, quaternion x y z w) at each time
         self._edges: dict[str, tuple[str, list[int], list[np.ndarray]]] = {}
 
     def add(self, message: Any, *, is_static: bool) -> None:
-        """Takes a TFMessage; what is no transform in it is left out."""
+        """Adds the transforms of a TFMessage; implausible ones are ignored."""
         for transform_stamped in getattr(message, "transforms", ()):
             child, parent = transform_stamped.child_frame_id.lstrip("/"), transform_stamped.header.frame_id.lstrip("/")
             t, q = transform_stamped.transform.translation, transform_stamped.transform.rotation
             placement = np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w])
-            # NaN is not below
+            # false for NaN
             is_plausible = np.abs(placement).max() < _MAX_PLAUSIBLE and np.linalg.norm(placement[3:]) > _MIN_NORM
             if not is_plausible or child == parent:
                 continue
@@ -306,14 +310,14 @@ class TransformTree:
             self._edges[child] = parent, times[-_MAX_KEPT:], placements[-_MAX_KEPT:]
 
     def poses(self, frame: str, time: int) -> dict[str, np.ndarray]:
-        """T_parent_frame (4, 4) of the frame in each of those above it, itself included, at a time in ns; those after a
-        transform that is not known then are left out."""
+        """T_parent_frame (4, 4) of the frame in itself and in each of its ancestors, at a time in ns. Ancestors beyond
+        a transform that is unknown at that time are left out."""
         poses = {frame: np.eye(4)}
         T = np.eye(4)
         while frame in self._edges:
             parent, times, placements = self._edges[frame]
             step = _between(times, placements, time) if times else _matrix(placements[0])
-            # a circle has no top
+            # stops at an unknown transform, and at a cycle in the tree
             if step is None or parent in poses:
                 break
             T = step @ T
@@ -323,7 +327,7 @@ class TransformTree:
 
 
 def _between(times: list[int], placements: list[np.ndarray], time: int) -> np.ndarray | None:
-    """The transform at a time between two that are known, or None."""
+    """The transform at a time, interpolated between two known ones, or None."""
     k = bisect_left(times, time)
     if k < len(times) and times[k] == time:
         return _matrix(placements[k])
@@ -331,11 +335,11 @@ def _between(times: list[int], placements: list[np.ndarray], time: int) -> np.nd
         return None
     share = (time - times[k - 1]) / (times[k] - times[k - 1])
     previous, following = placements[k - 1], placements[k].copy()
-    # q and -q are the same rotation; over so short a time the chord is the arc
+    # q and -q are the same rotation; over such a short time linear interpolation is close to spherical
     following[3:] *= np.sign(previous[3:] @ following[3:]) or 1.0
     return _matrix((1 - share) * previous + share * following)
 
 
 def _matrix(placement: np.ndarray) -> np.ndarray:
-    """(4, 4) of a translation and a quaternion x y z w, of any length."""
+    """The transform (4, 4) of a translation and a quaternion x y z w of any norm."""
     return rigid_transform(quaternion_to_matrix(np.roll(placement[3:], 1)), placement[:3])

@@ -1,4 +1,4 @@
-"""Packets of Velodyne sensors as frames, by the library velodyne-decoder."""
+"""Packets of Velodyne sensors as frames, decoded with the library velodyne-decoder."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -15,9 +15,10 @@ from lidarpose.io.sources.frame import ReadingOptions, Sweep
 from lidarpose.io.sources.pcap import Capture, Datagram, PacketRecording
 
 PACKET_BYTES = 1206
-# columns of the decoder's rows
+# column of the ring in the decoder's rows
 _RING = 6
-# packets among which a Velodyne's are looked for, and those that tell whether their last bytes are a model's number
+# number of packets that are searched for those of a Velodyne, and of packets that are checked for a model number in
+# their last bytes
 _NUM_TRIED, _NUM_PEEKED = 2000, 5
 
 
@@ -25,8 +26,8 @@ def open_recording(path: Path, options: ReadingOptions) -> "VelodyneRecording":
     """Opens a capture of a Velodyne sensor.
 
     Raises:
-        InputError: No capture, or of another sensor.
-        MissingExtra: Without the library that decodes it.
+        InputError: The file is not a capture, or is of another sensor.
+        MissingExtra: The library that decodes it is not installed.
     """
     sizes: list[int] = []
     try:
@@ -43,9 +44,9 @@ def open_recording(path: Path, options: ReadingOptions) -> "VelodyneRecording":
 
 
 class VelodyneRecording(PacketRecording):
-    """A capture of a Velodyne sensor's packets; a frame's time is that of the capture.
+    """A capture of a Velodyne sensor's packets; a frame's time is the time of capture.
 
-    The packets name the model, and the model's own beam angles are taken; an HDL-64E sends its calibration along.
+    The packets name the model, whose beam angles are used; an HDL-64E sends its own calibration in its packets.
     """
 
     def __init__(self, path: Path):
@@ -67,12 +68,12 @@ class VelodyneRecording(PacketRecording):
         return [f"{count} {problem}" for problem, count in counts.items() if count] + super().warnings
 
     def _model(self) -> tuple[Any, bytes]:
-        """The library's configuration, and the last bytes of each packet where they are the model's number."""
+        """The library's configuration, and the last bytes of each packet if they are the model number, else none."""
         config = self._library.Config()
         ends = Counter(packet.payload[-2:] for packet in islice(self.packets(), _NUM_PEEKED))
         if len(ends) <= 2:
             return config, ends.most_common(1)[0][0]
-        # pieces of an HDL-64E's calibration
+        # the last bytes vary: they are pieces of an HDL-64E's calibration
         try:
             config.model, config.calibration = self._library.hdl64e.detect_hdl64e(self.name)
         except Exception as error:
