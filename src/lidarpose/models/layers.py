@@ -86,8 +86,8 @@ def key_bias(valid: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def attend(query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None = None, *, dropout: float = 0.0) -> Tensor:
-    """torch's scaled_dot_product_attention, always in float32 on a CPU, where its gradient in bfloat16 takes five times
-    as long."""
+    """torch's scaled_dot_product_attention; under autocast on a CPU in float32, since its gradient in bfloat16 takes
+    five times as long there."""
     if query.device.type == "cpu" and torch.is_autocast_enabled("cpu"):
         mask = mask if mask is None or mask.dtype == torch.bool else mask.float()
         with torch.autocast("cpu", enabled=False):

@@ -63,7 +63,7 @@ def usable_threads() -> int:
 
 
 def thread_count(threads: int | None) -> int:
-    """The given number of threads, `usable_threads` for None. Raises InputError unless it is from 1 to 1024."""
+    """The given number of threads, `usable_threads` for None. Raises InputError unless it is 1 to `_THREADS_LIMIT`."""
     return usable_threads() if threads is None else check_int("threads", threads, least=1, most=_THREADS_LIMIT)
 
 
