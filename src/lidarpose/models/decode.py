@@ -34,8 +34,7 @@ def argmax(logits: np.ndarray, *, low: float | np.ndarray, step: float | np.ndar
 
 
 def dark(logits: np.ndarray, *, low: float | np.ndarray, step: float | np.ndarray) -> np.ndarray:
-    """logits (..., W) -> (...) m: the released code's refinement of the peak (DARK, Zhang et al. 2020), reproduced
-    exactly.
+    """logits (..., W) -> (...) m: the released code's exact refinement of the peak (DARK, Zhang et al. 2020).
 
     It blurs the raw logits, while DARK blurs probabilities, and takes the logarithm after clipping to positive values.
     The peak of a parabola through these logarithms is therefore wrong for noisy logits. Use it to reproduce published

@@ -183,8 +183,7 @@ class Block(nn.Module):
 
 
 class Exchange(nn.Module):
-    """Multi-density exchange: anchors (B, J, C), one learned vector per joint, attend to voxels (B, K, E), then to each
-    other.
+    """Multi-density exchange: anchors (B, J, C), one per joint, attend to voxels (B, K, E), then to each other.
 
     Paper: A_{m-1} = MDE_m(A_m, f_m), from the coarsest level to the finest. Deviations: pre-norm; the bottleneck is
     read too (the released code begins one level above it); attention to voxels also depends on density, and through
