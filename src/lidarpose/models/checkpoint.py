@@ -72,8 +72,7 @@ class Header:
 
 
 def runs_of(card: dict) -> list[dict]:
-    """The cards of all training runs behind the weights: the last run's, that of the weights it started from, and so
-    on."""
+    """The cards of all training runs behind the weights: the last run first, then the run that it started from, etc."""
     init_card = card.get("init_card")
     return [card, *(runs_of(init_card) if isinstance(init_card, dict) else [])]
 

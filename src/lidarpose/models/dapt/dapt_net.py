@@ -101,8 +101,7 @@ class DaptOutputs:
     voted: Tensor | None = None
 
     def joints(self) -> Tensor:
-        """(B, J, 3) m, differentiable: the windowed mean of the heatmaps, as `decode.window`, or else the
-        coordinates."""
+        """(B, J, 3) m, differentiable: the windowed mean of the heatmaps, as `decode.window`; else the coordinates."""
         if self.logits_x is None:
             # a network has at least one of the two heads
             return cast("Tensor", self.coordinates)

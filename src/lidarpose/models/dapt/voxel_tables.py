@@ -174,8 +174,7 @@ def _one_a_voxel(key: np.ndarray, points: np.ndarray, grid: float) -> tuple[np.n
 
 
 def _grouped(key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sorted keys (n,) -> the distinct keys (m,), the start of each (m,), and the index of each key among these
-    (n,)."""
+    """Sorted keys (n,) -> the distinct keys (m,), the start of each (m,), and the number of each key's group (n,)."""
     is_start = np.diff(key, prepend=-1) > 0
     starts = np.flatnonzero(is_start)
     return key[starts], starts, np.cumsum(is_start) - 1

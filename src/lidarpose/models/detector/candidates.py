@@ -1,5 +1,4 @@
-"""Candidates: positions where a person may stand, with the points there, the sensor's view past them, and the
-surroundings.
+"""Candidates: positions where a person may stand, their points, the sensor's view past them, and the surroundings.
 
 `render` makes the network's inputs from them and describes these.
 """
@@ -118,8 +117,10 @@ class SceneIndex:
         return Candidates(**{name: np.concatenate(arrays, axis=int(name == "xyz")) for name, arrays in columns.items()})
 
     def pieces(self, centers: np.ndarray, margin: int = 0) -> Iterator[Candidates]:
-        """Candidates at centers (K, 3) m, in pieces of at most `CHUNK`, with a limited number of points to process at
-        once. Their range views have a margin of the given number of cells."""
+        """Candidates at centers (K, 3) m, in pieces of at most `CHUNK` with a limited number of points to process.
+
+        Their range views have a margin of the given number of cells.
+        """
         centers = np.asarray(centers, float)
         for start in range(0, len(centers), CHUNK):
             piece = centers[start : start + CHUNK]
@@ -159,8 +160,10 @@ class SceneIndex:
         )
 
     def _near(self, centers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Points within `RADIUS` of centers (K, 3) m and at the heights of the slices, grouped by center: their
-        positions relative to the center, x, y, z (m,) float32 m, and the number per center (K,)."""
+        """Points within `RADIUS` of centers (K, 3) m and at the heights of the slices, grouped by center.
+
+        Returns their positions relative to the center, x, y, z (m,) float32 m, and the number per center (K,).
+        """
         owner, start, size = self._runs(centers[:, :2] - self._corner)
         row = np.arange(size.sum()) + np.repeat(start - (np.cumsum(size) - size), size)
         sizes = np.bincount(owner, size, minlength=len(centers)).astype(np.int64)
@@ -203,7 +206,7 @@ class SceneIndex:
 
 
 def _thinned(count: np.ndarray, limit: int) -> tuple[slice | np.ndarray, np.ndarray]:
-    """Subsamples consecutive groups of `count` (K,) rows to `limit` each: the rows that remain, and the number per
+    """Subsamples consecutive groups of `count` (K,) rows to `limit` each: the rows that remain, and their number per
     group.
 
     Of a group with too many rows, rows at regular intervals remain.

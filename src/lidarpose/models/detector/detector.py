@@ -1,4 +1,4 @@
-"""Detects the people in a whole scan: a network scores proposals, and detections of the same person are merged."""
+"""Detects the people in a whole scan: a network scores proposals, and duplicate detections are suppressed."""
 
 import os
 from collections.abc import Callable
@@ -192,8 +192,10 @@ class Detector:
 
 
 def rows_that_matter(points: np.ndarray, origin: np.ndarray | None, places: np.ndarray) -> np.ndarray:
-    """The rows (k,) of points (n, 3) m that `SceneIndex` uses for a few positions (K, 3) m: the points around each, and
-    all points in its direction from a sensor at origin (3,) m."""
+    """The rows (k,) of points (n, 3) m that `SceneIndex` uses for a few positions (K, 3) m.
+
+    These are the points around each position, and all points in its direction from a sensor at origin (3,) m.
+    """
     is_used = np.zeros(len(points), bool)
     for rows in rows_near(places, points, _CONTEXT):
         is_used[rows] = True

@@ -1,5 +1,4 @@
-"""`DetectorNet`: whether there is a person at a candidate, and its exact position. Small enough for hundreds of
-candidates per scan.
+"""`DetectorNet`: whether there is a person at a candidate, and where. Fast enough for hundreds of candidates per scan.
 
 Legend: K candidates, C channels.
 """

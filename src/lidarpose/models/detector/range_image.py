@@ -1,5 +1,4 @@
-"""A range image of a scan: nearest and farthest return and their number by direction. Views of candidates are cut from
-it."""
+"""A range image of a scan: nearest and farthest return and their number by direction, from which views are cut."""
 
 from math import pi
 

@@ -24,8 +24,8 @@ from lidarpose.models.detector.range_image import BOTTOM, CELL, RANGE_CHANNELS, 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CandidateAugmentation:
-    """Augmentation of candidates in training. Points in the view frame are, in this order, mirrored, turned, scaled,
-    shifted.
+    """Augmentation of candidates in training. Points in the view frame are mirrored, turned, scaled, shifted, in this
+    order.
 
     Each field is an array with one entry per candidate (K), or one value for all. turn: rad about z; mirror: y to -y;
     scale; shift (K, 2) m; keep: share of points; noise: standard deviation along x, away from the sensor, m;
@@ -144,8 +144,7 @@ def _range_views(pixels: np.ndarray, has_sensor: np.ndarray, change: CandidateAu
 
 
 def _lose_returns(views: np.ndarray, share: np.ndarray, seeds: list[int]) -> None:
-    """Drops all but a share (K,) of the returns of range views (K, 4, H, W), in place: a cell that loses all is
-    empty."""
+    """Drops all but a share (K,) of the returns of range views (K, 4, H, W), in place; a cell may become empty."""
     share = share[:, None, None]
     count = np.exp2(views[:, 2] / (0.125 * 255)) - 1
     chance = np.empty(count.shape, np.float32)
