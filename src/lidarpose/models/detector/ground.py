@@ -117,7 +117,8 @@ def estimate_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Gro
     x, y = floors.positions()
     is_floor &= _is_low(np.where(is_floor, residual, np.nan), _CONE_SLOPE)
     if origin is not None:
-        # the vehicle that carries the sensor is surrounded by a hole, across which the steeper cone reaches hood and
+        # no ground is seen next to the vehicle that carries the sensor: across this hole, the steeper cone would accept
+        # hood and roof
         # roof
         is_near = np.hypot(x - origin[0], y - origin[1]) < _OWN_REACH
         is_floor &= ~is_near | _is_low(np.where(is_floor, residual, np.nan), _OWN_SLOPE)
