@@ -16,8 +16,7 @@ from lidarpose.errors import InputError, check_name
 
 # half width of `window` and of its torch equivalents around the mode, in bins
 HALF_WIDTH = 3
-# the released code's blur before `dark`: kernel size and standard deviation, in bins (the kernel from 20 * its sigma of
-# 2 bins)
+# the released code's blur before `dark`: kernel size and deviation, in bins (the kernel from 20 * its sigma of 2 bins)
 _TAPS, _SIGMA = 11, 2.0
 # range to which it clips the blurred logits before the logarithm, and the largest refinement that it accepts, in bins
 _CLIP, _MOST = (1e-3, 50.0), 0.5

@@ -231,8 +231,7 @@ class _Stem(nn.Module):
 
 
 class _Down(nn.Module):
-    """Pools voxels of one level to their parents: the mean of the children, plus a function of the parent's
-    position."""
+    """Pools voxels of one level to their parents: the children's mean, plus a function of the parent's position."""
 
     def __init__(self, channels: int, out_channels: int):
         super().__init__()

@@ -138,8 +138,7 @@ class StGcn(nn.Module):
         self.layers = nn.ModuleList(GraphLayer(widths[k], widths[k + 1], first=k == 0) for k in range(len(widths) - 1))
         self.output = nn.Conv2d(widths[-1], 6, 1)
         if not stock_initialization:
-            # start near the identity, as most joints are near it: from any other rotation, training takes several times
-            # as long
+            # start near the identity, as most joints are near it: from elsewhere, training takes several times as long
             self.output.bias = nn.Parameter(torch.eye(3)[:, :2].flatten())
 
     def forward(self, joints: Tensor, features: Tensor) -> Tensor:

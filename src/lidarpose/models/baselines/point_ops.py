@@ -1,7 +1,6 @@
 """Neighborhoods within padded clouds, in plain torch: farthest points, balls, nearest neighbors.
 
-Clouds are (B, N, 3) m with valid (B, N), False for padding. Distance matrices are dense: meant for some thousand
-points.
+Clouds are (B, N, 3) m with valid (B, N), False for padding. Distance matrices are dense: meant for thousands of points.
 """
 
 import torch

@@ -41,8 +41,7 @@ class Rows:
         return torch.where(index >= 0, index + start, -1)[valid]
 
     def pooled(self, grid: float) -> tuple["Rows", Tensor]:
-        """Cells of `grid` m, counted from each person's minimum, as rows at their points' mean; and the cell of each
-        row."""
+        """Cells of `grid` m, counted from each person's minimum, as rows at their points' mean; each row's cell."""
         low = segment_reduce(self.xyz, self.person, len(self.count), "amin")
         cell = ((self.xyz - low[self.person]) / grid).floor().long()
         # sorted by (person, x, y, z): one number per row, since torch.unique of rows is slow on CPUs
@@ -153,8 +152,7 @@ class GroupedVectorAttention(nn.Module):
         neighbor = neighbors[row, slot]
         offset = (xyz[neighbor] - xyz[row]).masked_fill(neighbor[:, None] < 0, 0)
         bias = self.position[1](self.position[0](offset))
-        # relation = key - query + bias, summed within groups; keys and queries are summed before they are copied to
-        # neighbors
+        # relation = key - query + bias, summed within groups; keys and queries before they are copied to neighbors
         key, query = self._summed(self.key(x)), self._summed(self.query(x))
         all_values = self.value(x)
         if self.missing_in_softmax:

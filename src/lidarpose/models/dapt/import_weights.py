@@ -56,7 +56,7 @@ def import_dapt(path: str | os.PathLike, config: DaptConfig | dict | str | None 
 
 
 def import_released(source: str | os.PathLike, out: str | os.PathLike, *, config: str | None = None) -> Header:
-    """Writes the authors' weights at `source` as a checkpoint of this package; config: as `import_dapt` takes it.
+    """Writes the authors' weights at `source` as a checkpoint of this package; config: as for `import_dapt`.
 
     Raises InputError, one line that names the file and the tensor, if anything does not fit; then nothing is written.
     """

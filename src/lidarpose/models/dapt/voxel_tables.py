@@ -259,7 +259,7 @@ def _people(
 
 
 def z_order(cells: np.ndarray) -> np.ndarray:
-    """cells (n, 3), of up to 17 bits an axis -> (n,) int64 Z-order (Morton) codes, x the most significant.
+    """cells (n, 3), of up to 17 bits per axis -> (n,) int64 Z-order (Morton) codes, x the most significant.
 
     A parent's code is the child's code without its last three bits.
     """

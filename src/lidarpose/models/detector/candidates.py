@@ -29,8 +29,7 @@ _MOST_IN_CELL, _MOST_AT_ONCE = 10_000, 4_000_000
 # candidates that are rendered at a time
 CHUNK = 64
 _LEAST_DISTANCE = 0.5
-# heights above the ground: band whose filled slices are counted, m, number of its slices, and limit of "near the
-# ground", m
+# heights above the ground: band whose filled slices are counted, m; number of slices; limit of "near the ground", m
 _BAND, _BAND_SLICES, _NEAR_GROUND = (0.3, 2.1), 6, 0.2
 # number of ones in each byte; numpy can count them from 2.0 on
 _BIT_COUNTS = np.array([byte.bit_count() for byte in range(256)], np.uint8)
@@ -206,8 +205,7 @@ class SceneIndex:
 
 
 def _thinned(count: np.ndarray, limit: int) -> tuple[slice | np.ndarray, np.ndarray]:
-    """Subsamples consecutive groups of `count` (K,) rows to `limit` each: the rows that remain, and their number per
-    group.
+    """Subsamples consecutive groups of `count` (K,) rows to `limit` each: remaining rows, and their number per group.
 
     Of a group with too many rows, rows at regular intervals remain.
     """
@@ -254,7 +252,7 @@ def _draw_maps(cells: np.ndarray, heights: np.ndarray, shape: tuple[int, ...]) -
 
 
 def suppress_near(centers: np.ndarray, strength: np.ndarray, radius: float) -> np.ndarray:
-    """Indices of the candidates that remain, strongest first, if of two nearer than `radius` the weaker is suppressed.
+    """Indices of the candidates that remain, strongest first: of two nearer than `radius`, the weaker is suppressed.
 
     centers: (K, 2 or 3) m, of which x and y are used; strength (K,); radius m.
     """

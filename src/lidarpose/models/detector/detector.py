@@ -30,8 +30,7 @@ _STRAY, _NEARLY_ALL = 100.0, (0.1, 99.9)
 SAME = 0.15
 # distances from a person at which further people are searched, m; radius of the points that a proposal depends on, m
 _BESIDE, _COLUMN = (0.3, 0.85), 1.0
-# points used for a candidate: radius around it, m; half width of its view, m, plus a margin, rad; number of direction
-# bins
+# points used for a candidate: radius, m; half width of its view, m, plus a margin, rad; number of direction bins
 _CONTEXT, _VIEW, _VIEW_MARGIN, _BINS = 8.0, 2.0, 0.1, 512
 # boxes: side, side for a person who is mounted, margin added to the height, m; and bounds of the network's outputs, m
 _SIDE, _MOUNTED_SIDE, _ROOM = 0.9, 1.1, 0.1

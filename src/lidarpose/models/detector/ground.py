@@ -22,8 +22,7 @@ _MOST_CELLS = 1024
 _CONE_SLOPE, _CONE_ROOM, _CONE_REACH = 0.12, 0.12, 16
 # the cone's slope near the sensor, and the distance up to which it applies, m
 _OWN_SLOPE, _OWN_REACH = 0.04, 4.0
-# a cell is supported if this many of the cells within 2 m are at its height, up to a tolerance, m, plus a slope, m per
-# m
+# a cell is supported if this many cells within 2 m are at its height; the tolerance, m, and its increase with distance
 _SUPPORT, _SUPPORT_ROOM, _SUPPORT_SLOPE = 3, 0.1, 0.15
 # or if it is nearer than this to the shared plane, m
 _NEAR_PLANE = 0.25
@@ -49,8 +48,7 @@ TILTED = 10.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ground:
-    """Heights (X, Y) float32 m of the ground at the centers of cells; corner (2,) m: of the first cell; cell: size,
-    m."""
+    """Heights (X, Y) float32 m of the ground at cells' centers; corner (2,) m: of the first cell; cell: size, m."""
 
     corner: np.ndarray
     heights: np.ndarray
@@ -117,9 +115,7 @@ def estimate_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Gro
     x, y = floors.positions()
     is_floor &= _is_low(np.where(is_floor, residual, np.nan), _CONE_SLOPE)
     if origin is not None:
-        # no ground is seen next to the vehicle that carries the sensor: across this hole, the steeper cone would accept
-        # hood and roof
-        # roof
+        # the vehicle that carries the sensor hides the ground around it: the steeper cone would accept hood and roof
         is_near = np.hypot(x - origin[0], y - origin[1]) < _OWN_REACH
         is_floor &= ~is_near | _is_low(np.where(is_floor, residual, np.nan), _OWN_SLOPE)
     # cells below the sensor, both heights without the slope; if the sensor is unknown, cells that are not tall

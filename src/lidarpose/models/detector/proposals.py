@@ -25,13 +25,11 @@ _TILE, _OVERLAP = 64.0, 1.0
 # of view; extent from its lowest to its highest point, m
 LEAST_POINTS = 5
 _LEAST_TOP, _LEAST_PART, _LEAST_EXTENT = 0.6, 0.45, 0.25
-# minimum extent of a head or shoulder that is visible above an occluder, and minimum height of its top above the
-# ground, m
+# minimum extent of a head or shoulder visible above an occluder, and minimum height of its top above the ground, m
 _LEAST_HEAD, _HEAD_TOP = 0.08, 1.1
 # counts are summed over this many cells to each side
 _SUMMED = 1
-# radii in cells of the disc and the two rings around it from which a column's features are computed, and the number of
-# features
+# radii in cells of the disc and the two rings around it that give a column's features, and the number of features
 _RINGS, FEATURES = (3, 6, 9), 13
 # cells to each side: of a peak's neighborhood, of the mean shift, of a candidate's column, of the grid's margin
 _PEAK, _SHIFT, _COLUMN, _MARGIN = 2, 2, 3, 16
@@ -202,8 +200,7 @@ def _peaks(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> tuple[np.ndarra
 
 
 def _grids(number: int, size: int) -> np.ndarray:
-    """Zeros (number, size) float32 in memory that the thread reuses: allocating it takes longer than everything
-    else."""
+    """Zeros (number, size) float32 in memory that the thread reuses: allocation takes longer than everything else."""
     if number * size > len(getattr(_kept, "memory", ())):
         _kept.memory = np.empty(number * size, np.float32)
     grids = _kept.memory[: number * size].reshape(number, size)

@@ -24,8 +24,7 @@ from lidarpose.models.detector.range_image import BOTTOM, CELL, RANGE_CHANNELS, 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CandidateAugmentation:
-    """Augmentation of candidates in training. Points in the view frame are mirrored, turned, scaled, shifted, in this
-    order.
+    """Training augmentation of candidates. Points in the view frame are, in order, mirrored, turned, scaled, shifted.
 
     Each field is an array with one entry per candidate (K), or one value for all. turn: rad about z; mirror: y to -y;
     scale; shift (K, 2) m; keep: share of points; noise: standard deviation along x, away from the sensor, m;
