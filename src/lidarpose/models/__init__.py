@@ -1,7 +1,7 @@
-"""The kinds of network, and the weights that ship with them: their names, and where they lie. No torch, no numpy here.
+"""The kinds of network, and the names and paths of the bundled weights. No torch, no numpy here.
 
-A further network is a module that holds it and its configuration, an objective that trains it, a backend that runs it,
-and an entry in `NETWORKS`. Its checkpoints then are written, read and checked as all others.
+A new kind of network needs a module for the network and its configuration, an objective that trains it, a backend that
+runs it, and an entry in `NETWORKS`. Its checkpoints are then written, read and checked like all others.
 """
 
 import os
@@ -15,12 +15,12 @@ from lidarpose.errors import InputError, check_name
 
 @dataclass(frozen=True)
 class NetworkKind:
-    """Where the parts of a kind of network are defined, as "module:name": they are imported when first needed.
+    """Where the parts of a kind of network are defined, as "module:name"; they are imported on first use.
 
     config: a `models.config.Config` with `kind` (its key in `NETWORKS`), `name` (for messages), `joints` (names, in the
-    order of the outputs) and `layers` (a lower bound of its tensors), which raises InputError for what cannot be;
-    network: a module made from the config alone, which it keeps as `config`; objective: a
-    `train.objectives.objective.Objective`; backend: called with (network, header, device=, compile=), an
+    order of the outputs) and `layers` (a lower bound of the number of its tensors), which raises InputError for invalid
+    settings; network: a module built from the config alone, which it stores as `config`; objective: a
+    `train.objectives.objective.Objective`; backend: called with (network, header, device=, compile=), returns an
     `inference.backend.Backend`.
     """
 
@@ -30,7 +30,7 @@ class NetworkKind:
     backend: str
 
     def part(self, name: str) -> Any:
-        """The class that `config`, `network`, `objective` or `backend` names."""
+        """The class or function that `config`, `network`, `objective` or `backend` names."""
         folder = {"objective": "train.objectives", "backend": "inference"}.get(name, "models")
         module, _, attribute = getattr(self, name).partition(":")
         return getattr(import_module(f"lidarpose.{folder}.{module}"), attribute)
@@ -43,8 +43,8 @@ def _baseline(name: str, objective: str, backend: str) -> NetworkKind:
 
 _FRAMES = ("baseline_objective:BaselineObjective", "BaselineBackend")
 _CLIPS = ("baseline_objective:ClipObjective", "ClipBackend")
-# by the name that checkpoints give, modules of `models`, `train.objectives` and `inference`: this package's own, the
-# paper's, those that the paper compares with, and one that finds people and poses nobody
+# by their names in checkpoints, with modules of `models`, `train.objectives` and `inference`: this package's own
+# network, the paper's, the baselines that the paper compares with, and a detector, which predicts no poses
 NETWORKS = {
     "pose": NetworkKind(
         "config:NetworkConfig", "posenet:PoseNet", "posenet_objective:PoseNetObjective", "torch_backend:TorchBackend"
@@ -66,27 +66,27 @@ NETWORKS = {
 }
 
 BUNDLED = ("tiny", "small")
-# what is taken where nothing is named: the best whose two files are at most 6 MB
+# the default: the best network whose two files have at most 6 MB
 DEFAULT = "small"
-# the network that tells people from what the detector takes for people; it poses nobody
+# the network that rejects the detector's false positives; it predicts no poses
 VERIFIER = "verifier"
-# the same, for help texts
+# the names of `BUNDLED`, for help texts
 NAMES = ", ".join(f"{name} (default)" if name == DEFAULT else name for name in BUNDLED)
 
 
 def bundled_path(name: str = DEFAULT, suffix: str = ".safetensors") -> Path:
-    """Where the package keeps a bundled checkpoint, or with the suffix .onnx its exported twin."""
+    """Path of a bundled checkpoint, or, with the suffix .onnx, of its exported network."""
     check_name("bundled weights", name, BUNDLED)
     return weights_file(f"{name}{suffix}")
 
 
 def weights_file(name: str) -> Path:
-    """Where the package keeps a file of weights."""
+    """Path of a weights file in the package."""
     return Path(str(resources.files("lidarpose.models") / "weights" / name))
 
 
 def weights_path(weights: str | os.PathLike) -> Path:
-    """The file that a name of bundled weights or a path means. Raises InputError for an unknown name."""
+    """The path for a name of bundled weights, or the given path. Raises InputError for an unknown name."""
     try:
         name = os.fsdecode(weights)
     except TypeError:

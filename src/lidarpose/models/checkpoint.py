@@ -1,11 +1,11 @@
-"""Weights on disk: one safetensors file that describes itself. Its header is read without torch.
+"""Checkpoints: a self-describing safetensors file. Its header is read without torch.
 
 The metadata of a checkpoint hold two entries. "lidarpose" is JSON: schema, package version, the kind of network, the
-network's configuration, and "card": what it was trained with (command, seed, people seen) and what it scores.
+network's configuration, and "card": how it was trained (command, seed, number of samples) and its scores.
 "lidarpose.sha256" is a digest of everything else in the file. An exported ONNX file carries the same entries.
 
-Loading is strict: the digest must fit, every tensor must be there, no other, each of its shape and finite. Files are
-read, not mapped: a mapped file that is cut off meanwhile would end the process.
+Loading is strict: the digest must match, and the file must hold exactly the expected tensors, each finite and of the
+expected shape. Files are read, not memory-mapped: truncating a mapped file would crash the process.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ ENTRY, DIGEST = "lidarpose", "lidarpose.sha256"
 SCHEMA = "lidarpose.checkpoint/2"
 _FAMILY = SCHEMA.rpartition("/")[0]
 _EXPECTED = "a checkpoint (.safetensors)"
-# bytes: what safetensors allows
+# largest header that safetensors allows, bytes
 _MOST_HEADER = 100_000_000
 _AGAIN = "get the file again"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Header:
-    """What a checkpoint says of itself. config: as `models.NetworkKind` says; card: plain JSON values; version: the
-    package's that wrote it."""
+    """The description of a checkpoint. config: see `models.NetworkKind`; card: plain JSON values; version: of the
+    package that wrote the file."""
 
     config: Any
     card: dict
@@ -56,7 +56,7 @@ class Header:
 
     @property
     def skeleton(self) -> Skeleton:
-        """The joints that the network predicts. Raises InputError for a network whose joints make up no skeleton."""
+        """The largest skeleton that the network's joints contain. Raises InputError if they contain none."""
         names = self.config.joints
         candidates = [candidate for candidate in SKELETONS.values() if set(candidate.joints) <= set(names)]
         if not candidates:
@@ -72,7 +72,7 @@ class Header:
 
 
 def runs_of(card: dict) -> list[dict]:
-    """The cards of the runs that made weights: the last one's, that of the weights it began with, and so on."""
+    """The cards of all training runs behind the weights: the last run first, then the run that it started from, etc."""
     init_card = card.get("init_card")
     return [card, *(runs_of(init_card) if isinstance(init_card, dict) else [])]
 
@@ -81,19 +81,19 @@ def runs_of(card: dict) -> list[dict]:
 
 
 def read_header(path: str | os.PathLike) -> Header:
-    """The header of a checkpoint. Raises InputError where the file is not a checkpoint of this package."""
+    """The header of a checkpoint. Raises InputError if the file is not a checkpoint of this package."""
     return parse_header(path, SafetensorsFile.open(path).metadata.get(ENTRY))
 
 
 def parameter_count(path: str | os.PathLike) -> int:
-    """Numbers that a checkpoint holds. Raises InputError as `read_header` does."""
+    """Number of values in a checkpoint's tensors. Raises InputError as `read_header` does."""
     return sum(map(math.prod, SafetensorsFile.open(path).shapes.values()))
 
 
 def save_checkpoint(path: str | os.PathLike, network: nn.Module, *, card: dict, half: bool = False) -> None:
-    """Writes the network's weights and its card, whole or not at all; `half` stores them as float16.
+    """Writes the network's weights and its card, the whole file or nothing; `half` stores the weights as float16.
 
-    Raises InputError for weights that are not finite, or too large for float16: nothing could load them.
+    Raises InputError for weights that are not finite or too large for float16: the file could not be loaded.
     """
     import torch
     from safetensors.torch import save
@@ -101,7 +101,7 @@ def save_checkpoint(path: str | os.PathLike, network: nn.Module, *, card: dict, 
     header = Header(config=network.config, card=card).to_json()
     dtype = torch.float16 if half else torch.float32
     tensors = {
-        # counters stay whole numbers
+        # counters stay integers
         name: value.detach().to("cpu", dtype if value.is_floating_point() else value.dtype).contiguous()
         for name, value in network.state_dict().items()
     }
@@ -115,8 +115,7 @@ def save_checkpoint(path: str | os.PathLike, network: nn.Module, *, card: dict, 
 def load_checkpoint(path: str | os.PathLike) -> tuple[Any, Header]:
     """The network in evaluation mode, float32 on the CPU, and its header.
 
-    Warns of a file without a digest. Raises InputError that names the file and the tensor for anything that does not
-    fit.
+    Warns about a file without a digest. Raises InputError that names the file and the tensor if anything does not fit.
     """
     file = SafetensorsFile.open(path)
     has_digest = file.check_digest()
@@ -129,13 +128,13 @@ def load_checkpoint(path: str | os.PathLike) -> tuple[Any, Header]:
 
 
 def build(config: Any) -> nn.Module:
-    """A network of a configuration, its weights random."""
+    """A network of a configuration, with random weights."""
     return NETWORKS[config.kind].part("network")(config)
 
 
 @contextmanager
 def _float32() -> Iterator[None]:
-    """Whatever torch's default type is, float32 meanwhile."""
+    """Sets torch's default type to float32 within the context."""
     import torch
 
     default_type = torch.get_default_dtype()
@@ -148,9 +147,9 @@ def _float32() -> Iterator[None]:
 
 @dataclass(frozen=True, kw_only=True)
 class SafetensorsFile:
-    """A safetensors file that is neither cut off nor something else.
+    """A safetensors file, checked to be complete.
 
-    metadata: texts by name; header: all of it; shapes: of the tensors, by the names that the network gives them;
+    metadata: strings by name; header: the whole JSON header; shapes: of the tensors, by the network's names for them;
     content: the whole file; prefix: of the names in the file.
     """
 
@@ -161,7 +160,7 @@ class SafetensorsFile:
 
     @classmethod
     def open(cls, path: str | os.PathLike, *, prefix: str = "") -> SafetensorsFile:
-        """prefix: dropped where all names of tensors begin with it. Raises InputError that names the damaged byte."""
+        """prefix: removed if all tensor names begin with it. Raises InputError that names the damaged byte."""
         problem = "is a folder" if os.path.isdir(path) else "" if os.path.isfile(path) else "does not exist"
         if problem:
             raise file_error(path, f"expected {_EXPECTED}, but it {problem}: check the path")
@@ -181,7 +180,7 @@ class SafetensorsFile:
         return {name.removeprefix(self.prefix): tuple(entry["shape"]) for name, entry in entries.items()}
 
     def check_digest(self) -> bool:
-        """Whether the header has a digest. Raises InputError where it is not the content's."""
+        """Whether the header has a digest. Raises InputError if the digest does not match the content."""
         expected = self.metadata.get(DIGEST)
         if expected not in (None, _digest(self.header, _data_of(self.content))):
             raise file_error(self.path, DAMAGED)
@@ -190,9 +189,9 @@ class SafetensorsFile:
     def network(self, config: Any, *, source: str, remedy: str) -> Any:
         """The network of a configuration with the file's tensors, in evaluation mode.
 
-        source: where the configuration is from; remedy: what to do where it does not fit. Raises InputError for the
-        first tensor that is missing, unknown, of another shape, or not of finite floats where floats belong. Whatever
-        the configuration says, nothing is allocated for it before the file is known to hold it.
+        source: origin of the configuration, for messages; remedy: what to do if it does not fit. Raises InputError for
+        the first tensor that is missing, unknown, of another shape, or does not hold finite floats where floats are
+        expected. Whatever the configuration requests, nothing is allocated for it before the file is known to hold it.
         """
         import torch
 
@@ -211,15 +210,15 @@ class SafetensorsFile:
                 problem = f"tensor {name} should be {tuple(value.shape)} by {source}, got {shapes[name]}: {remedy}"
                 raise file_error(self.path, problem)
         state = self.load(expected)
-        # random weights come before the file's: who draws random numbers elsewhere does not see it
+        # building a network draws random weights: the fork leaves the global random state unchanged
         with _float32(), torch.random.fork_rng(devices=[]):
             network = build(config)
         network.load_state_dict(state)
         return network.eval()
 
     def load(self, wanted: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """The tensors in the types of those wanted. Raises InputError for anything but finite floats where a float is
-        wanted."""
+        """The wanted tensors, converted to the given tensors' types. Raises InputError for anything but finite floats
+        if a float is wanted."""
         from safetensors import SafetensorError
         from safetensors.torch import load
 
@@ -238,8 +237,8 @@ class SafetensorsFile:
 
 
 def _parse_safetensors(path: str | os.PathLike, content: bytes) -> dict:
-    """The header of a file: 8 bytes of a length, so much JSON, then the tensors. Raises InputError that says what is
-    wrong, and where."""
+    """The header of a file, which consists of 8 bytes of header length, the header as JSON, and the tensors. Raises
+    InputError with the problem and its position."""
     remedy = "it was not copied completely: get it again"
     size = len(content)
     if size < 8:
@@ -277,18 +276,18 @@ DAMAGED = "is damaged: its content does not fit the SHA-256 digest in its header
 
 
 def warn_without_digest(path: str | os.PathLike) -> None:
-    """Says that a file of weights is from before there were digests."""
+    """Warns that a weights file was written before digests were introduced."""
     remedy = "if it may be damaged, get it again or write it anew with this version"
     warnings.warn(f"{os.fspath(path)}: has no digest, so damage goes unnoticed: {remedy}", stacklevel=3)
 
 
 def with_digest(content: bytes) -> bytes:
-    """A safetensors file with the digest of its tensors and of the rest of its header in its metadata."""
+    """Adds a digest of the tensors and of the rest of the header to the metadata of a safetensors file."""
     data = _data_of(content)
     header = json.loads(content[8 : len(content) - len(data)])
     header["__metadata__"] = header.get("__metadata__", {}) | {DIGEST: _digest(header, data)}
     text = json.dumps(header, separators=(",", ":")).encode()
-    # tensors begin at a multiple of 8
+    # tensors must begin at a multiple of 8
     text += b" " * (-len(text) % 8)
     return struct.pack("<Q", len(text)) + text + bytes(data)
 
@@ -309,7 +308,7 @@ def _digest(header: dict, data: memoryview) -> str:
 
 
 def parse_header(path: str | os.PathLike, entry: str | None) -> Header:
-    """The header from its JSON entry, None where there is none; `path` names the file in errors. Raises InputError."""
+    """The header from its JSON entry, None if the file has none; `path` names the file in errors. Raises InputError."""
     if entry is None:
         raise file_error(
             path,
@@ -338,7 +337,7 @@ def parse_header(path: str | os.PathLike, entry: str | None) -> Header:
         return Header(version=str(header["version"]), config=config_class(**entries), card=card)
     except InputError as error:
         raise file_error(path, f"its header does not fit: {error}") from None
-    # a number of thousands of digits is a plain ValueError
+    # an integer with thousands of digits raises a plain ValueError
     except (KeyError, TypeError, AttributeError, RecursionError, ValueError) as error:
         reason = f"{type(error).__name__}: {error}"
         raise file_error(path, f"its header cannot be read ({reason}): {_AGAIN}, or train anew") from None

@@ -1,4 +1,4 @@
-"""What configurations of networks have in common, and the sizes of the package's own: one dial, the rest derived."""
+"""The base class of network configurations, and the configuration and named sizes of the package's own network."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -9,17 +9,17 @@ from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.models import VERIFIER
 from lidarpose.skeleton import BODY26, Skeleton, skeleton
 
-# heatmaps in a window about each joint's vote; over the whole person, as the paper's; or votes alone
+# heatmaps in a window around each joint's vote; over the whole person, as in the paper; or votes without heatmaps
 HEATMAPS = ("window", "full", "none")
 # width of a heatmap's bin, m
 BIN = 0.03
-# of any width, far above what anybody trains: a damaged file's header is to ask for nothing larger
+# upper limit of any width, far above any trained network: the header of a damaged file must not request more
 MOST = 16_384
 
 
 def check_counts(name: str, value: Any, count: int, *, least: int = 1, levels: str = "") -> tuple[int, ...]:
-    """So many whole numbers from `least` to `MOST`, as a tuple. Raises InputError for anything else; levels: what they
-    are of."""
+    """`count` integers from `least` to `MOST`, as a tuple. Raises InputError for anything else; levels: what the
+    entries stand for, for the message."""
     if isinstance(value, list | tuple) and len(value) == count:
         with suppress(InputError):
             return tuple(check_int(name, number, least=least, most=MOST) for number in value)
@@ -31,34 +31,34 @@ def is_number(value: object) -> bool:
 
 
 def at_least(least: int, default: Any = MISSING, *, levels: str = "") -> Any:
-    """A field of whole numbers from `least` on; levels: what those of a tuple are of."""
+    """A field of integers from `least` on; levels: what the entries of a tuple stand for, for messages."""
     return field(default=default, metadata={"least": least, "levels": levels})
 
 
 def probability(default: float) -> Any:
-    """A field of a number from 0 to below 1."""
+    """A field for a number from 0 to below 1."""
     return field(default=default, metadata={"probability": True})
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config:
-    """The configuration of a network, checked as its fields declare: whole numbers from 1 (see `at_least`) to `MOST`,
-    numbers above 0 (see `probability`), true or false; lists become tuples. Raises InputError for anything else."""
+    """The configuration of a network. Its fields are checked by their declarations: integers from 1 (see `at_least`) to
+    `MOST`, numbers above 0 (see `probability`), booleans; lists become tuples. Raises InputError for anything else."""
 
     kind: ClassVar[str] = ""
 
     @property
     def poses(self) -> bool:
-        """Whether it predicts joints."""
+        """Whether the network predicts joints."""
         return bool(getattr(self, "joints", ()))
 
     @property
     def columns(self) -> list[int]:
-        """Columns of body26 that its joints are."""
+        """Index of each of the network's joints in body26."""
         return [BODY26.index(joint) for joint in getattr(self, "joints", ())]
 
     def order_in(self, skeleton: Skeleton) -> list[int]:
-        """For each joint of a skeleton that has no others, its place among the network's joints."""
+        """Index of each joint of a skeleton among the network's joints, which must include them all."""
         joints = getattr(self, "joints", ())
         return [joints.index(joint) for joint in skeleton.joints]
 
@@ -67,12 +67,12 @@ class Config:
             object.__setattr__(self, f.name, _checked(f, _as_tuple(getattr(self, f.name))))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values, for a file's header: the constructor reads them back, from JSON too."""
+        """Plain values for a file's header; the constructor accepts them, also after a JSON round trip."""
         return asdict(self)
 
     @staticmethod
     def renamed(entries: dict[str, Any]) -> dict[str, Any]:
-        """A file's entries under today's names."""
+        """A file's entries under their current names."""
         return entries
 
 
@@ -81,7 +81,7 @@ def _as_tuple(value: Any) -> Any:
 
 
 def _checked(f: Field, value: Any) -> Any:
-    """A setting as its field declares it; tuples of free length are for the configuration itself to check."""
+    """A setting, checked by its field's declaration; the configuration class checks tuples of free length itself."""
     least, type_args = f.metadata.get("least", 1), get_args(f.type)
     if f.type is int:
         return check_int(f.name, value, least=least, most=MOST)
@@ -100,7 +100,7 @@ def _checked(f: Field, value: Any) -> Any:
 
 
 def check_joints(joints: Any) -> None:
-    """Raises InputError unless these are names of body26's joints, each once."""
+    """Raises InputError unless `joints` are distinct joint names of body26."""
     if not isinstance(joints, tuple) or not joints or len(set(joints)) != len(joints):
         raise InputError(f"joints must be joint names, each once, got {joints!r}")
     for joint in joints:
@@ -111,11 +111,11 @@ def check_joints(joints: Any) -> None:
 class NetworkConfig(Config):
     """Widths and depths of a `PoseNet`.
 
-    channels: of the fine, mid and coarse level; head_channels: a head of attention; blocks: attention blocks (mid
-    encoder, coarse, mid decoder); grid: edge of a fine voxel in meters (mid and coarse: 2 and 4 times); max_voxels:
-    fine voxels a person at the most; parts: body parts and 0; heatmap: one of `HEATMAPS`; convolution: channels
-    of the submanifold convolutions before the blocks of the mid and coarse level, 0 for none; person: whether it says
-    if a crop shows a person, and a second one.
+    channels: of the fine, mid and coarse level; head_channels: channels per attention head; blocks: attention blocks
+    (mid encoder, coarse, mid decoder); grid: edge of a fine voxel in meters (mid and coarse: 2 and 4 times as wide);
+    max_voxels: maximum number of fine voxels per person; parts: number of part classes, including 0 for background;
+    heatmap: one of `HEATMAPS`; convolution: channels of the submanifold convolutions before the blocks of the mid and
+    coarse level, 0 for none; person: whether the network predicts if a crop shows a person, and if a second one.
     """
 
     kind: ClassVar[str] = "pose"
@@ -133,7 +133,7 @@ class NetworkConfig(Config):
     person: bool = False
 
     def __post_init__(self):
-        # false in files of before it was a number
+        # False in old files, in which this setting was a boolean
         if self.convolution is False:
             object.__setattr__(self, "convolution", 0)
         super().__post_init__()
@@ -149,7 +149,7 @@ class NetworkConfig(Config):
 
     @property
     def poses(self) -> bool:
-        """Whether it learned to predict joints."""
+        """Whether the network was trained to predict joints."""
         return self.size != VERIFIER
 
     @property
@@ -158,7 +158,7 @@ class NetworkConfig(Config):
 
     @property
     def layers(self) -> int:
-        """Blocks of all levels."""
+        """Number of blocks at all levels."""
         return sum(self.blocks)
 
 

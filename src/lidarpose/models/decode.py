@@ -1,11 +1,11 @@
-"""From 1D heatmaps to positions: the decoders, for whoever has logits as an array. Numpy only.
+"""Decoders from 1D heatmaps to positions, for logits as arrays. Numpy only.
 
 Legend: ... leading axes (people, joints, axes of space), W bins.
 
-A decoder takes logits (..., W) and says where bin 0 lies (`low`) and how far apart bins are (`step`), in meters:
-position = low + index * step. That serves both conventions of bins. The released DAPT code puts a bin at its left edge,
-index = (position - lo) * bins / (hi - lo), so low = lo and step = (hi - lo) / bins. A heatmap whose bins are known by
-their middles has low = lo + step / 2.
+A decoder takes logits (..., W), the position of bin 0 (`low`) and the spacing of bins (`step`), in meters:
+position = low + index * step. This covers both conventions for bins. The released DAPT code places a bin at its left
+edge, index = (position - lo) * bins / (hi - lo), so low = lo and step = (hi - lo) / bins. For a heatmap whose bins are
+given by their centers, low = lo + step / 2.
 """
 
 from collections.abc import Callable
@@ -14,30 +14,30 @@ import numpy as np
 
 from lidarpose.errors import InputError, check_name
 
-# half width of `window`, and of its twins in torch, about the mode, in bins
+# half width of `window` and of its torch equivalents around the mode, in bins
 HALF_WIDTH = 3
-# the released code's blur before `dark`: kernel and deviation, in bins (the kernel from 20 * its sigma of 2 bins)
+# the released code's blur before `dark`: kernel size and deviation, in bins (the kernel from 20 * its sigma of 2 bins)
 _TAPS, _SIGMA = 11, 2.0
-# what it clips the blurred logits to before their logarithm, and the refinement it does not believe, in bins
+# range to which it clips the blurred logits before the logarithm, and the largest refinement that it accepts, in bins
 _CLIP, _MOST = (1e-3, 50.0), 0.5
 
 Decoder = Callable[..., np.ndarray]
 
 
 def argmax(logits: np.ndarray, *, low: float | np.ndarray, step: float | np.ndarray) -> np.ndarray:
-    """logits (..., W) -> (...) m: the peak's bin.
+    """logits (..., W) -> (...) m: position of the bin with the peak.
 
-    Paper: "Heatmap decoder for joints", the peak mapped back through range and bins. Raises InputError for no bins.
+    Paper: "Heatmap decoder for joints", the peak mapped back through range and bins. Raises InputError without bins.
     """
     return low + _checked(logits).argmax(-1) * step
 
 
 def dark(logits: np.ndarray, *, low: float | np.ndarray, step: float | np.ndarray) -> np.ndarray:
-    """logits (..., W) -> (...) m: the released code's refinement of the peak (DARK, Zhang et al. 2020), to the letter.
+    """logits (..., W) -> (...) m: the released code's exact refinement of the peak (DARK, Zhang et al. 2020).
 
-    It blurs the raw logits, where DARK blurs probabilities, and takes the logarithm of what is clipped to be positive,
-    so that the peak of a parabola through the logarithms is off where logits are noisy: kept to reproduce published
-    figures, `window` is better. Steps of more than half a bin are dropped. Raises InputError for no bins.
+    It blurs the raw logits, while DARK blurs probabilities, and takes the logarithm after clipping to positive values.
+    The peak of a parabola through these logarithms is therefore wrong for noisy logits. Use it to reproduce published
+    figures; `window` is more accurate. Refinements of more than half a bin are dropped. Raises InputError without bins.
     """
     logits = _checked(logits)
     mode = logits.argmax(-1)
@@ -45,7 +45,7 @@ def dark(logits: np.ndarray, *, low: float | np.ndarray, step: float | np.ndarra
     half_width = _TAPS // 2
     kernel = np.exp(-0.5 * (np.arange(-half_width, half_width + 1) / _SIGMA) ** 2)
     kernel /= kernel.sum()
-    # only the five bins about the mode are asked for; beyond an edge its own value is repeated
+    # only the five bins around the mode are needed; beyond an edge, the value of the edge bin is repeated
     window_bins = np.clip(mode[..., None] + np.arange(-2, 3), 0, bins - 1)
     padded = np.pad(logits, [(0, 0)] * (logits.ndim - 1) + [(half_width, half_width)])
     taps = window_bins[..., None] + np.arange(_TAPS)
@@ -60,8 +60,9 @@ def dark(logits: np.ndarray, *, low: float | np.ndarray, step: float | np.ndarra
 def window(logits: np.ndarray, *, low: float | np.ndarray, step: float | np.ndarray) -> np.ndarray:
     """logits (..., W) -> (...) m: the mean position under the softmax of the bins within `HALF_WIDTH` of the mode.
 
-    A mean over all bins would fall between the two peaks of a left/right doubt. The window has as many bins on either
-    side: one that an edge cuts would lean inwards, so near an edge it is narrower. Raises InputError for no bins.
+    If left and right are ambiguous, a mean over all bins would fall between the two peaks. The window is symmetric
+    about the mode, and thus narrower near an edge: a window truncated at the edge would bias the mean inwards. Raises
+    InputError without bins.
     """
     logits = _checked(logits)
     bins = logits.shape[-1]
@@ -78,7 +79,7 @@ def sigmoid(logit: np.ndarray) -> np.ndarray:
 
 
 def out_of_range(logits: np.ndarray) -> np.ndarray:
-    """logits (..., W) -> (...) bool: the mode lies in an outermost bin, so the truth may lie beyond the heatmap."""
+    """logits (..., W) -> (...) bool: the mode is an outermost bin, so the true position may lie outside the heatmap."""
     logits = _checked(logits)
     mode = logits.argmax(-1)
     return (mode == 0) | (mode == logits.shape[-1] - 1)

@@ -1,4 +1,4 @@
-"""Networks as files that run elsewhere: ONNX, or a program of `torch.export`. Checked before they are written."""
+"""Exports networks to ONNX or to a program of `torch.export`. Results are checked before they are written."""
 
 import contextlib
 import copy
@@ -29,29 +29,29 @@ from lidarpose.models.onnx import (
 )
 from lidarpose.models.posenet import ArrayModule, PoseNet
 
-# of each format, the suffix of its files
+# file suffix of each format
 FORMATS = {"onnx": ".onnx", "torch": ".pt2"}
 _OPSET = 18
-# points a person: of the example that is traced, where 0 and 1 would be taken for constants, and of what is checked
+# points per person: of the traced example, in which 0 and 1 would become constants, and of the checked examples
 _TRACED, _CHECKED = (300, 60, 700), ((1, 2000, 37, 0, 9), (1,))
-# an exported network may differ from torch's by rounding; its logits are of order ten
+# an exported network may differ from torch by rounding; its logits are of order ten
 _TOLERANCE = 1e-3
-# an array of fewer numbers is not worth a node
+# an array with fewer values is not worth a cast node
 _WORTH = 64
 
 
 def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = "onnx") -> None:
-    """Writes a checkpoint as a file of another format, computing in float32, whole or not at all.
+    """Exports a checkpoint to a file of another format that computes in float32; writes the whole file or nothing.
 
     Args:
         weights: a name of bundled weights, or the path of a checkpoint.
-        format: "onnx", a self-contained file that ONNX Runtime and this package run without torch, no larger than the
-            checkpoint where that keeps float16; or "torch", a program (.pt2) for `torch.export.load`. Both take any
-            number of people and points; docs/use.md, "Exported networks", tells inputs and outputs.
+        format: "onnx", a self-contained file that ONNX Runtime and this package run without torch, no larger than a
+            float16 checkpoint; or "torch", a program (.pt2) for `torch.export.load`. Both take any number of people and
+            points; docs/use.md, "Exported networks", describes inputs and outputs.
 
     Raises:
-        InputError: a file that is no checkpoint of this package's own networks, and an `out` that ends in another
-            suffix than `FORMATS` says. MissingExtra: without onnx.
+        InputError: the file is not a checkpoint of this package's own networks, or the suffix of `out` is not the one
+            in `FORMATS`. MissingExtra: onnx is not installed.
     """
     check_name("format", format, FORMATS)
     weights = weights_path(weights)
@@ -66,7 +66,7 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
             f"{os.fspath(weights)}: the network {network.config.name} is not offered as {format}: "
             "it runs with torch, and the package's own networks (tiny, small, base) are exported"
         )
-    # tracing takes a minute
+    # before tracing, which takes a minute
     check_writable(out)
     metadata = {ENTRY: header.to_json(), SOURCE: content_digest(weights, expected="a checkpoint")}
     if format == "onnx":
@@ -90,10 +90,10 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
 
 
 def export_detector(network: DetectorNet, out: str | os.PathLike, *, card: dict) -> None:
-    """Writes a detector as ONNX, its weights as float16, whole or not at all.
+    """Exports a detector as ONNX with float16 weights; writes the whole file or nothing.
 
-    card: what its header says, see `detector.open_detector`. Raises MissingExtra without onnx, LidarPoseError where the
-    file does not give what the network does.
+    card: of its header, see `detector.open_detector`. Raises MissingExtra without onnx, LidarPoseError if the outputs
+    of the file are not those of the network.
     """
     check_suffix(out, FORMATS["onnx"])
     check_writable(out)
@@ -114,14 +114,14 @@ def export_detector(network: DetectorNet, out: str | os.PathLike, *, card: dict)
 
 
 def trace(network: PoseNet) -> torch.export.ExportedProgram:
-    """The network as a program whose numbers of people and rows are free."""
+    """The network as a program with dynamic numbers of people and rows."""
     arrays = _people(network, _TRACED)
     dynamic_shapes = tuple(dict.fromkeys(axes, torch.export.Dim.DYNAMIC) for axes in _axes(arrays))
     module = ArrayModule(network.eval(), tuple(arrays))
     with torch.no_grad():
         program = torch.export.export(module, _tensors(arrays), dynamic_shapes=(dynamic_shapes,))
     for node in program.graph.nodes:
-        # paths of the machine that traced it
+        # it holds paths of the machine that traced the network
         node.meta.pop("stack_trace", None)
     return program
 
@@ -142,8 +142,8 @@ def module_to_onnx(
     outputs: Sequence[str],
     metadata: dict[str, str],
 ) -> bytes:
-    """A module of tensors as the content of an ONNX file. axes: of each argument, those of free length and their names.
-    Raises MissingExtra without onnx or onnxscript."""
+    """A module with tensor arguments as the content of an ONNX file. axes: of each argument, the dynamic axes and their
+    names. Raises MissingExtra without onnx or onnxscript."""
     try:
         import onnx
         import onnxscript  # noqa: F401
@@ -162,7 +162,7 @@ def module_to_onnx(
         )
     assert program is not None, "of an export that names no file"
     model = program.model_proto
-    # where each node was traced from: a third of the file, and paths of the machine that made it
+    # the source of each traced node: a third of the file, with paths of the machine that made it
     for node in [*model.graph.node, *(node for function in model.functions for node in function.node)]:
         del node.metadata_props[:]
         node.ClearField("doc_string")
@@ -177,7 +177,7 @@ def module_to_onnx(
 
 
 def check(network: PoseNet, run: Callable[[dict[str, np.ndarray]], list[np.ndarray]]) -> None:
-    """Raises LidarPoseError where `run` does not give what the network does, on people of other sizes."""
+    """Raises LidarPoseError if `run` does not return the network's outputs for other numbers of people and points."""
     for sizes in _CHECKED:
         arrays = _people(network, sizes)
         with torch.inference_mode():
@@ -196,7 +196,7 @@ def _check_close(name: str, expected: np.ndarray, actual: np.ndarray) -> None:
 
 
 def _people(network: PoseNet, sizes: tuple[int, ...]) -> dict[str, np.ndarray]:
-    """What the network reads of random people of so many points."""
+    """The network's inputs for random people with the given numbers of points."""
     rng = np.random.default_rng(0)
     clouds = [rng.normal(0, (0.2, 0.2, 0.5), (size, 3)) for size in sizes]
     return voxelize_people(clouds, rng.normal(size=(len(sizes), 5)), network.config).arrays()
@@ -207,16 +207,16 @@ def _tensors(arrays: dict[str, np.ndarray]) -> tuple[Tensor, ...]:
 
 
 def _axes(arrays: dict[str, np.ndarray]) -> tuple[dict[int, str], ...]:
-    """What the axes count that may have any length: people, and rows of a level."""
+    """The dynamic axes of each array, with the names of what they count: people, and rows of a level."""
     levels = [name.partition(".")[0] if "." in name else "fine" for name in arrays]
     rows = [{0: "people", 1: f"{level}_rows"} for level in levels]
     return tuple({0: "people"} if name == "view" else axes for name, axes in zip(arrays, rows, strict=True))
 
 
 def _pack(graph) -> None:
-    """Keeps weights as float16 where that loses nothing, as of a checkpoint in float16: half the file.
+    """Stores weights as float16 where that is lossless, as for a float16 checkpoint, which halves the file.
 
-    A node brings each back to float32; runtimes do that once, when they open the file.
+    A node casts each back to float32; runtimes do that once, when they open the file.
     """
     from onnx import TensorProto, helper, numpy_helper
 
@@ -239,7 +239,7 @@ def _pack(graph) -> None:
 
 @contextlib.contextmanager
 def _silence():
-    """Without what the exporter logs and warns of; errors are raised all the same."""
+    """Suppresses the exporter's logs and warnings; errors are still raised."""
     disable_level = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:

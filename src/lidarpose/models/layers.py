@@ -1,7 +1,7 @@
-"""The network's layers: rotary positions, attention that knows where and how dense, exchange, pooling, joint heads.
+"""The network's layers: rotary positions, position- and density-aware attention, exchange, pooling, joint heads.
 
-Legend: B people, N rows (padded), K keys (padded), C channels, H heads, D channels a head, P rotated pairs a head, J
-joints, W heatmap bins.
+Legend: B people, N rows (padded), K keys (padded), C channels, H heads, D channels per head, P rotated pairs per head,
+J joints, W heatmap bins.
 """
 
 from collections.abc import Sequence
@@ -16,13 +16,13 @@ from lidarpose.models.decode import HALF_WIDTH
 # wavelengths in meters of the position features and the rotary encoding: from a fine voxel to twice a person's height
 WAVELENGTHS = (0.15, 0.25, 0.4, 0.65, 1.05, 1.7, 2.7, 4.4)
 PLACE_FEATURES = 3 + 6 * len(WAVELENGTHS)
-# half the width of a heatmap's range: about the vote, or about the person's center; meters
+# half width of a heatmap's range, meters: "window" is centered on the vote, "full" on the person's center
 REACH = {"window": 0.36, "full": 1.2}
 
 
 class DropPath(nn.Module):
-    """Stochastic depth: in training drops the branch (B, ...) of some of B with a probability, and scales the others up
-    to keep the mean."""
+    """Stochastic depth: in training drops the branch (B, ...) of each of the B entries with a probability, and scales
+    the others up to preserve the mean."""
 
     def __init__(self, probability: float):
         super().__init__()
@@ -37,7 +37,7 @@ class DropPath(nn.Module):
 
 
 class RotaryEmbedding:
-    """Where rows (B, N, 3) m stand, as sines and cosines that position features and rotary attention share."""
+    """Sines and cosines of the positions (B, N, 3) m of rows, shared by position features and rotary attention."""
 
     def __init__(self, position: Tensor):
         scale = position.new_tensor([2 * torch.pi / w for w in WAVELENGTHS])
@@ -53,8 +53,8 @@ class RotaryEmbedding:
     def rotate(self, x: Tensor, frequencies: Tensor) -> Tensor:
         """Rotary encoding of x (B, N, H, D): P pairs of each head are rotated by the row's phases.
 
-        The product of two rotated vectors depends on the difference of their places in meters alone. The D - 2 P
-        channels that are left see no place.
+        The dot product of two rotated vectors depends on their positions only through the difference in meters. The
+        remaining D - 2 P channels do not depend on position.
         """
         sin, cos = self._phases(frequencies)
         pairs = sin.shape[-1]
@@ -71,23 +71,23 @@ class RotaryEmbedding:
 
 
 def head_frequencies(heads: int, width: int) -> Tensor:
-    """(H, 1, P / 3) rad/m for heads of `width` channels, P = 3 * (width // 6): heads share out the wavelengths."""
+    """(H, 1, P / 3) rad/m for heads of `width` channels, P = 3 * (width // 6): heads cycle through the wavelengths."""
     count = width // 6
     frequencies = [2 * torch.pi / WAVELENGTHS[k % len(WAVELENGTHS)] for k in range(heads * count)]
     return torch.tensor(frequencies).view(heads, 1, count)
 
 
 def key_bias(valid: Tensor, dtype: torch.dtype) -> Tensor:
-    """valid (B, K) bool -> (B, 1, 1, K), 0 for a key to read and a large negative number for padding.
+    """valid (B, K) bool -> (B, 1, 1, K), 0 for a valid key and a large negative number for padding.
 
-    A person without any valid key attends to its padding evenly: finite, and discarded by the caller.
+    A person without any valid key attends uniformly to padding: the result is finite, and the caller discards it.
     """
     return torch.where(valid, 0.0, -1e4).to(dtype)[:, None, None, :]
 
 
 def attend(query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None = None, *, dropout: float = 0.0) -> Tensor:
-    """torch's scaled_dot_product_attention, always in float32 on a CPU: its gradient in bfloat16 takes five times as
-    long there."""
+    """torch's scaled_dot_product_attention; under autocast on a CPU in float32, since its gradient in bfloat16 takes
+    five times as long there."""
     if query.device.type == "cpu" and torch.is_autocast_enabled("cpu"):
         mask = mask if mask is None or mask.dtype == torch.bool else mask.float()
         with torch.autocast("cpu", enabled=False):
@@ -96,7 +96,7 @@ def attend(query: Tensor, key: Tensor, value: Tensor, mask: Tensor | None = None
 
 
 class Attention(nn.Module):
-    """Queries, keys, values and outputs of multi-head attention with rotary places."""
+    """Query, key, value and output layers of multi-head attention with rotary positions."""
 
     frequencies: Tensor
 
@@ -111,7 +111,7 @@ class Attention(nn.Module):
 
 
 class SelfAttention(Attention):
-    """Multi-head self-attention of rows (B, N, C), all of a person's to all, with rotary places."""
+    """Multi-head self-attention among all rows (B, N, C) of a person, with rotary positions."""
 
     def __init__(self, channels: int, heads: int):
         super().__init__(channels, heads, channels)
@@ -128,10 +128,10 @@ class SelfAttention(Attention):
 
 
 class CrossAttention(Attention):
-    """Attention of queries (B, J, C) to the voxels (B, K, E) of a level: by content, by place and by density.
+    """Attention of queries (B, J, C) to the voxels (B, K, E) of a level, by content, position and density.
 
-    A head's weight of a voxel is multiplied by (its number of points) ** density, a learned exponent a head: 0 reads
-    voxels alike, 1 reads points alike.
+    Each head multiplies the weight of a voxel by (its number of points) ** density, with one learned exponent per head:
+    0 weights all voxels equally, 1 weights all points equally.
     """
 
     def __init__(self, channels: int, heads: int, key_channels: int):
@@ -151,9 +151,9 @@ class CrossAttention(Attention):
         query = (query_places.rotate(query, self.frequencies) * query.shape[-1] ** -0.5).transpose(1, 2)
         key = places.rotate(self.key(keys).unflatten(-1, (self.heads, -1)), self.frequencies).transpose(1, 2)
         density_bias = self.density[:, None, None].to(bias.dtype) * log_count[:, None, None, :]
-        # few queries: written out, since the fused kernels give no gradient to a bias
+        # written out, since the fused kernels give no gradient to a bias; cheap for few queries
         weight = (query @ key.transpose(-2, -1) + (bias + density_bias)).softmax(-1).to(keys.dtype)
-        # weights sum to 1, so the mean of the values is the value of the mean: no voxel's own is needed
+        # weights sum to 1, so the mean of the values is the value of the mean: no value per voxel is needed
         mean_keys = (weight.flatten(1, 2) @ keys).unflatten(1, (self.heads, -1))
         values = self.value.weight.unflatten(0, (self.heads, -1))
         output = (mean_keys @ values.mT).transpose(1, 2).flatten(-2) + self.value.bias
@@ -161,14 +161,14 @@ class CrossAttention(Attention):
 
 
 class FeedForward(nn.Sequential):
-    """Linear, SiLU, Linear: C -> ratio C -> C. SiLU for a quarter of GELU's cost on a CPU."""
+    """Linear, SiLU, Linear: C -> ratio C -> C. SiLU costs a quarter of GELU on a CPU."""
 
     def __init__(self, channels: int, ratio: int = 2):
         super().__init__(nn.Linear(channels, ratio * channels), nn.SiLU(), nn.Linear(ratio * channels, channels))
 
 
 class Block(nn.Module):
-    """A pre-norm transformer block over the voxels of one level, attention over all of a person's rows."""
+    """A pre-norm transformer block over the voxels of one level, with attention among all rows of a person."""
 
     def __init__(self, channels: int, heads: int):
         super().__init__()
@@ -183,11 +183,12 @@ class Block(nn.Module):
 
 
 class Exchange(nn.Module):
-    """Multi-density exchange: anchors (B, J, C), a learned vector a joint, read voxels (B, K, E), then each other.
+    """Multi-density exchange: anchors (B, J, C), one per joint, attend to voxels (B, K, E), then to each other.
 
     Paper: A_{m-1} = MDE_m(A_m, f_m), from the coarsest level to the finest. Deviations: pre-norm; the bottleneck is
-    read too (the released code begins one level above it); voxels are read by place, rotary and relative to where the
-    anchor believes its joint to be, and by density; anchors keep one width, so it is the keys that are brought to it.
+    read too (the released code begins one level above it); attention to voxels also depends on density, and through
+    rotary encoding on the voxel's position relative to the anchor's current estimate of its joint; anchors keep one
+    width, so the keys are projected to it.
     """
 
     def __init__(self, channels: int, heads: int, voxel_channels: int):
@@ -218,8 +219,8 @@ class Exchange(nn.Module):
 class Convolution(nn.Module):
     """A residual submanifold convolution, 3 x 3 x 3, of rows (B, N, C) by a table of neighbors (B, N, 27).
 
-    The table holds row numbers, N where a cell is empty. After Point Transformer V3's conditional position encoding,
-    but that neighbors are seen through `narrow` channels: its cost is theirs.
+    The table holds row numbers, N for an empty cell. Follows Point Transformer V3's conditional position encoding,
+    except that neighbors are first projected to `narrow` channels, which determine the cost.
     """
 
     def __init__(self, channels: int, narrow: int):
@@ -231,7 +232,7 @@ class Convolution(nn.Module):
     def forward(self, rows: Tensor, neighbors: Tensor) -> Tensor:
         people, n, _ = rows.shape
         padded_rows = F.pad(self.narrow(self.norm(rows)), (0, 0, 0, 1)).flatten(0, 1)
-        # by row numbers of the whole batch: along dim 1 the gradient of gather is far slower on a CPU
+        # indexes rows of the flattened batch: the gradient of a gather along dim 1 is far slower on a CPU
         start = (n + 1) * torch.arange(people, device=rows.device)
         index = (neighbors + start[:, None, None]).flatten()
         return rows + self.mix(padded_rows.index_select(0, index).view(people, n, -1))
@@ -240,8 +241,8 @@ class Convolution(nn.Module):
 def membership(parent: Tensor, valid: Tensor, parents: int, dtype: torch.dtype) -> Tensor:
     """parent (B, N) int, valid (B, N) -> (B, parents, N): 1 where row n belongs to the parent voxel.
 
-    Pooling and unpooling are products with this matrix: on rows of a few hundred voxels that is several times faster
-    on a CPU than scattering, has the same gradient on every device, and exports.
+    Pooling and unpooling are products with this matrix: for a few hundred voxels per person that is several times
+    faster on a CPU than scattering, has the same gradient on every device, and can be exported.
     """
     index = torch.arange(parents, device=parent.device)
     return ((parent[:, None, :] == index[:, None]) & valid[:, None, :]).to(dtype)
@@ -251,38 +252,38 @@ def membership(parent: Tensor, valid: Tensor, parents: int, dtype: torch.dtype) 
 
 
 def bin_centers(bins: int, device: torch.device | None = None) -> Tensor:
-    """(W,) m: offsets from the heatmap's origin at the middle of each bin."""
+    """(W,) m: offset of each bin's center from the heatmap's origin."""
     return _offset(torch.arange(bins, device=device), bins)
 
 
 def _offset(position: Tensor, bins: int) -> Tensor:
-    """position (...) bins -> (...) m from the heatmap's origin, which is the middle of all bins."""
+    """position (...) bins -> (...) m from the heatmap's origin, which is the center of its range."""
     return (position + 0.5 - bins / 2) * BIN
 
 
 def decode(logits: Tensor) -> Tensor:
-    """logits (..., W) -> (...) m from the heatmap's origin: `mean_bin` as a length."""
+    """logits (..., W) -> (...) m from the heatmap's origin: `mean_bin` in meters."""
     return _offset(mean_bin(logits), logits.shape[-1])
 
 
 def mean_bin(logits: Tensor) -> Tensor:
     """logits (..., W) -> (...) bins: expectation of the softmax within `HALF_WIDTH` bins of its mode, fewer at an edge.
 
-    A mean over all bins would fall between the two peaks of a left/right doubt; the window keeps to one of them. It has
-    as many bins on either side of the mode: a window that an edge cuts would lean inwards. Computed in float32, since
-    half types cannot tell bins of the hundreds apart. Twin in numpy, for whoever has no torch: `decode.window`.
+    If left and right are ambiguous, a mean over all bins would fall between the two peaks; the window stays at one of
+    them. It is symmetric about the mode, since a window truncated at an edge would bias the mean inwards. Computed in
+    float32, since half types cannot distinguish bin indices in the hundreds. Equivalent in numpy: `decode.window`.
     """
     bins = logits.shape[-1]
     mode = logits.argmax(-1, keepdim=True)
     reach = torch.minimum(mode, bins - 1 - mode).clamp(max=HALF_WIDTH)
     index = torch.arange(bins, device=logits.device)
-    # finite: a softmax's gradient at -inf may not be a number
+    # finite, since the gradient of a softmax at -inf may be NaN
     weight = logits.float().masked_fill((index - mode).abs() > reach, -1e4).softmax(-1)
     return (weight * index).sum(-1)
 
 
 def encode(offset: Tensor, sigma: float, bins: int) -> Tensor:
-    """offset (...) m from the heatmap's origin -> (..., W): a Gaussian of `sigma` m over the bins, of sum 1."""
+    """offset (...) m from the heatmap's origin -> (..., W): a Gaussian of `sigma` m over the bins, with sum 1."""
     distance = (offset[..., None] - bin_centers(bins, offset.device)) / sigma
     return torch.softmax(-0.5 * distance**2, -1)
 
@@ -291,7 +292,8 @@ class VoteHead(nn.Module):
     """Every voxel votes for every joint: its position plus an offset, weighted by a softmax over the voxels.
 
     A voxel's offset is linear in its features, so the weighted mean of offsets is the offset of the weighted mean: no
-    voxel's own is ever needed. Offsets begin at zero, so an untrained head already puts joints among the points.
+    offset per voxel is needed. Offsets are initialized to zero, so an untrained head already places joints among the
+    points.
     """
 
     def __init__(self, channels: int, voxel_channels: int, joints: int):
@@ -304,7 +306,7 @@ class VoteHead(nn.Module):
         nn.init.zeros_(self.residual.bias)
 
     def forward(self, anchors: Tensor, voxels: Tensor, position: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
-        """Returns vote (B, J, 3) m and the voters' mean features, (B, J, C)."""
+        """Returns the vote (B, J, 3) m and the voters' mean features (B, J, C)."""
         query = self.query(anchors) * voxels.shape[-1] ** -0.5
         weight = torch.softmax(query @ self.key(voxels).transpose(1, 2) + bias[:, 0], -1)
         features = weight @ voxels
@@ -313,7 +315,7 @@ class VoteHead(nn.Module):
 
 
 class JointHead(nn.Module):
-    """Heatmaps, confidence, spread and visibility of each joint: from its anchor, its voters' features, its vote."""
+    """Heatmaps, confidence, spread and visibility of each joint, from its anchor, its voters' features and its vote."""
 
     def __init__(self, channels: int, voxel_channels: int, bins: int):
         super().__init__()
@@ -325,7 +327,7 @@ class JointHead(nn.Module):
         self.certainty = nn.Linear(2 * channels, 3)
 
     def forward(self, anchors: Tensor, voter_features: Tensor, vote: Tensor) -> tuple[Tensor, ...]:
-        """Returns heatmap (B, J, 3, W), of no bins (B, J, 1, 0); confidence, log_spread, visible (B, J)."""
+        """Returns heatmap (B, J, 3, W), or (B, J, 1, 0) without bins; confidence, log_spread, visible (B, J)."""
         features = self.norm(torch.cat([anchors, voter_features], -1))
         hidden = self.hidden(torch.cat([features, vote.detach()], -1))
         certainty = self.certainty(hidden).unbind(-1)
@@ -335,8 +337,9 @@ class JointHead(nn.Module):
 
 
 class PersonHead(nn.Module):
-    """Whether a crop shows a person, and a second one: from the means of anchors and voxels and what the joints' head
-    says of every joint. detach_inputs: no gradient reaches its inputs, which are the joints' alone."""
+    """Whether a crop shows a person, and whether it shows a second one: from the mean anchor, the mean voxel and the
+    certainties that `JointHead` predicts for every joint. detach_inputs: no gradient flows into its inputs, so the
+    joint losses alone train them."""
 
     detach_inputs = True
 

@@ -1,8 +1,8 @@
-"""How an exported network lies in an ONNX file, and how ONNX Runtime opens it. No torch.
+"""The layout of an exported network in an ONNX file, and how ONNX Runtime opens it. No torch.
 
-Inputs are a pyramid's arrays, "fine.position" by the name "in_fine_position": a bare "view" would be the name of a node
-too. Numbers of people and of rows are free. The file's metadata hold the checkpoint's header, the SHA-256 of the
-checkpoint that it was made from, and a digest: the SHA-256 of the file with zeros in the digest's place.
+Inputs are the arrays of a pyramid; "fine.position" is named "in_fine_position", since a bare "view" would also be the
+name of a node. The numbers of people and of rows are dynamic. The file's metadata hold the checkpoint's header, the
+SHA-256 of the source checkpoint, and a digest: the SHA-256 of the file with zeros in the digest's place.
 """
 
 import hashlib
@@ -22,20 +22,20 @@ from lidarpose.models.config import NetworkConfig
 from lidarpose.models.voxelize import VoxelPyramid, voxelize
 
 SOURCE = "lidarpose.source"
-# what stands for a digest while it is computed
+# placeholder for the digest while it is computed
 NO_DIGEST = "0" * 64
-# a tensor in a file of its own: the key of where that lies, as protocol buffers write it
+# marks a tensor in an external file: the key of its location, as protocol buffers encode it
 _EXTERNAL = b"\n\x08location\x12"
-# what every network gives, in this order
+# outputs of every network, in this order
 OUTPUTS = ("vote", "heatmap", "part", "confidence", "log_spread", "visible")
-# a network this small only waits for more threads than that
+# a network this small does not run faster on more threads than this
 _MOST_THREADS = 8
-# more are a mistake
+# a larger number must be a mistake
 _THREADS_LIMIT = 1024
 
 
 def voxelize_people(clouds: list[np.ndarray], view: np.ndarray | None, config: NetworkConfig) -> VoxelPyramid:
-    """The voxels of people's clouds (n, 3) m, each about its person's center, as `config` wants it; view (B, 5)."""
+    """Voxelizes clouds (n, 3) m, each centered on its person, with the settings of `config`; view (B, 5)."""
     return voxelize(
         np.concatenate([np.zeros((0, 3)), *clouds]),
         np.array([len(cloud) for cloud in clouds], np.int64),
@@ -48,29 +48,29 @@ def voxelize_people(clouds: list[np.ndarray], view: np.ndarray | None, config: N
 
 def input_name(name: str) -> str:
     """ "fine.position" -> "in_fine_position"."""
-    # as spelled in files that are out there
+    # the spelling in files that are already exported
     return "in_" + name.replace(".", "_").replace("neighbors", "neighbours")
 
 
 def usable_threads() -> int:
-    """Processors that this process may use, `_MOST_THREADS` at the most, and what OMP_NUM_THREADS says."""
-    # macOS and Windows cannot be asked
+    """Number of processors that this process may use, at most `_MOST_THREADS` and at most OMP_NUM_THREADS."""
+    # macOS and Windows do not report the processors of a process
     processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    # a list is of nested regions, the outermost first
+    # a list has one entry per level of nested regions, the outermost first
     bound = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()
     most = int(bound) if bound.isascii() and bound.isdecimal() else 0
     return min(processors, _MOST_THREADS, most or _MOST_THREADS)
 
 
 def thread_count(threads: int | None) -> int:
-    """So many threads, `usable_threads` for None. Raises InputError for a number that is none or far too large."""
+    """The given number of threads, `usable_threads` for None. Raises InputError unless it is 1 to `_THREADS_LIMIT`."""
     return usable_threads() if threads is None else check_int("threads", threads, least=1, most=_THREADS_LIMIT)
 
 
 def map_in_threads(function: Callable, parts: Sequence, threads: int) -> list:
-    """What a function makes of each part, several at once on so many threads.
+    """Applies a function to each part, on up to the given number of threads; results are in the order of the parts.
 
-    They last for the call: threads that stayed would not be there in a process forked later.
+    The threads end with the call: persistent threads would not exist in a process that is forked later.
     """
     count = min(threads, len(parts))
     if count < 2:
@@ -80,14 +80,14 @@ def map_in_threads(function: Callable, parts: Sequence, threads: int) -> list:
 
 
 def runtime() -> ModuleType:
-    """The module onnxruntime, without its telemetry. Raises InputError where it cannot be loaded, as for want of a
-    system library."""
-    # read when it is loaded: else it notes machine and process in ~/.cache and sends that to its maker
+    """The module onnxruntime, with its telemetry disabled. Raises InputError if it cannot be loaded, for example
+    because a system library is missing."""
+    # read on import: otherwise it records machine and process in ~/.cache and sends that to its vendor
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     try:
         return import_module("onnxruntime")
     except (ImportError, OSError) as error:
-        # its extension makes one of Ctrl-C
+        # its extension module turns Ctrl-C into such an error
         if isinstance(error.__cause__, KeyboardInterrupt):
             raise KeyboardInterrupt from None
         remedy = "reinstall it, pip install --force-reinstall onnxruntime"
@@ -95,21 +95,21 @@ def runtime() -> ModuleType:
 
 
 def open_session(content: bytes):
-    """An `onnxruntime.InferenceSession` of a file's content, whose runs take one thread each and may be several at
-    once. Raises what ONNX Runtime does."""
+    """An `onnxruntime.InferenceSession` of a file's content. Each run uses one thread, and several may run at once.
+    Raises the exceptions of ONNX Runtime."""
     module = runtime()
     settings = module.SessionOptions()
-    # networks this small gain little from several threads for one run, and much from several runs at once
+    # networks this small gain little from several threads per run, and much from several concurrent runs
     settings.intra_op_num_threads = settings.inter_op_num_threads = 1
-    # what is wrong is raised; the log would add lines of its own
+    # errors are raised; the log would only repeat them
     settings.log_severity_level = 4
     return module.InferenceSession(content, settings, providers=["CPUExecutionProvider"])
 
 
 def open_onnx(path: str | os.PathLike) -> tuple[Any, Header, str]:
-    """The session of an exported network, its header, and the digest of the checkpoint that it was made from.
+    """The session of an exported network, its header, and the digest of its source checkpoint.
 
-    Raises InputError as `open_network` does, and for a file that holds no network of poses.
+    Raises InputError as `open_network` does, and for a network of another kind than pose.
     """
     session, header = open_network(path)
     if not isinstance(header.config, NetworkConfig):
@@ -121,23 +121,23 @@ def open_onnx(path: str | os.PathLike) -> tuple[Any, Header, str]:
 def open_network(path: str | os.PathLike) -> tuple[Any, Header]:
     """The session of an exported network of any kind, and its header.
 
-    Warns of a file without a digest. Raises InputError, one line, for a file that is damaged, cut off, something else,
-    another program's ONNX, or one that keeps its weights elsewhere.
+    Warns about a file without a digest. Raises InputError, one line, for a file that is damaged, truncated, not ONNX,
+    another program's ONNX, or that stores its weights in external files.
     """
     content = read_bytes(path, expected="an ONNX file (.onnx)")
     if _EXTERNAL in content:
-        # they would be looked up in the current folder, whatever lies there
+        # those would be read from the current folder, whatever it contains
         raise file_error(path, "keeps its weights in other files: make one file of it with `lidarpose export`")
-    # a checkpoint begins with the length of its header in JSON
+    # a checkpoint begins with 8 bytes of length, followed by its JSON header
     if content[8:9] == b"{":
         raise file_error(path, "expected an ONNX file, got a checkpoint: make one of it with `lidarpose export`")
     has_digest = check_digest(path, content)
-    # what is wrong with it is not the file's fault
+    # outside the try: if ONNX Runtime cannot be loaded, the file is not at fault
     runtime()
     try:
         session = open_session(content)
     except Exception as error:
-        # its exceptions have no base of their own
+        # ONNX Runtime's exceptions have no base class of their own
         reason = " ".join(str(error).split())[:120]
         raise file_error(
             path,
@@ -151,7 +151,7 @@ def open_network(path: str | os.PathLike) -> tuple[Any, Header]:
 
 
 def check_names(path: str | os.PathLike, session: Any, inputs: Sequence[str], outputs: Sequence[str]) -> None:
-    """Raises InputError unless a session reads and gives arrays of these names."""
+    """Raises InputError unless the inputs and outputs of a session have exactly these names."""
     for kind, values, expected in (
         ("input", session.get_inputs(), inputs),
         ("output", session.get_outputs(), outputs),
@@ -163,13 +163,13 @@ def check_names(path: str | os.PathLike, session: Any, inputs: Sequence[str], ou
 
 
 def with_digest(content: bytes) -> bytes:
-    """An ONNX file whose entry `DIGEST` is `NO_DIGEST`, with the digest there."""
+    """Replaces `NO_DIGEST` in the entry `DIGEST` of an ONNX file with the file's digest."""
     start = _digest_start(content)
     return content[:start] + _digest(content, start) + content[start + len(NO_DIGEST) :]
 
 
 def check_digest(path: str | os.PathLike, content: bytes) -> bool:
-    """Whether a file has a digest. Raises InputError where it is not the content's."""
+    """Whether a file has a digest. Raises InputError if the digest does not match the content."""
     start = _digest_start(content)
     if start and content[start : start + len(NO_DIGEST)] != _digest(content, start):
         raise file_error(path, DAMAGED)
@@ -177,7 +177,7 @@ def check_digest(path: str | os.PathLike, content: bytes) -> bool:
 
 
 def _digest_start(content: bytes) -> int:
-    """Where the digest begins, 0 where there is none: a key, a tag and a length of one byte each, then its digits."""
+    """Offset of the digest, 0 without one. It follows its key, a tag of one byte and a length of one byte."""
     key = DIGEST.encode()
     key_start = content.rfind(key)
     return key_start + len(key) + 2 if key_start >= 0 else 0
@@ -191,7 +191,7 @@ def _digest(content: bytes, start: int) -> bytes:
 
 
 def output_names(config: NetworkConfig) -> tuple[str, ...]:
-    """What an exported network gives, in this order."""
+    """Names of an exported network's outputs, in order."""
     return (*OUTPUTS, "person") if config.person else OUTPUTS
 
 

@@ -1,4 +1,4 @@
-"""`PoseNet`: a point-transformer U-Net over voxels whose joint anchors gather evidence at every density level.
+"""`PoseNet`: a point-transformer U-Net over voxels whose joint anchors collect features at every density level.
 
 Legend: B people, F / M / N rows of the fine, mid and coarse level (padded), J joints, C channels, W heatmap bins.
 """
@@ -33,14 +33,15 @@ from lidarpose.models.onnx import output_names
 from lidarpose.models.voxelize import VoxelLevel
 from lidarpose.skeleton import skeleton
 
-# what a fine voxel knows besides its place: offset in the cell (3), deviation (3), log counts of itself and its parents
+# features of a fine voxel besides its position: offset in the cell (3), deviation (3), log counts of itself, its parent
+# and its grandparent (3)
 VOXEL_FEATURES = 9
 VIEW_FEATURES = 5
 
 
 @dataclass(frozen=True, kw_only=True)
 class Batch:
-    """What the network reads: the tables of a `voxelize.VoxelPyramid` as tensors."""
+    """The network's inputs: the tables of a `voxelize.VoxelPyramid` as tensors."""
 
     fine: VoxelLevel[Tensor]
     mid: VoxelLevel[Tensor]
@@ -51,7 +52,7 @@ class Batch:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray | Tensor], device: torch.device | str = "cpu") -> "Batch":
-        """From `VoxelPyramid.arrays`; names that a batch does not have are left out."""
+        """From `VoxelPyramid.arrays`; names that are not fields of a batch are ignored."""
 
         def tensors(kind: type, prefix: str = "") -> dict[str, Any]:
             names = [field.name for field in fields(kind) if prefix + field.name in arrays]
@@ -65,13 +66,13 @@ class Batch:
 
 @dataclass(frozen=True, kw_only=True)
 class Targets:
-    """What training compares with.
+    """Training targets.
 
-    joints (B, J, 3) m in the person's frame; known (B, J) bool: false where the truth is not known, for a dataset that
-    labels some of the skeleton's joints; visible (B, J): 1 where some point lies near the joint, 0 where none does, NaN
-    where that is not known, see `train.augment.visible_joints`; part (B, F) int64, the majority part of each fine
-    voxel's points, -1 where padded or unknown; person (B, 2): 1 where the crop shows a person, and a second one, 0
-    where it does not, NaN where that is not known.
+    joints (B, J, 3) m in the person's frame; known (B, J) bool: false without ground truth, for a dataset that labels
+    only some of the skeleton's joints; visible (B, J): 1 if some point lies near the joint, 0 if none does, NaN if
+    unknown, see `train.augment.visible_joints`; part (B, F) int64, the majority part of each fine voxel's points, -1
+    for padding or unknown; person (B, 2): 1 if the crop shows a person, and if it shows a second one, 0 if not, NaN if
+    unknown.
     """
 
     joints: Tensor
@@ -89,12 +90,11 @@ class Targets:
 class Outputs:
     """Raw results in the person's frame.
 
-    vote (B, J, 3) m; heatmap (B, J, 3, W) logits about the vote, or about the origin where the network has no votes
-    (vote is then zero), W = 0 where it has no heatmaps; part (B, N, P) logits of each fine voxel, 0 = background;
-    confidence (B, J) logit of an error under 10 cm; log_spread (B, J) log of the expected error in m; visible (B, J)
-    logit of the joint being seen; level_joints: one (B, J, 3) m a coarser level, read off its anchors; has_votes:
-    whether the network votes at all; person (B, 2) logits of a person and of a second one in the crop, where the
-    network has them.
+    vote (B, J, 3) m; heatmap (B, J, 3, W) logits centered on the vote, or on the origin if the network has no votes
+    (vote is then zero), W = 0 without heatmaps; part (B, N, P) logits of each fine voxel, 0 = background; confidence
+    (B, J) logit of an error under 10 cm; log_spread (B, J) log of the expected error in m; visible (B, J) logit of the
+    joint being visible; level_joints: one (B, J, 3) m per coarser level, predicted from its anchors; has_votes: whether
+    the network votes; person (B, 2) logits of a person and of a second one in the crop, if the network predicts them.
     """
 
     vote: Tensor
@@ -113,7 +113,7 @@ class Outputs:
 
 
 class PoseNet(nn.Module):
-    """Points of people, voxelized into a `Batch`, to raw `Outputs`. A pure function of the batch's tensors."""
+    """Maps people, voxelized into a `Batch`, to raw `Outputs`. A pure function of the batch's tensors."""
 
     def __init__(self, config: NetworkConfig):
         super().__init__()
@@ -192,17 +192,17 @@ class PoseNet(nn.Module):
         )
 
     def _features(self, batch: Batch, places: RotaryEmbedding, mid_of_fine: Tensor, coarse_of_mid: Tensor) -> Tensor:
-        """(B, F, ...): place, spread of the points inside, and density at three scales."""
+        """(B, F, ...): position, mean and spread of the points inside, and density at three scales."""
         coarse_count = coarse_of_mid.transpose(1, 2) @ batch.coarse.log_count[..., None]
         parents = torch.cat([batch.mid.log_count[..., None], coarse_count], -1)
         density = torch.cat([batch.fine.log_count[..., None], mid_of_fine.transpose(1, 2) @ parents], -1)
-        # deviations inside a cell are a few centimeters: brought to order one
+        # deviations inside a cell are a few centimeters, so they are scaled to order one
         return torch.cat([places.features(), batch.offset, batch.deviation / self.config.grid, density], -1)
 
 
 class ArrayModule(nn.Module):
-    """A network as a function of a pyramid's arrays, named `names`, one after the other, giving its
-    `output_names` in order."""
+    """A network as a function of a pyramid's arrays in the order of `names`, which returns the outputs in the order of
+    `output_names`."""
 
     def __init__(self, network: PoseNet, names: tuple[str, ...]):
         super().__init__()
@@ -216,12 +216,12 @@ class ArrayModule(nn.Module):
 
 
 class _Stem(nn.Module):
-    """What a fine voxel is made of, and from where the person is seen, to the first features."""
+    """Maps the features of fine voxels and of the view to the first hidden features."""
 
     def __init__(self, channels: int):
         super().__init__()
         self.voxel = nn.Linear(PLACE_FEATURES + VOXEL_FEATURES, 2 * channels)
-        # the same for all of a person's voxels, so it is added, not repeated beside them
+        # equal for all voxels of a person, so it is projected once and added instead of concatenated
         self.view = nn.Linear(VIEW_FEATURES, 2 * channels, bias=False)
         self.act = nn.SiLU()
         self.out = nn.Linear(2 * channels, channels)
@@ -231,7 +231,7 @@ class _Stem(nn.Module):
 
 
 class _Down(nn.Module):
-    """Voxels of one level to their parents: the mean of the children, and where the parent lies."""
+    """Pools voxels of one level to their parents: the children's mean, plus a function of the parent's position."""
 
     def __init__(self, channels: int, out_channels: int):
         super().__init__()
@@ -245,7 +245,7 @@ class _Down(nn.Module):
 
 
 class _Stage(nn.Module):
-    """The blocks of one level, a convolution before each where asked for."""
+    """The blocks of one level, with a convolution before each block if configured."""
 
     def __init__(self, channels: int, head_channels: int, count: int, convolution: int):
         super().__init__()
@@ -261,15 +261,15 @@ class _Stage(nn.Module):
         return rows
 
 
-# ---- a larger network that begins where a smaller one is, after Net2Net (Chen et al. 2016), by padding
+# ---- initializing a larger network from a smaller one by padding, after Net2Net (Chen et al. 2016)
 #
-# Channels that are new in a residual stream begin as the mean of the old ones: a layer norm over more channels then
-# sees the same mean, and a variance smaller by as much as its scale makes up for; what reads the stream without a norm
-# reads them by zero. Hidden units and heads that are new begin at random, and what reads them at zero; blocks and
-# convolutions that are new add nothing. What is left of the difference is the norm of the joint head, which sees two
-# streams at once: under a millimeter on average.
+# New channels of a residual stream are initialized to the mean of the old channels: a layer norm over more channels
+# then sees the same mean, and a smaller variance, which its scale compensates. Layers that read the stream without a
+# norm read new channels with zero weights. New hidden units and heads are random, and layers read them with zero
+# weights. New blocks and convolutions add nothing. The remaining difference comes from the norm of the joint head,
+# which covers two streams at once: under a millimeter on average.
 
-# what must be alike for numbers to mean the same
+# settings that must be equal for the weights to keep their meaning
 _SAME = ("grid", "skeleton", "parts", "heatmap", "head_channels")
 # layers that read hidden units
 _HIDDEN = ("stem.out", "attention.out", "among.out", "cross.out", "feed.2")
@@ -283,12 +283,12 @@ _READERS = (
 
 
 def expand_weights(network: PoseNet, config: NetworkConfig) -> PoseNet:
-    """A network of `config`, in training mode, that answers nearly as `network` does; of the same depth and width, the
-    same. What is drawn comes from torch's global generator. Raises InputError, one line, where `config` is narrower or
-    shallower, or of another grid, skeleton, heatmap, width of heads or of convolutions.
+    """A network of `config`, in training mode, whose outputs are nearly those of `network`, or the same for the same
+    depth and width. New random weights come from torch's global generator. Raises InputError, one line, if `config` is
+    narrower or shallower, or has another grid, skeleton, number of parts, heatmap, width of heads or of convolutions.
     """
     old_config = network.config
-    # convolutions where there are none add nothing, as new blocks
+    # like new blocks, convolutions in a network that had none add nothing at first
     fixed_settings = (*_SAME, "convolution") if old_config.convolution else _SAME
     for name in ("channels", "blocks", *fixed_settings):
         old_value, new_value = getattr(old_config, name), getattr(config, name)
@@ -301,21 +301,21 @@ def expand_weights(network: PoseNet, config: NetworkConfig) -> PoseNet:
     new_network = PoseNet(config)
     old_state = network.state_dict()
     if old_config.channels != config.channels:
-        # small, soon learned, and of streams that mean something else now
+        # the person head is small, quickly learned, and its input streams have another meaning now
         old_state = {name: value for name, value in old_state.items() if not name.startswith("person.")}
     state = new_network.state_dict()
     for name, value in state.items():
         if name in old_state:
             state[name] = _padded(name, old_state[name], value, network, new_network)
         elif name.rpartition(".")[0].endswith(_WRITERS):
-            # of a new block: it adds nothing to what goes through it
+            # in a new block: it adds nothing to the residual stream
             state[name] = torch.zeros_like(value)
     new_network.load_state_dict(state)
     return new_network.train()
 
 
 def _padded(name: str, old: Tensor, new: Tensor, old_network: PoseNet, new_network: PoseNet) -> Tensor:
-    """The old tensor in the larger one's shape; what is new of it as it was drawn, zero, or the mean of a stream."""
+    """The old tensor padded to the new shape; new entries stay random, or are zero or the mean of a stream."""
     layer, _, entry = name.rpartition(".")
     out = new.clone()
     if name in ("anchors", "vote.offset"):
@@ -323,12 +323,12 @@ def _padded(name: str, old: Tensor, new: Tensor, old_network: PoseNet, new_netwo
         out[:, : old.shape[1]] = old
         return out
     if "norm" in layer:
-        # the mean square over more channels is smaller by as much
+        # compensates the mean square, which is smaller by this factor over more channels
         value = old * sqrt(len(old) / len(new)) if entry == "weight" else old
         out[_places(old_network, new_network)[: len(old)] if layer == "joint.norm" else torch.arange(len(old))] = value
         return out
     if layer == "vote.query":
-        # its products are divided by the root of the width
+        # compensates that its products are divided by the root of the width
         old = old * sqrt(len(new) / len(old))
     if layer.endswith(_WRITERS):
         old = torch.cat([old, old.mean(0, keepdim=True).expand(len(new) - len(old), *old.shape[1:])])
@@ -347,7 +347,7 @@ def _padded(name: str, old: Tensor, new: Tensor, old_network: PoseNet, new_netwo
 
 
 def _places(old_network: PoseNet, new_network: PoseNet) -> Tensor:
-    """Where the joint head's old inputs lie among the new ones: the anchors', the voters', and the vote."""
+    """Indices of the joint head's old inputs among the new ones: of the anchors, the voters and the vote."""
     (old_voters, old_width), (new_voters, new_width) = (
         (net.config.channels[0] if net.vote is not None else 0, net.config.channels[1])
         for net in (old_network, new_network)

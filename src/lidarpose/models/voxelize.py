@@ -1,9 +1,10 @@
-"""From points to integer tables: voxels at three sizes, their parents, and a padded layout. Numpy only.
+"""Converts points to integer tables: voxels of three sizes, their parents, and a padded layout. Numpy only.
 
-Legend: B people, M points of all people one after the other, F / M / C in names: fine, mid, coarse level.
+Legend: B people, M points of all people concatenated, F / M / C in names: fine, mid, coarse level.
 
-The grid's origin is the person's own center, never the cloud's minimum: one stray point cannot move the voxels of the
-others (the released DAPT code subtracts the minimum). A parent is the child's index shifted right, as in its pooling.
+The grid's origin is the person's center, not the cloud's minimum, so one stray point cannot shift the voxels of the
+other points (the released DAPT code subtracts the minimum). A parent's index is the child's index shifted right, as in
+DAPT's pooling.
 """
 
 from dataclasses import dataclass, fields
@@ -13,24 +14,24 @@ import numpy as np
 
 from lidarpose.errors import InputError
 
-# of a level: numpy's, or torch's tensors
+# array type of a level: a numpy array or a torch tensor
 Array = TypeVar("Array")
 
 # half width of the window around the center that reaches the network, meters: arm span plus a step
 WINDOW = 2.0
-# bits an axis of a voxel index: 2 * WINDOW / 0.04 m < 2 ** 7
+# bits per axis of a voxel index: 2 * WINDOW / 0.04 m < 2 ** 7
 _BITS = 8
-# the cell at the person's center
+# index of the cell at the person's center
 _HALF = 1 << (_BITS - 1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class VoxelLevel(Generic[Array]):
-    """Voxels of one size, padded to the most a person has.
+    """Voxels of one size, padded to the largest number of voxels of a person in the batch.
 
     position (B, N, 3) float32 m: mean of the points inside, in the person's frame; log_count (B, N) float32: log of the
-    number of points; valid (B, N) bool; parent (B, N) int64: index into the next coarser level (0 where padded);
-    neighbors (B, N, 27) int64, where asked for: rows of the 3 x 3 x 3 cells around, N where there is no voxel.
+    number of points; valid (B, N) bool; parent (B, N) int64: index into the next coarser level (0 for padding);
+    neighbors (B, N, 27) int64, if requested: rows of the surrounding 3 x 3 x 3 cells, N for an empty cell.
     """
 
     position: Array
@@ -42,12 +43,12 @@ class VoxelLevel(Generic[Array]):
 
 @dataclass(frozen=True, kw_only=True)
 class VoxelPyramid:
-    """All that the network reads of a batch of people, as arrays.
+    """All network inputs for a batch of people, as arrays.
 
     deviation (B, F, 3) m: standard deviation of the points inside each fine voxel; offset (B, F, 3): mean of the points
-    from the voxel's center, in voxels; view (B, 5): unit vector to the sensor, log of the range in meters, 1 if the
-    sensor's position is known (else all zero); point_voxel (M,): row of the padded (B * F) fine level of every point,
-    -1 for a point outside the window or thinned away.
+    relative to the voxel's center, in voxels; view (B, 5): unit vector to the sensor, log of the range in meters, 1 if
+    the sensor position is known (else all zero); point_voxel (M,): row of each point's voxel in the padded fine level,
+    flattened to B * F; -1 for a point outside the window or in a voxel dropped by subsampling.
     """
 
     fine: VoxelLevel[np.ndarray]
@@ -59,7 +60,7 @@ class VoxelPyramid:
     point_voxel: np.ndarray
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """What a network reads, by dotted name ("fine.position"): all but `point_voxel`."""
+        """The network's inputs by dotted name ("fine.position"): all fields but `point_voxel`."""
         arrays: dict[str, np.ndarray] = {}
         for name in ("fine", "mid", "coarse"):
             level = getattr(self, name)
@@ -78,20 +79,21 @@ def voxelize(
     seeds: np.ndarray | None = None,
     neighbors: bool = False,
 ) -> VoxelPyramid:
-    """Voxels of people, at three sizes.
+    """Voxelizes people at three sizes.
 
-    A person of more than `max_voxels` fine voxels keeps that many. Every person of at least one point inside the window
-    has at least one voxel at every level; one of none has only padding. Twin: `voxelize_reference` of the tests.
+    A person with more than `max_voxels` fine voxels is subsampled to that many. Every person with at least one point
+    inside the window has at least one voxel at every level; a person without any has only padding. The tests hold a
+    reference implementation, `voxelize_reference`.
 
     Args:
-        points: (M, 3) m, each in its person's frame; people one after the other.
-        lengths: (B,) points of each person.
-        grid: edge of a fine voxel in meters; the mid and coarse ones are 2 and 4 times as wide.
-        max_voxels: fine voxels a person at the most.
+        points: (M, 3) m, each in its person's frame; the points of all people concatenated.
+        lengths: (B,) number of points of each person.
+        grid: edge of a fine voxel in meters; mid and coarse voxels are 2 and 4 times as wide.
+        max_voxels: maximum number of fine voxels per person.
         view: (B, 5), see `view_features`.
-        seeds: (B,) whole numbers: the voxels that are kept are random ones, by the person's own seed; None: evenly
-            spread ones.
-        neighbors: also make the tables of the mid and coarse level that convolutions read.
+        seeds: (B,) integers: each person's voxels are subsampled at random with that person's seed; None: at even
+            intervals.
+        neighbors: also build the neighbor tables of the mid and coarse level, which convolutions read.
 
     Raises InputError for a grid too fine for the voxel index.
     """
@@ -103,7 +105,7 @@ def voxelize(
     mean = _segment_sum(voxel_of_point, xyz, len(key)) / count[:, None]
     mean_square = _segment_sum(voxel_of_point, xyz**2, len(key)) / count[:, None]
     deviation = np.sqrt(np.maximum(mean_square - mean**2, 0))
-    # from the voxel's own cell: a mean on its border may round into the next one
+    # relative to the voxel's own cell: a mean on its border may round into the next cell
     offset = mean / grid - (np.stack(_axes(key), 1) - _HALF) - 0.5
 
     (fine, mid, coarse), slots = _levels(key, mean, count, len(lengths), neighbors)
@@ -121,7 +123,7 @@ def voxelize(
 
 
 def view_features(center: np.ndarray, sensor_origin: np.ndarray | None) -> np.ndarray:
-    """(5,) for `VoxelPyramid.view`: unit vector from `center` to the sensor, log range, known; zeros for None."""
+    """(5,) for `VoxelPyramid.view`: unit vector from `center` to the sensor, log range, 1; all zeros for None."""
     if sensor_origin is None:
         return np.zeros(5, np.float32)
     to_sensor = np.asarray(sensor_origin, float) - center
@@ -130,7 +132,7 @@ def view_features(center: np.ndarray, sensor_origin: np.ndarray | None) -> np.nd
 
 
 class _Slots:
-    """Where the sorted rows of one level go in the padded block."""
+    """Positions of one level's sorted rows in the padded block."""
 
     def __init__(self, person: np.ndarray, people: int):
         lengths = np.bincount(person, minlength=people)
@@ -148,8 +150,8 @@ class _Slots:
 def _fine_voxels(
     points: np.ndarray, lengths: np.ndarray, grid: float, max_voxels: int, seeds: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Indices (K,) of the points that count, sorted keys (V,) of their voxels, the voxel (K,) of each point, and how
-    many points (V,) each voxel has."""
+    """Indices (K,) of the points used, sorted keys (V,) of their voxels, the voxel (K,) of each point, and the number
+    of points (V,) per voxel."""
     rows = np.flatnonzero((np.abs(points) < WINDOW).all(1))
     person = np.repeat(np.arange(len(lengths)), lengths)[rows]
     x, y, z = np.floor(points[rows] / grid).astype(np.int64).T + _HALF
@@ -167,7 +169,7 @@ def _fine_voxels(
 
 
 def _thinned(count: int, max_voxels: int, seeds: np.ndarray | None, person: int) -> np.ndarray:
-    """Which of a person's voxels to keep, in order."""
+    """Indices of the voxels of a person that remain after subsampling, in ascending order."""
     if count <= max_voxels:
         return np.arange(count)
     if seeds is None:
@@ -178,7 +180,7 @@ def _thinned(count: int, max_voxels: int, seeds: np.ndarray | None, person: int)
 def _levels(
     key: np.ndarray, mean: np.ndarray, count: np.ndarray, people: int, neighbors: bool
 ) -> tuple[list[VoxelLevel], _Slots]:
-    """The three levels over fine voxels of sorted keys (V,), and where the fine ones lie."""
+    """The three levels above fine voxels with sorted keys (V,), and the slots of the fine level."""
     levels: list[VoxelLevel] = []
     fine_slots = slots = _Slots(key >> (3 * _BITS), people)
     total = mean * count[:, None]
@@ -205,7 +207,7 @@ def _levels(
 
 
 def _key(person: np.ndarray, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """One number for each cell of each person, in their order."""
+    """One integer per person and cell, which sorts by person, then x, y, z."""
     return ((person << _BITS | x) << _BITS | y) << _BITS | z
 
 
@@ -216,8 +218,8 @@ def _axes(key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _neighbors(key: np.ndarray, slots: _Slots) -> np.ndarray:
-    """(V, 27) int: slots of the voxels around each, x slowest; the padded width where there is none."""
-    # cells reach neither end of their bits: no step runs over into another axis
+    """(V, 27) int: slots of the voxels around each voxel, x slowest; the padded width for an empty cell."""
+    # cell indices never reach either end of their bit range, so a step cannot overflow into another axis
     steps = _key(np.zeros(1, np.int64), *np.mgrid[:3, :3, :3].reshape(3, 27)) - _key(*np.array([0, 1, 1, 1]))
     neighbor_key = key[:, None] + steps
     row = np.minimum(np.searchsorted(key, neighbor_key), max(len(key) - 1, 0))

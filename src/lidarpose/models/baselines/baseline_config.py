@@ -1,6 +1,6 @@
-"""Configurations of the baselines, and how a person's cloud reaches those of a single frame. Numpy only.
+"""Configurations of the baselines, and the conversion of clouds to the inputs of their networks. Numpy only.
 
-Legend: B people, N points of the largest.
+Legend: B people, N points of the largest cloud.
 """
 
 from dataclasses import dataclass
@@ -14,20 +14,22 @@ from lidarpose.models.voxelize import WINDOW
 from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import HUMAN15, SMPL24
 
-# points of a person that a network reads at most, as published
+# maximum number of points of a person that a network reads, as published
 MOST_POINTS = 1024
 GRIDS = (64, 32, 16)
-# what widths may be divided by: heads and groups of attention stay as many
+# allowed divisors of widths; the numbers of attention heads and groups stay the same
 DIVISORS = (1, 2, 4, 8)
 
 
 @dataclass(frozen=True, kw_only=True)
 class BaselineConfig(Config):
-    """What all baselines have. frames: of a clip, 1 for networks of single frames; layers: a lower bound of its
-    tensors; joints: names, in the order of the outputs; width_divisor: the channels of hidden layers are as many as
-    published divided by it, for CPUs; most_points: of a cloud, of more a draw is read. Each option is False for the
-    behavior that its class calls mended. Raises InputError for unknown joints, other divisors, and options that are
-    neither true nor false."""
+    """The settings of all baselines.
+
+    frames: of a clip, 1 for networks of single frames; layers: a lower bound of the number of its tensors; joints:
+    names, in the order of the outputs; width_divisor: number by which the published channels of hidden layers are
+    divided, for CPUs; most_points: of a cloud, larger clouds are subsampled. Each option is False for the corrected
+    behavior. Raises InputError for unknown joints, other divisors, and options that are not booleans.
+    """
 
     frames: ClassVar[int] = 1
     layers: ClassVar[int] = 1
@@ -50,12 +52,15 @@ class BaselineConfig(Config):
 
 @dataclass(frozen=True, kw_only=True)
 class PrnConfig(BaselineConfig):
-    """PRN, the pose network of LiDAR-HMR. resample_with_replacement: `most_points` points are drawn, some of them
-    several times, in evaluation too, as published; else each point is there once, and of more that many stay;
-    missing_in_softmax: a neighbor that a small cloud does not have takes part in the attention's batch norms and
-    softmax, and its weight is set to 0 after it, as published; labels_before_scaling: points' parts in training are
-    those of the person before the augmentation scales them, as published; attention_dropout: share of the
-    attention's weights dropped."""
+    """PRN, the pose network of LiDAR-HMR.
+
+    resample_with_replacement: `most_points` points are drawn, some of them several times, in evaluation too, as
+    published; else each point is used once, and larger clouds are subsampled to that number; missing_in_softmax: a
+    neighbor that is missing in a small cloud takes part in the attention's batch norms and softmax, and its weight is
+    set to 0 afterwards, as published; labels_before_scaling: in training, the part labels of points are those of the
+    person before the augmentation scales it, as published; attention_dropout: share of the attention's weights that are
+    dropped.
+    """
 
     kind: ClassVar[str] = "prn"
     layers: ClassVar[int] = 100
@@ -68,13 +73,16 @@ class PrnConfig(BaselineConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class LpformerConfig(BaselineConfig):
-    """LPFormer for crops. resample_with_replacement: as for `PrnConfig`; grid: cells a side of the occupancy grid,
-    64 as published, or 32 or 16, each an eighth of the work of the one before, with weights of the same shapes;
-    labels_before_scaling: as for `PrnConfig`; second_softmax: the cross entropy of parts is computed of
-    probabilities, as published; divide_by_all_joints: the distance of joints is divided by all, with a label or
-    not, as published; sensor_position: a point's token has its place from the sensor beside the local one, as in
-    LiDAR-HMR, else the local one twice, as in the DAPT repository; attention_dropout: share of the attention's
-    weights dropped."""
+    """LPFormer for crops.
+
+    resample_with_replacement: as for `PrnConfig`; grid: cells per side of the occupancy grid, 64 as published, or 32 or
+    16, each an eighth of the work of the one before, with weights of the same shapes; labels_before_scaling: as for
+    `PrnConfig`; second_softmax: the cross entropy of parts is computed from probabilities, as published;
+    divide_by_all_joints: the distance of joints is divided by the number of all joints, labeled or not, as published;
+    sensor_position: a point's token has its position relative to the sensor beside the local one, as in LiDAR-HMR, else
+    the local one twice, as in the DAPT repository; attention_dropout: share of the attention's weights that are
+    dropped.
+    """
 
     kind: ClassVar[str] = "lpformer"
     layers: ClassVar[int] = 50
@@ -96,18 +104,18 @@ class LpformerConfig(BaselineConfig):
 def pad_clouds(
     clouds: list[np.ndarray], view: np.ndarray, config: PrnConfig | LpformerConfig, seeds: list[int]
 ) -> dict[str, np.ndarray]:
-    """Clouds (n, 3) m of people, n = 0 is legal, as a network of single frames reads them.
+    """Clouds (n, 3) m of people, where n may be 0, as inputs of a network of single frames.
 
     Args:
-        clouds: each in its person's frame; what is beyond `WINDOW` of it is left out.
+        clouds: each in its person's frame; points beyond `WINDOW` are left out.
         view: (B, 5), see `voxelize.view_features`.
-        config: the network's, which says how many points are read and how they are drawn.
-        seeds: of what is drawn, a number a person.
+        config: of the network, with the number of points and how they are drawn.
+        seeds: of the random draws, one number per person.
 
     Returns:
-        points (B, N, 3) float32 m, about the middle of the cloud's extent; valid (B, N) bool, False for padding;
-        middle (B, 3) float32 m in the person's frame; center (B, 3) float32 m: the middle from the sensor, 0 where its
-        place is not known.
+        points (B, N, 3) float32 m, relative to the middle of the cloud's extent; valid (B, N) bool, False for padding;
+        middle (B, 3) float32 m in the person's frame; center (B, 3) float32 m: the middle relative to the sensor, 0 if
+        the sensor position is unknown.
     """
     centered_clouds, middles, most_points = [], [], config.most_points
     for cloud, seed in zip(clouds, seeds, strict=True):
@@ -131,20 +139,23 @@ def pad_clouds(
 
 # ---- networks of clips
 
-# clouds of a frame by name: the person, what stands still about them, and the frame's other points
+# clouds of a frame by name: the person, the static surroundings, and the frame's other points
 CLOUDS = ("person", "background", "neighbors")
-# points of each cloud that a network of clips reads at most, as published
+# maximum number of points of each cloud that a network of clips reads, as published
 FRAME_POINTS = 512
 
 
 @dataclass(frozen=True, kw_only=True)
 class LidarcapConfig(BaselineConfig):
-    """LiDARCap. resample_with_replacement: every cloud has `most_points` points, of fewer all are repeated, of more
-    some are drawn, perhaps twice, as published; else each point is there once; order_dependent_neighbors:
-    neighborhoods depend on the order of the points, as its CUDA kernels'; trans_center: in training, frames are
-    centered on SMPL's true trans, as published, so that where the pelvis is need not be learned; else on the points,
-    or on a guess of the pelvis; stock_initialization: weights begin as PyTorch's layers make them, as published; else
-    rotations begin near none, and the layers of NE's encoders as copies of what they read."""
+    """LiDARCap.
+
+    resample_with_replacement: every cloud has `most_points` points: smaller clouds are repeated in full, larger ones
+    are drawn from with replacement, as published; else each point is used once; order_dependent_neighbors:
+    neighborhoods depend on the order of the points, as in its CUDA kernels; trans_center: in training, frames are
+    centered on SMPL's true trans, as published, so that the network need not learn where the pelvis is; else on the
+    points, or on an estimate of the pelvis; stock_initialization: weights are initialized as by PyTorch's layers, as
+    published; else rotations start near the identity, and the layers of NE's encoders start as copies of their inputs.
+    """
 
     kind: ClassVar[str] = "lidarcap"
     frames: ClassVar[int] = CLIP_FRAMES
@@ -166,8 +177,11 @@ class LidarcapConfig(BaselineConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class NeConfig(LidarcapConfig):
-    """NE. exchange_across_batch: the three clouds' exchange attends over the clips of a batch instead of a clip's
-    frames, as published; with one clip it does nothing then."""
+    """NE.
+
+    exchange_across_batch: the exchange among the three clouds attends over the clips of a batch instead of the frames
+    of a clip, as published; with one clip, each frame then attends only to itself.
+    """
 
     kind: ClassVar[str] = "ne"
     clouds: ClassVar[tuple[str, ...]] = CLOUDS
@@ -178,13 +192,13 @@ class NeConfig(LidarcapConfig):
 def pad_frames(
     clouds: list[np.ndarray], config: LidarcapConfig, seeds: list[int], *, window: float = np.inf
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Clouds (n, 3) m of frames, n = 0 is legal, about their centers, as a network of clips reads them.
+    """Clouds (n, 3) m of frames, where n may be 0, relative to their centers, as inputs of a network of clips.
 
     Args:
         clouds: of F frames.
-        config: the network's, which says how many points are read and how they are drawn.
-        seeds: of what is drawn, a number a frame.
-        window: what is farther from the center along an axis is left out, m.
+        config: of the network, with the number of points and how they are drawn.
+        seeds: of the random draws, one number per frame.
+        window: points farther than this from the center along an axis are left out, m.
 
     Returns:
         Points (F, N, 3) float32 m and valid (F, N) bool, False for padding.
@@ -199,14 +213,16 @@ def pad_frames(
 
 
 def _repeated(points: np.ndarray, count: int) -> np.ndarray:
-    """Points (n, 3) as so many: each as often as all can be, one copy after the other, then the first of these anew.
-    Source: LiDARCap's fix_points_num."""
+    """Repeats points (n, 3) to `count` points: all equally often, each in succession, then the first of these again.
+
+    Source: LiDARCap's fix_points_num.
+    """
     copies = np.repeat(points, count // len(points), axis=0)
     return np.concatenate([copies, copies[: count - len(copies)]])
 
 
 def _near(cloud: np.ndarray, window: float) -> np.ndarray:
-    """The points (n, 3) within `window` m of the origin along each axis; the origin itself where there is none."""
+    """The points (n, 3) within `window` m of the origin along each axis; the origin itself if there are none."""
     points = cloud[(np.abs(cloud) < window).all(1)]
     return points if len(points) else np.zeros((1, 3))
 

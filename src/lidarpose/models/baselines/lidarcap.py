@@ -1,4 +1,4 @@
-"""LiDARCap (Li et al. 2022): PointNet++ of each frame, a recurrent net for joints, a graph net for rotations.
+"""LiDARCap (Li et al. 2022): PointNet++ of each frame, a recurrent network for joints, a graph network for rotations.
 
 A clip is 16 frames of 512 points; joints are those of SMPL, relative to each frame's center.
 """
@@ -14,11 +14,11 @@ from lidarpose.models.baselines.baseline_config import LidarcapConfig
 from lidarpose.models.baselines.point_ops import ball_query, farthest_points, gather_points
 from lidarpose.skeleton import SMPL24
 
-# what the networks of clips read: of each frame points (..., N, 3) m about its center, and valid (..., N) bool, one or
-# more a frame, by the name of the cloud
+# inputs of the networks of clips, by the name of the cloud: for each frame points (..., N, 3) m relative to its center,
+# and valid (..., N) bool, at least one per frame
 Clouds = dict[str, tuple[Tensor, Tensor]]
 FEATURES = 1024
-# x, y, z of the package's mean adult's joints from their parents at rest, SMPL's frame and order, m
+# offsets x, y, z of the joints from their parents, of the package's mean adult at rest, in SMPL's frame and order, m
 _REST_OFFSETS = (
     (0, 0, 0), (0.075, -0.095, 0), (-0.075, -0.095, 0), (0, 0.1008, -0.0365), (0.0239, -0.3892, 0.0086),
     (-0.0239, -0.3892, 0.0086), (0, 0.1296, -0.0081), (0, -0.409, -0.0301), (0, -0.409, -0.0301), (0, 0.048, -0.0037),
@@ -26,20 +26,20 @@ _REST_OFFSETS = (
     (0.0007, 0.0848, 0.0225), (0.111, -0.0316, -0.0051), (-0.111, -0.0316, -0.0051), (0.2513, 0, 0), (-0.2513, 0, 0),
     (0.2309, 0, 0), (-0.2308, 0, 0), (0.1054, 0, 0), (-0.1054, 0, 0),
 )  # fmt: skip
-# how far the graph's convolutions reach in time, frames
+# size of the graph convolutions' kernel in time, frames
 TIME_KERNEL = 5
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClipOutputs:
-    """Of B clips of T frames: joints (B, T, 24, 3) m of the first stage; rotations (B, T, 24, 3, 3) of SMPL, each
-    joint's relative to its parent's, the pelvis' to the world."""
+    """Of B clips of T frames: joints (B, T, 24, 3) m of the first stage; rotations (B, T, 24, 3, 3) of SMPL, each joint
+    relative to its parent, the pelvis relative to the world."""
 
     joints: Tensor
     rotations: Tensor
 
     def posed(self) -> Tensor:
-        """(B, T, 24, 3) m: the mean adult with these rotations, the pelvis where the first stage has it."""
+        """(B, T, 24, 3) m: the mean adult with these rotations, and with the first stage's pelvis."""
         offsets = rest_offsets().to(self.joints)
         return self.joints[:, :, :1] + forward_kinematics(self.rotations, offsets, SMPL24.parents)
 
@@ -47,7 +47,7 @@ class ClipOutputs:
 class Lidarcap(nn.Module):
     """34.9 M parameters."""
 
-    # tensors with a row for each joint: joints are always SMPL's
+    # tensors with one row per joint: none, since joints are always SMPL's
     per_joint = ()
 
     def __init__(self, config: LidarcapConfig):
@@ -66,7 +66,7 @@ class Lidarcap(nn.Module):
         return self.decode(by_frame(self.encode, clouds))
 
     def encode(self, clouds: Clouds) -> dict[str, Tensor]:
-        """Features (F, C) of F frames, which know nothing of each other."""
+        """Features (F, C) of F frames, each frame on its own."""
         return {"person": self.encoder(*clouds["person"])}
 
     def decode(self, encoded: dict[str, Tensor]) -> ClipOutputs:
@@ -78,7 +78,7 @@ class Lidarcap(nn.Module):
 
 
 def by_frame(encode: Callable[[Clouds], dict[str, Tensor]], clouds: Clouds) -> dict[str, Tensor]:
-    """Features (B, T, C) of clips' frames, by what encodes frames."""
+    """Features (B, T, C) of the frames of clips, from a function that encodes frames."""
     shape = clouds["person"][0].shape[:2]
     features = encode({name: (points.flatten(0, 1), valid.flatten(0, 1)) for name, (points, valid) in clouds.items()})
     return {name: value.unflatten(0, shape) for name, value in features.items()}
@@ -115,7 +115,7 @@ class SetAbstraction(nn.Module):
         self.layers = _perceptron(channels)
 
     def forward(self, points: Tensor, valid: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        # of fewer points centers would repeat, which changes no maximum
+        # with fewer points, centers would repeat, which changes no maximum
         count = self.centers if self.as_published else min(self.centers, points.shape[1])
         center_index = farthest_points(points, valid, count, as_published=self.as_published)
         centers = gather_points(points, center_index)
@@ -124,7 +124,7 @@ class SetAbstraction(nn.Module):
         rows = torch.cat([offsets, gather_points(features, index)], -1)
         shape = rows.shape[:3]
         center_features = self.layers(rows.flatten(0, 2)).unflatten(0, shape).amax(2)
-        # centers that were chosen twice do not change a maximum, so all count from here on
+        # centers that were chosen twice do not change a maximum, so all are valid from here on
         return centers, torch.ones_like(center_index, dtype=torch.bool), center_features
 
 
@@ -138,14 +138,14 @@ class StGcn(nn.Module):
         self.layers = nn.ModuleList(GraphLayer(widths[k], widths[k + 1], first=k == 0) for k in range(len(widths) - 1))
         self.output = nn.Conv2d(widths[-1], 6, 1)
         if not stock_initialization:
-            # near no rotation, as most joints are near it: from any other, learning takes several times as long
+            # start near the identity, as most joints are near it: from elsewhere, training takes several times as long
             self.output.bias = nn.Parameter(torch.eye(3)[:, :2].flatten())
 
     def forward(self, joints: Tensor, features: Tensor) -> Tensor:
         """joints (B, T, J, 3), features (B, T, C) -> (B, T, J, 3, 3)."""
         joint_count = joints.shape[2]
         x = torch.cat([joints, features[:, :, None].expand(-1, -1, joint_count, -1)], -1)
-        # joints and their channels are the channels of the norm, joint by joint
+        # the norm's channels are the joints' channels, joint by joint
         x = self.norm(x.flatten(2).transpose(1, 2)).unflatten(1, (joint_count, -1)).permute(0, 2, 3, 1)
         for layer in self.layers:
             x = layer(x)
@@ -153,7 +153,7 @@ class StGcn(nn.Module):
 
 
 class GraphLayer(nn.Module):
-    """(B, C, T, J) -> (B, C', T, J). first: nothing is dropped, nothing added to what is read."""
+    """(B, C, T, J) -> (B, C', T, J). first: without dropout and without residual."""
 
     def __init__(self, in_channels: int, out_channels: int, *, first: bool):
         super().__init__()
@@ -180,8 +180,8 @@ class GraphLayer(nn.Module):
 
 
 def tree_partition(parents: tuple[int, ...]) -> Tensor:
-    """(3, J, J) weights from joint v to joint w: itself; neighbors as far from the root or farther; neighbors nearer to
-    it. Each column is divided by the joint's number of neighbors, itself among them."""
+    """(3, J, J) weights from joint v to joint w, by kind of v: w itself; neighbors as far from the root or farther;
+    neighbors nearer to it. Each column is divided by the joint's number of neighbors, including itself."""
     joints = len(parents)
     depth = [0] * joints
     weights = torch.zeros(3, joints, joints)
@@ -195,7 +195,7 @@ def tree_partition(parents: tuple[int, ...]) -> Tensor:
 
 
 def rotations_from_6d(numbers: Tensor) -> Tensor:
-    """(..., 6), a 3x2 matrix row by row, -> (..., 3, 3): its columns made orthonormal, and their cross product."""
+    """(..., 6), a 3x2 matrix row by row -> (..., 3, 3): its columns, orthonormalized, and their cross product."""
     first, second = numbers.unflatten(-1, (3, 2)).unbind(-1)
     x = F.normalize(first, dim=-1)
     y = F.normalize(second - (x * second).sum(-1, keepdim=True) * x, dim=-1)
@@ -208,8 +208,8 @@ def rest_offsets() -> Tensor:
 
 
 def forward_kinematics(rotations: Tensor, offsets: Tensor, parents: tuple[int, ...]) -> Tensor:
-    """rotations (..., J, 3, 3), offsets (J, 3) m of each joint from its parent at rest -> joints (..., J, 3) m, the
-    first one at 0."""
+    """rotations (..., J, 3, 3), offsets (J, 3) m of each joint from its parent at rest -> joints (..., J, 3) m,
+    relative to the first one."""
     world_rotations: list[Tensor] = []
     joints: list[Tensor] = []
     for joint, parent in enumerate(parents):

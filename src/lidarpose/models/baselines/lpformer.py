@@ -1,6 +1,6 @@
-"""LPFormer for crops, as LiDAR-HMR rebuilt it (Ye et al. 2024): a 3D convolutional net of occupancy and a transformer.
+"""LPFormer for crops, as LiDAR-HMR rebuilt it (Ye et al. 2024): a 3D convolutional network on occupancy, a transformer.
 
-The original finds people in whole sweeps by a detector, whose features it reads; it has no public code.
+The original detects people in whole sweeps, and reads features of its detector; its code is not public.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from lidarpose.models.baselines.baseline_config import LpformerConfig
 from lidarpose.models.baselines.prn import BareAttention
 
-# half the side of the occupancy grid, and how far out a point may ask for features, m
+# half the side of the occupancy grid, and the limit to which points are clamped when features are sampled, m
 HALF, REACH = 1.0, 1.1
 
 
@@ -28,7 +28,7 @@ class LpformerOutputs:
 class Lpformer(nn.Module):
     """4.81 M parameters."""
 
-    # tensors with a row for each joint, in this order, and perhaps one more for background
+    # tensors with one row per joint, in order, and some with one more row for background
     per_joint = ("joint", "parts.3.")
 
     def __init__(self, config: LpformerConfig):
@@ -36,7 +36,7 @@ class Lpformer(nn.Module):
         self.config = config
         self.grid = config.grid
         joints, divisor = len(config.joints), config.width_divisor
-        # on CPUs twice as fast as channels first where channels are few
+        # twice as fast on CPUs as channels first if there are few channels
         self.volume = V2V(divisor).to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
         widths = [6 + 32 // divisor, 1024 // divisor, 512 // divisor, 256 // divisor]
         self.token = nn.Sequential(*map(nn.Linear, widths, widths[1:]))
@@ -44,17 +44,17 @@ class Lpformer(nn.Module):
         self.joint = nn.Parameter(torch.randn(joints, width))
         dropout = config.attention_dropout
         self.attention = nn.ModuleList(BareAttention(width, heads=8, dropout=dropout) for _ in range(4))
-        # no activation between the last two: as published
+        # no activation between the last two layers, as published
         self.xy, self.z, self.visible = (
             nn.Sequential(nn.Linear(width, 16), nn.ReLU(), nn.Linear(16, 8), nn.Linear(8, size)) for size in (2, 1, 2)
         )
         self.parts = nn.Sequential(nn.Linear(width, width), nn.ReLU(), nn.Linear(width, 16), nn.Linear(16, joints + 1))
 
     def forward(self, points: Tensor, valid: Tensor, center: Tensor | None = None) -> LpformerOutputs:
-        """points (B, N, 3) m about the middle of their extent, valid (B, N) bool; center (B, 3) m: the middle from the
-        sensor, read with `sensor_position`, by default 0."""
+        """points (B, N, 3) m relative to the middle of their extent, valid (B, N) bool; center (B, 3) m: the middle
+        relative to the sensor, used with `sensor_position`, by default 0."""
         volume = self.volume(self.occupancy(points, valid))
-        # grid_sample wants x last in the volume and first in the places
+        # grid_sample expects x as the last axis of the volume, and first in the positions
         place = points.clamp(-REACH, REACH)[:, :, None, None]
         local_features = F.grid_sample(volume, place, align_corners=False)[..., 0, 0].transpose(1, 2)
         absolute_points = points
@@ -74,7 +74,7 @@ class Lpformer(nn.Module):
         )
 
     def occupancy(self, points: Tensor, valid: Tensor) -> Tensor:
-        """(B, 1, grid z, grid y, grid x): 1 where a point is; points beyond the grid count in its border cells."""
+        """(B, 1, grid z, grid y, grid x): 1 for cells with points; points beyond the grid count in its border cells."""
         cell = ((points / HALF + 1) * 0.5 * self.grid).floor().long().clamp(0, self.grid - 1)
         person = torch.arange(len(points), device=points.device)[:, None].expand_as(valid)
         volume = points.new_zeros(len(points), 1, self.grid, self.grid, self.grid)

@@ -1,7 +1,7 @@
 """NE (Zhang et al., "Neighborhood-Enhanced 3D Human Pose Estimation with Monocular LiDAR", AAAI 2024).
 
-As LiDARCap, with two further clouds of each frame: the static background behind the person, and the frame's other
-points about it; attention exchanges what the three say.
+Like LiDARCap, with two further clouds per frame: the static background behind the person, and the frame's other points
+around the person. Attention exchanges information among the three.
 """
 
 from typing import Any
@@ -30,7 +30,7 @@ WIDTH, HIDDEN, LAYERS = 512, 1024, 8
 class Ne(nn.Module):
     """129.7 M parameters."""
 
-    # tensors with a row for each joint: joints are always SMPL's
+    # tensors with one row per joint: none, since joints are always SMPL's
     per_joint = ()
 
     def __init__(self, config: NeConfig):
@@ -47,13 +47,13 @@ class Ne(nn.Module):
         self.clip = _transformer(3 * width, hidden, stock_initialization=stock_initialization)
         self.joints = nn.Linear(3 * width, 3 * len(SMPL24))
         self.shrink = nn.Linear(3 * width, hidden, bias=False)
-        # frames are its channels: clips have 16
+        # its channels are the frames: clips have 16
         self.frame_norm = nn.BatchNorm1d(CLIP_FRAMES)
         self.widen = nn.Linear(hidden, hidden)
         self.rotations = StGcn(3 + hidden, divisor, stock_initialization=stock_initialization)
         if not stock_initialization:
-            # joints begin near those of a person who stands: steps that bring them there from elsewhere are the same
-            # for all frames, and bring all frames to one answer
+            # joints start near those of a standing person: from elsewhere, the first training steps would be the same
+            # for all frames, and would make the outputs of all frames equal
             nn.init.constant_(self.clip.layers[-1].norm2.weight, 0.1)
             self.joints.bias = nn.Parameter(_heights())
 
@@ -62,7 +62,7 @@ class Ne(nn.Module):
         return self.decode(by_frame(self.encode, clouds))
 
     def encode(self, clouds: Clouds) -> dict[str, Tensor]:
-        """Features (F, C) of each cloud of F frames, which know nothing of each other."""
+        """Features (F, C) of each cloud of F frames, each frame on its own."""
         return {name: self.encoders[name](*clouds[name]) for name in CLOUDS}
 
     def decode(self, features: dict[str, Tensor]) -> ClipOutputs:
@@ -80,11 +80,11 @@ class Ne(nn.Module):
 
 
 class CloudExchange(nn.Module):
-    """Person, background and neighbors (B, T, C) -> (B, T, 3 C): each asks with one, by the keys of another."""
+    """Person, background and neighbors (B, T, C) -> (B, T, 3 C): each as values, the other two as queries and keys."""
 
     def __init__(self, width: int, hidden: int):
         super().__init__()
-        # of each of the three attentions: query, key, value
+        # of each of the three attentions: norms of query, key, value
         self.norms: Any = nn.ModuleList(
             nn.ModuleList(nn.LayerNorm(width, eps=1e-6) for _ in range(3)) for _ in range(3)
         )
@@ -109,15 +109,18 @@ class CloudExchange(nn.Module):
 
 
 def _heights() -> Tensor:
-    """(72,) m: x, y = 0 and z of the mean adult's joints, standing, about the pelvis."""
+    """(72,) m: x, y = 0 and z of the mean adult's joints, standing, relative to the pelvis."""
     rest_joints = forward_kinematics(torch.eye(3).expand(len(SMPL24), 3, 3), rest_offsets(), SMPL24.parents)
-    # of SMPL's frame, y up
+    # in SMPL's frame, y is up
     return F.pad(rest_joints[:, 1:2], (2, 0)).flatten()
 
 
 def _transformer(width: int, hidden: int, *, stock_initialization: bool) -> nn.TransformerEncoder:
-    """Layers with the norm after the sum. As PyTorch makes them, copies of one layer that each average over the frames,
-    they begin with most of what tells frames apart lost, and a few steps lose the rest."""
+    """Post-norm transformer layers.
+
+    With PyTorch's initialization, the layers are copies of one layer that each average over the frames: most of what
+    distinguishes frames is lost at the start, and a few training steps lose the rest.
+    """
 
     def layer() -> nn.TransformerEncoderLayer:
         return nn.TransformerEncoderLayer(width, 4, hidden, dropout=0.1, activation="gelu", batch_first=True)
@@ -130,6 +133,6 @@ def _transformer(width: int, hidden: int, *, stock_initialization: bool) -> nn.T
         attention: Any = encoder_layer.self_attn
         nn.init.zeros_(attention.out_proj.weight)
         nn.init.zeros_(encoder_layer.linear2.weight)
-        # of frames that are all zero, as without neighbors, a norm's gradient would be 300 times as large in each layer
+        # for frames that are all zero, as without neighbors, a norm's gradient would grow 300 times in each layer
         nn.init.uniform_(attention.out_proj.bias, -(width**-0.5), width**-0.5)
     return encoder

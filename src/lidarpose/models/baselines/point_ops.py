@@ -1,13 +1,12 @@
 """Neighborhoods within padded clouds, in plain torch: farthest points, balls, nearest neighbors.
 
-Clouds are (B, N, 3) m with valid (B, N), False where a row is padding. Dense distance matrices: meant for some
-thousand points.
+Clouds are (B, N, 3) m with valid (B, N), False for padding. Distance matrices are dense: meant for thousands of points.
 """
 
 import torch
 from torch import Tensor
 
-# square distance of what is no neighbor, m²
+# squared distance of points that are not neighbors, m²
 _FAR = 1e10
 
 
@@ -19,20 +18,20 @@ def gather_points(values: Tensor, index: Tensor) -> Tensor:
 
 
 def square_distances(a: Tensor, b: Tensor) -> Tensor:
-    """a (B, M, 3), b (B, N, 3) -> (B, M, N) m²; by differences, since a product of near points loses digits."""
+    """a (B, M, 3), b (B, N, 3) -> (B, M, N) m²; from differences, since a product of near points loses digits."""
     x, y, z = ((a[:, :, None, k] - b[:, None, :, k]).square() for k in range(3))
     return x + y + z
 
 
 def farthest_points(points: Tensor, valid: Tensor, count: int, *, as_published: bool = False) -> Tensor:
-    """(B, count) indices: each next point is the farthest from those before; the first of equals.
+    """(B, count) indices: each next point is the farthest from all previous ones; ties go to the first point.
 
     Args:
         points: (B, N, 3) m.
-        valid: (B, N); a cloud of fewer points than `count` repeats its first choice.
-        count: how many; as many as N, and not `as_published`: all points, in their order.
+        valid: (B, N); a cloud with fewer points than `count` repeats its first choice.
+        count: number of indices; if it is N and not `as_published`: all points, in their order.
         as_published: begin at point 0 and never choose a point within 3.2 cm of the origin, as the CUDA kernel of
-            PointNet++ does; else begin at the point farthest from the mean, whatever the order of the points.
+            PointNet++ does; else begin at the point farthest from the mean, independent of the order of the points.
     """
     points, cloud = points.detach(), torch.arange(len(points), device=points.device)
     is_candidate = valid & (points.square().sum(-1) > 1e-3) if as_published else valid
@@ -49,7 +48,7 @@ def farthest_points(points: Tensor, valid: Tensor, count: int, *, as_published: 
     indices = [index]
     for _ in range(count - 1):
         nearest_distance = torch.minimum(nearest_distance, (points - points[cloud, index][:, None]).square().sum(-1))
-        # rows of padding are below every distance; once every point is chosen, the first one again
+        # padding is below every distance; once every point is chosen, the first one is repeated
         index = torch.where(nearest_distance.amax(1) > 0, nearest_distance.argmax(1), indices[0])
         indices.append(index)
     return torch.stack(indices, 1)
@@ -58,9 +57,9 @@ def farthest_points(points: Tensor, valid: Tensor, count: int, *, as_published: 
 def ball_query(
     centers: Tensor, points: Tensor, valid: Tensor, radius: float, count: int, *, as_published: bool = False
 ) -> Tensor:
-    """(B, M, count) indices of points within `radius` m of centers (B, M, 3); the nearest ones, repeating the nearest.
+    """(B, M, count) indices of the nearest points within `radius` m of centers (B, M, 3), padded with the nearest one.
 
-    as_published: the first ones in the order of the points, repeating the first, as the CUDA kernel does.
+    as_published: the first points in their order, padded with the first, as in the CUDA kernel.
     """
     distance = square_distances(centers, points)
     is_inside = (distance < radius * radius) & valid[:, None]
@@ -73,7 +72,7 @@ def ball_query(
 
 
 def nearest_neighbors(points: Tensor, valid: Tensor, count: int) -> Tensor:
-    """(B, N, count) indices of each point's nearest points, itself among them; -1 where a cloud has fewer."""
+    """(B, N, count) indices of each point's nearest points, itself among them; -1 if a cloud has fewer."""
     distance = square_distances(points, points).masked_fill(~valid[:, None], _FAR)
     nearest_distance, index = distance.topk(min(count, points.shape[1]), largest=False)
     index = index.masked_fill((nearest_distance >= _FAR) | ~valid[..., None], -1)

@@ -1,6 +1,6 @@
 """Point Transformer V2 as LiDAR-HMR's pose network uses it: a U-Net of grouped vector attention over 16 neighbors.
 
-Rows of all people lie one after the other: M rows, of which `person` says whose they are.
+Rows of all people are concatenated: M rows, with the person of each in `person`.
 """
 
 from dataclasses import dataclass
@@ -21,30 +21,30 @@ NEIGHBORS = 16
 
 @dataclass(frozen=True, kw_only=True)
 class Rows:
-    """Points of B people: xyz (M, 3) m; person (M,) in ascending order; count (B,) of each."""
+    """Points of B people: xyz (M, 3) m; person (M,) in ascending order; count (B,) points of each person."""
 
     xyz: Tensor
     person: Tensor
     count: Tensor
 
     def padded(self) -> tuple[Tensor, Tensor]:
-        """Row numbers (B, N), 0 where `valid` (B, N) is False."""
+        """Row numbers (B, N), 0 for padding, and `valid` (B, N), False for padding."""
         column = torch.arange(int(self.count.max()), device=self.count.device)
         valid = column < self.count[:, None]
         return ((self.count.cumsum(0) - self.count)[:, None] + column).masked_fill(~valid, 0), valid
 
     def neighbors(self, count: int) -> Tensor:
-        """(M, count) numbers of each row's nearest rows of the same person, itself first; -1 for none."""
+        """(M, count) numbers of each row's nearest rows of the same person, itself first; -1 for a missing neighbor."""
         rows, valid = self.padded()
         index = nearest_neighbors(self.xyz[rows], valid, count)
         start = rows[:, :1, None]
         return torch.where(index >= 0, index + start, -1)[valid]
 
     def pooled(self, grid: float) -> tuple["Rows", Tensor]:
-        """Cells of `grid` m, counted from each person's minimum, as rows at their points' mean; and each row's cell."""
+        """Cells of `grid` m, counted from each person's minimum, as rows at their points' mean; each row's cell."""
         low = segment_reduce(self.xyz, self.person, len(self.count), "amin")
         cell = ((self.xyz - low[self.person]) / grid).floor().long()
-        # in the order of (person, x, y, z): rows as one number each, since torch.unique of rows is slow on CPUs
+        # sorted by (person, x, y, z): one number per row, since torch.unique of rows is slow on CPUs
         x, y, z = cell.amax(0) + 1
         key = ((self.person * x + cell[:, 0]) * y + cell[:, 1]) * z + cell[:, 2]
         _, inverse = torch.unique(key, return_inverse=True)
@@ -55,7 +55,7 @@ class Rows:
 
 
 def segment_reduce(values: Tensor, segment: Tensor, segments: int, reduce: str) -> Tensor:
-    """values (M, C) of rows of `segment` (M,) -> (segments, C); 0 for a segment without rows."""
+    """values (M, C), grouped by `segment` (M,) -> (segments, C); 0 for a segment without rows."""
     zeros = values.new_zeros(segments, values.shape[1])
     return zeros.scatter_reduce(0, segment[:, None].expand_as(values), values, reduce, include_self=False)
 
@@ -85,7 +85,7 @@ class PointTransformerV2(nn.Module):
                 module.missing_in_softmax = missing_in_softmax
 
     def forward(self, rows: Rows) -> Tensor:
-        # nearest first, so fewer are the first ones
+        # neighbors are sorted by distance, so the first columns are a smaller neighborhood
         tables = [rows.neighbors(NEIGHBORS)]
         x = self.block(self.embedding(rows.xyz), rows.xyz, tables[0][:, :EMBEDDING_NEIGHBORS])
         levels, skips, parents = [rows], [x], []
@@ -106,13 +106,13 @@ class PointTransformerV2(nn.Module):
 
 
 def _stages(channels: list[int], groups: tuple[int, ...], depth: int) -> Any:
-    """A list of blocks a level."""
+    """A list of blocks per level."""
     levels = zip(channels, groups, strict=True)
     return nn.ModuleList(nn.ModuleList(Block(c, g) for _ in range(depth)) for c, g in levels)
 
 
 class Block(nn.Module):
-    """Linear, attention, Linear, each with a batch norm, about a residual."""
+    """A residual block of Linear, attention, Linear, each with a batch norm."""
 
     def __init__(self, channels: int, groups: int):
         super().__init__()
@@ -129,7 +129,7 @@ class Block(nn.Module):
 class GroupedVectorAttention(nn.Module):
     """Wu et al., Point Transformer V2, Eq. 4 to 6: a weight for each neighbor and group of channels.
 
-    missing_in_softmax: a neighbor that does not exist is one of zeros at the row's own place in all but the last step.
+    missing_in_softmax: a missing neighbor counts as zeros at the row's own position, except in the last step.
     """
 
     missing_in_softmax = False
@@ -145,18 +145,18 @@ class GroupedVectorAttention(nn.Module):
         self.weight = nn.Sequential(nn.BatchNorm1d(groups), nn.ReLU(), nn.Linear(groups, groups))
 
     def forward(self, x: Tensor, xyz: Tensor, neighbors: Tensor) -> Tensor:
-        """x (M, C), xyz (M, 3), neighbors (M, k), -1 for none -> (M, C)."""
+        """x (M, C), xyz (M, 3), neighbors (M, k), -1 for a missing one -> (M, C)."""
         exists = neighbors >= 0
-        # rows of neighbors that exist, all in one list: batch norms see no others
+        # existing neighbors in one list, so that batch norms see no others
         row, slot = (exists | self.missing_in_softmax).nonzero(as_tuple=True)
         neighbor = neighbors[row, slot]
         offset = (xyz[neighbor] - xyz[row]).masked_fill(neighbor[:, None] < 0, 0)
         bias = self.position[1](self.position[0](offset))
-        # of relation = key - query + bias, summed within groups: keys and queries before they are copied to neighbors
+        # relation = key - query + bias, summed within groups; keys and queries before they are copied to neighbors
         key, query = self._summed(self.key(x)), self._summed(self.query(x))
         all_values = self.value(x)
         if self.missing_in_softmax:
-            # the last row, which is that of -1
+            # a row of zeros at the end, which the index -1 reads
             key, all_values = (nn.functional.pad(rows, (0, 0, 0, 1)) for rows in (key, all_values))
         scores = self.weight(key[neighbor] - query[row] + self._summed(bias))
         weight = scores.new_full((*neighbors.shape, self.groups), -torch.inf).index_put((row, slot), scores).softmax(1)

@@ -1,7 +1,7 @@
-"""PRN, the pose regression network of LiDAR-HMR (Fan et al. 2023): points vote for joints, attention refines them.
+"""PRN, the pose regression network of LiDAR-HMR (Fan et al. 2023): points vote for joints, attention refines the votes.
 
-`Prn` is the published one on Point Transformer V2. `PrnNeck` is the same idea on the features of any backbone, as the
-paper exchanges it.
+`Prn` is the published network on Point Transformer V2. `PrnNeck` is the same idea on the features of any backbone, as
+the paper exchanges it.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from lidarpose.models.baselines.baseline_config import PrnConfig
 from lidarpose.models.baselines.point_transformer_v2 import EMBEDDING, PointTransformerV2, Rows, segment_reduce
 from lidarpose.models.layers import attend
 
-# a point votes where body is this likely and one joint is
+# a point votes if its background probability is below this and its most likely part's probability is above it
 VOTES = 0.6
 
 
@@ -29,9 +29,9 @@ class PrnOutputs:
 
 
 class Prn(nn.Module):
-    """1.74 M parameters. Of the published network: background is the last part."""
+    """1.74 M parameters. As in the published network, background is the last part."""
 
-    # tensors with a row for each joint, in this order, and perhaps one more for background
+    # tensors with one row per joint, in order, and some with one more row for background
     per_joint = ("joint.", "vote.parts.7.", "unused.3.")
 
     def __init__(self, config: PrnConfig):
@@ -39,7 +39,7 @@ class Prn(nn.Module):
         self.config = config
         joints, channels = len(config.joints), EMBEDDING // config.width_divisor
         self.backbone = PointTransformerV2(config.width_divisor, config.missing_in_softmax)
-        # a classifier that the published network has and does not read
+        # a classifier that the published network has but does not use
         self.unused = nn.Sequential(
             nn.Linear(channels, channels), nn.BatchNorm1d(channels), nn.ReLU(), nn.Linear(channels, joints + 1)
         ).requires_grad_(False)
@@ -49,12 +49,12 @@ class Prn(nn.Module):
         self.embed = nn.Linear(32 + 3, channels)
         dropout = config.attention_dropout
         self.attention = nn.ModuleList(BareAttention(width, heads=3, dropout=dropout) for _ in range(2))
-        # no activation between the last two: as published
+        # no activation between the last two layers, as published
         self.output = nn.Sequential(nn.Linear(width, 16), nn.ReLU(), nn.Linear(16, 8), nn.Linear(8, 3))
 
     def forward(self, points: Tensor, valid: Tensor, center: Tensor | None = None) -> PrnOutputs:
-        """points (B, N, 3) m about the middle of their extent, valid (B, N) bool, at least one a person; center: for
-        `Lpformer` alone."""
+        """points (B, N, 3) m relative to the middle of their extent, valid (B, N) bool, at least one per person;
+        center: used by `Lpformer` alone."""
         person = torch.arange(len(points), device=points.device)[:, None].expand_as(valid)[valid]
         rows = Rows(xyz=points[valid], person=person, count=valid.sum(1))
         features = self.backbone(rows)
@@ -71,8 +71,11 @@ class Prn(nn.Module):
 
 
 class OffsetHead(nn.Module):
-    """Parts and offsets of points, from their features beside the maximum and mean of the person's; and the joints that
-    they vote for. background: which of the parts that is."""
+    """Parts and offsets of points, and the joints that they vote for.
+
+    The inputs are the points' features and the maximum and mean of each person's features. background: index of the
+    background part.
+    """
 
     def __init__(self, channels: int, joints: int, *, background: int):
         super().__init__()
@@ -85,7 +88,7 @@ class OffsetHead(nn.Module):
         summary = [segment_reduce(features, rows.person, people, kind)[rows.person] for kind in ("amax", "mean")]
         context = torch.cat([features, *summary], 1)
         parts, offsets = self.parts(context), self.offsets(context)
-        # in half precision too votes are summed in single
+        # votes are summed in single precision, also under half precision
         probability = parts.float().softmax(1)
         background = probability[:, self.background]
         joint_probability = torch.cat([probability[:, : self.background], probability[:, self.background + 1 :]], 1)
@@ -100,7 +103,7 @@ class OffsetHead(nn.Module):
 
 
 class BareAttention(nn.Module):
-    """x + attention(x): neither norm nor feed-forward nor output layer. Dropout is on the weights."""
+    """x + attention(x), without norm, feed-forward or output layer. Dropout is on the weights."""
 
     def __init__(self, channels: int, heads: int, dropout: float = 0.1):
         super().__init__()
@@ -120,9 +123,9 @@ class BareAttention(nn.Module):
 
 
 class PrnNeck(nn.Module):
-    """The neck of the DAPT repository: votes and three layers of stock attention on features (M, C) of a backbone.
+    """The neck of the DAPT repository: votes, and three layers of stock attention, on features (M, C) of a backbone.
 
-    Background is part 0. Of its training no configuration is published; see docs/method.md for ours.
+    Background is part 0. No configuration of its training is published; see docs/method.md for ours.
     """
 
     def __init__(self, channels: int, joints: int, heads: int = 4, dropout: float = 0.1):

@@ -1,6 +1,6 @@
 """Sizes of the paper's network, its joints and heatmaps, and the configurations by name. Numpy only.
 
-Legend: L levels (0 = the finest), J joints, W heatmap bins an axis.
+Legend: L levels (0 = the finest), J joints, W heatmap bins per axis.
 """
 
 from dataclasses import dataclass, fields
@@ -12,7 +12,7 @@ from lidarpose.errors import InputError, check_name
 from lidarpose.models.config import MOST, Config, at_least, check_counts, check_joints, is_number, probability
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24
 
-# the order in which the released Waymo network knows its joints: Waymo's own numbers, limb after limb
+# joint order of the released Waymo network: Waymo's own numbering, limb by limb
 WAYMO_JOINTS = tuple(
     """nose left_shoulder left_elbow left_wrist left_hip left_knee left_ankle
     right_shoulder right_elbow right_wrist right_hip right_knee right_ankle head_center""".split()
@@ -21,35 +21,36 @@ WAYMO_JOINTS = tuple(
 PARTS = 25
 # space-filling curves, see `voxel_tables`
 CURVES = ("z", "z-trans", "hilbert", "hilbert-trans")
-# how joints come out of the decoder, see `DaptConfig`
+# how joints are read from the decoder, see `DaptConfig`
 NECKS = ("mde", "finest", "prn")
-# cells are counted in so many bits along each axis
+# bits of a cell index along each axis
 CELL_BITS = 16
 
 Range = tuple[float, float]
 
-# settings that bring a fault of the released code back, and those that its weights were trained with
+# settings that each reproduce a fault of the released code, and those that its weights were trained with
 FAULTS = ("stale_convolution", "grid_from_minimum", "zero_anchors")
 RELEASED_FAULTS: dict[str, Any] = {"stale_convolution": True, "grid_from_minimum": True}
 
 
 @dataclass(frozen=True, kw_only=True)
 class DaptConfig(Config):
-    """The network: a Point Transformer V3 U-Net, joint anchors that read every level of its decoder, heads.
+    """The network: a Point Transformer V3 U-Net, joint anchors that attend to every level of its decoder, heads.
 
     name: of the configuration; joints: names in the network's own order; bins, ranges: heatmap bins (W) and (low, high)
-    in meters for x, y and z, both empty where there are no heatmaps; encoder_*: one entry a level; decoder_*: one entry
-    a level but the last; anchor_channels: width of the anchors after each level's exchange, the last where they begin;
-    anchor_heads, anchor_dropout: of the neck's layers; neck: "mde", anchors read every level of the decoder (the
-    paper's network); "finest", four layers read the finest level alone (Table 3 without MDE), anchors and layers as
-    wide as it; "prn", no anchors, voxels vote and attention refines (`PrnNeck`), coordinates come from there; patch:
-    voxels within which attention is full; grid: edge of a voxel of level 0, meters; strides: how many times wider the
-    next level's voxels are; orders: curves for people of more than `patch` voxels; drop_path: the last block's; parts:
-    classes of the part head, 0 for no such head; coordinates: a head that reads x, y, z off each anchor (the paper's
-    pre-training); auxiliary: a head that reads all joints off the bottleneck (the released fine-tuning). `FAULTS`, what
-    the released code does otherwise, each False for mended; its weights need the first two: stale_convolution: later
-    blocks' convolutions read rows of before the last sum (see `dapt_net`); grid_from_minimum: cells count from the
-    cloud's own minimum, so that one outlier moves them all; zero_anchors: new anchors begin at zero, all equal.
+    in meters for x, y and z, both empty without heatmaps; encoder_*: one entry per level; decoder_*: one entry per
+    level but the last; anchor_channels: width of the anchors after each level's exchange, the last entry before any
+    exchange; anchor_heads, anchor_dropout: of the neck's layers; neck: "mde", anchors attend to every level of the
+    decoder (the paper's network); "finest", four layers attend to the finest level alone (Table 3 without MDE), anchors
+    and layers as wide as that level; "prn", no anchors, voxels vote and attention refines the votes (`PrnNeck`), which
+    gives the coordinates; patch: number of voxels within which attention is full; grid: edge of a voxel of level 0,
+    meters; strides: width of the next level's voxels relative to each level's; orders: curves for people with more than
+    `patch` voxels; drop_path: of the last block; parts: classes of the part head, 0 for no part head; coordinates: a
+    head that predicts x, y, z from each anchor (the paper's pre-training); auxiliary: a head that predicts all joints
+    from the bottleneck (the released fine-tuning). `FAULTS` of the released code, each False for the corrected
+    behavior; its weights need the first two: stale_convolution: the convolutions of later blocks read rows from before
+    the last sum (see `dapt_net`); grid_from_minimum: cells count from the cloud's own minimum, so that one outlier
+    moves them all; zero_anchors: new anchors are initialized to zero, all equal.
     """
 
     kind: ClassVar[str] = "dapt"
@@ -121,7 +122,7 @@ class DaptConfig(Config):
 
     @property
     def layers(self) -> int:
-        """Blocks of all levels, encoder and decoder."""
+        """Number of blocks at all levels, encoder and decoder."""
         return sum(self.encoder_depths) + sum(self.decoder_depths)
 
     @property
@@ -131,23 +132,23 @@ class DaptConfig(Config):
 
     @property
     def low(self) -> np.ndarray:
-        """(3,) m: where bin 0 of each axis lies."""
+        """(3,) m: position of bin 0 on each axis."""
         return np.array([low for low, _ in self.ranges])
 
     @property
     def step(self) -> np.ndarray:
-        """(3,) m: how far apart the bins of each axis are. position = low + index * step, as in the released code."""
+        """(3,) m: spacing of the bins on each axis. position = low + index * step, as in the released code."""
         return np.array([(high - low) / n for (low, high), n in zip(self.ranges, self.bins, strict=True)])
 
     @classmethod
     def from_dict(cls, entries: dict) -> "DaptConfig":
         """From `to_dict`'s entries, or from the constructor arguments of the authors' backbone.
 
-        The latter are known by their `enc_depths`; `grid`, their heatmap arguments, with "size" and "range", means a
-        fine-tuned network (heatmaps and auxiliary head), no `grid` a pre-trained one (coordinates and parts). Joints
-        follow from `num_keypoints`: 14 Waymo's, 15 HumanM3's, 24 SMPL's, unless `joints` names them; name, parts,
-        coordinates, auxiliary and `FAULTS` may be added, or legacy for both of `RELEASED_FAULTS`. Raises InputError for
-        what does not fit.
+        The latter are recognized by `enc_depths`. In them, `grid` holds the heatmap arguments "size" and "range" of a
+        fine-tuned network (heatmaps and auxiliary head); without `grid` the network is a pre-trained one (coordinates
+        and parts). Joints follow from `num_keypoints`: 14 are Waymo's, 15 HumanM3's, 24 SMPL's, unless `joints` names
+        them; name, parts, coordinates, auxiliary and `FAULTS` may be added, or legacy for both of `RELEASED_FAULTS`.
+        Raises InputError for entries that do not fit.
         """
         entries = cls.renamed(entries)
         if "enc_depths" in entries:
@@ -162,7 +163,7 @@ class DaptConfig(Config):
 
     @staticmethod
     def renamed(entries: dict[str, Any]) -> dict[str, Any]:
-        """`legacy`, one word for both faults of the released weights, as these two."""
+        """Replaces `legacy`, which stands for both of `RELEASED_FAULTS`, with these two settings."""
         if "legacy" not in entries:
             return entries
         return {name: value for name, value in entries.items() if name != "legacy"} | dict.fromkeys(
@@ -174,14 +175,14 @@ def _is_range(value: object) -> bool:
     return isinstance(value, tuple) and len(value) == 2 and all(map(is_number, value)) and value[0] < value[1]
 
 
-# the authors' names of what this package names otherwise
+# settings that the authors name differently: their name, and this package's
 _REFERENCE = dict(
     pair.split(":")
     for pair in """enc_depths:encoder_depths enc_channels:encoder_channels enc_num_head:encoder_heads
     dec_depths:decoder_depths dec_channels:decoder_channels dec_num_head:decoder_heads dec_kp_channels:anchor_channels
     mlp_ratio:mlp_ratio stride:strides order:orders drop_path:drop_path grid_size:grid""".split()
 )
-# what the authors' arguments must be for this network to be theirs
+# values that the authors' arguments must have: others describe a different network
 _FIXED = {"in_channels": 3, "dec_kp_mixer": "attn", "num_extra": 0, "pre_norm": True, "qkv_bias": True}
 _FIXED |= dict.fromkeys(("enable_rpe", "cls_mode", "pdnorm_bn", "pdnorm_ln"), False)
 _JOINTS = (WAYMO_JOINTS, HUMAN15.joints, SMPL24.joints)
@@ -210,21 +211,21 @@ def _from_reference(entries: dict) -> dict:
             settings |= {"bins": heatmaps["size"], "ranges": heatmaps["range"], "name": "released", "auxiliary": True}
         except (KeyError, TypeError):
             raise InputError(f"grid must be {{'size': ..., 'range': ...}} of the heatmaps, got {heatmaps!r}") from None
-    # what their arguments do not say
+    # settings that their arguments do not cover
     extra_names = ("name", "parts", "coordinates", "auxiliary", *FAULTS)
     return settings | {name: entries[name] for name in extra_names if name in entries}
 
 
 def _released(name: str, joints: tuple[str, ...], bins: tuple[int, int], half_widths: Range) -> DaptConfig:
-    """bins and half widths in meters of (x and y, z)."""
+    """A released configuration; bins and half widths in meters are each (of x and y, of z)."""
     xy_range, z_range = ((-r, r) for r in half_widths)
     heads: dict[str, Any] = {"bins": (bins[0], *bins), "ranges": (xy_range, xy_range, z_range), "auxiliary": True}
     return DaptConfig(name=name, joints=joints, **heads, **RELEASED_FAULTS)
 
 
 _ALL_HEADS: dict[str, Any] = {"parts": PARTS, "coordinates": True, "auxiliary": True}
-# `paper`: the paper's network for the superset skeleton, every head of both stages, so that none is thrown away between
-# pre-training and fine-tuning; the others: what the authors' own files hold
+# `paper`: the paper's network for the superset skeleton, with the heads of both stages, so that none is discarded
+# between pre-training and fine-tuning; the others: the networks in the authors' own files
 CONFIGS = {
     "paper": DaptConfig(name="paper", joints=BODY26.joints, bins=(220,) * 3, ranges=((-1.1, 1.1),) * 3, **_ALL_HEADS),
     "waymo": _released("waymo", WAYMO_JOINTS, (72, 120), (0.9, 1.5)),

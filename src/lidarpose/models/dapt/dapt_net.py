@@ -1,13 +1,14 @@
 """`DaptNet`: the paper's network. A Point Transformer V3 U-Net whose decoder feeds joint anchors, level by level.
 
-Legend: B people, M voxels of all people at a level, one after the other, N voxels a person at most, J joints, C
-channels, A anchor channels, W heatmap bins, P parts.
+Legend: B people, M voxels of all people at a level, concatenated, N voxels per person at most, J joints, C channels, A
+anchor channels, W heatmap bins, P parts.
 
-Modules bear the names of the released weights, so that these load by name.
+Modules have the names of the released weights, so that these load by name.
 
-Stale convolutions. In the released code a sparse tensor is not brought up to date after each block and each unpooling:
-the convolution of every later block reads the block's last branch instead of the sum, and the first one of a decoder
-stage reads the skip alone. Weights trained so need it (`config.stale_convolution`); new ones are trained without.
+Stale convolutions. In the released code a sparse tensor is not updated after each block and each unpooling: the
+convolution of every later block reads the previous block's last branch instead of the sum, and the first convolution of
+a decoder stage reads the skip alone. Weights trained this way need it (`config.stale_convolution`); new weights are
+trained without it.
 """
 
 from collections import OrderedDict
@@ -27,16 +28,16 @@ from lidarpose.models.dapt.point_transformer_v3 import Perceptron, RowNorm, Stag
 from lidarpose.models.dapt.voxel_tables import Level, Tables, build_tables
 from lidarpose.models.layers import mean_bin
 
-# layers of the neck that reads the finest level alone
+# number of layers of the neck that reads the finest level alone
 FINEST_LAYERS = 4
 
 
 class MultiDensityExchange(nn.Module):
-    """Multi-density exchange: anchors (B, J, A) look at each other, then at the voxels of one level.
+    """Multi-density exchange: anchors (B, J, A) attend to each other, then to the voxels of one level.
 
-    Paper: A_{m-1} = MDE_m(A_m, f_m). A stock post-norm decoder layer, anchors as its targets, voxels as its memory;
-    one-way, the voxels never see the anchors. As in the released code and unlike the paper's words, widths are aligned
-    by Linear and norm where they differ, and the coarsest level is not read.
+    Paper: A_{m-1} = MDE_m(A_m, f_m). A stock post-norm decoder layer with anchors as targets and voxels as memory. It
+    is one-way: voxels never attend to anchors. As in the released code, and unlike the paper's text, widths that differ
+    are matched by Linear and norm, and the coarsest level is not read.
     """
 
     def __init__(self, channels: int, voxel_channels: int, out_channels: int, heads: int, dropout: float):
@@ -54,7 +55,7 @@ class MultiDensityExchange(nn.Module):
 
 
 class FinestNeck(nn.Module):
-    """Stock post-norm decoder layers, anchors (B, J, C) as targets, the voxels of level 0 as memory; LayerNorm.
+    """Stock post-norm decoder layers, anchors (B, J, C) as targets, the voxels of level 0 as memory; then a LayerNorm.
 
     Paper: Table 3, anchors without MDE.
     """
@@ -79,12 +80,12 @@ def _aligned(channels: int, out_channels: int) -> nn.Module:
 
 @dataclass(frozen=True, kw_only=True)
 class DaptOutputs:
-    """Raw results in the person's frame; None where the network has no such head.
+    """Raw results in the person's frame; None if the network lacks the head.
 
-    anchors (B, J, A) after the neck; logits_x, logits_y, logits_z (B, J, W) heatmaps; inter (B, J, 3) m, the
-    auxiliary head's joints; points (M, C) features of the voxels of level 0; parts (M, P) logits, 0 = background, of
-    the neck prn's (M, J + 1) the joint nearest; coordinates (B, J, 3) m, the coordinate head's joints or prn's refined
-    ones; voted (B, J, 3) m, prn's before; low, step: where bin 0 lies and how far apart bins are, m.
+    anchors (B, J, A) after the neck; logits_x, logits_y, logits_z (B, J, W) heatmaps; inter (B, J, 3) m, joints of the
+    auxiliary head; points (M, C) features of the voxels of level 0; parts (M, P) logits, 0 = background, for the neck
+    prn (M, J + 1) of the nearest joint; coordinates (B, J, 3) m, joints of the coordinate head, or refined ones of prn;
+    voted (B, J, 3) m, joints of prn before refinement; low, step: position of bin 0 and spacing of bins, m.
     """
 
     anchors: Tensor | None
@@ -100,9 +101,9 @@ class DaptOutputs:
     voted: Tensor | None = None
 
     def joints(self) -> Tensor:
-        """(B, J, 3) m, differentiable: the heatmaps' windowed mean, as `decode.window`; else the coordinates."""
+        """(B, J, 3) m, differentiable: the windowed mean of the heatmaps, as `decode.window`; else the coordinates."""
         if self.logits_x is None:
-            # a network has the one head or the other
+            # a network has at least one of the two heads
             return cast("Tensor", self.coordinates)
         heatmaps = cast("tuple[Tensor, Tensor, Tensor]", (self.logits_x, self.logits_y, self.logits_z))
         axes = [mean_bin(h) * step + low for h, low, step in zip(heatmaps, self.low, self.step, strict=True)]
@@ -123,7 +124,7 @@ class DaptNet(nn.Module):
         if config.neck == "prn":
             heads["prn"] = PrnNeck(width, len(config.joints), config.anchor_heads, config.anchor_dropout)
         elif config.coordinates:
-            # the released files hold one of the two heads of an anchor, under one name
+            # the released files hold only one of the two anchor heads, under the same name
             heads["coordinate" if config.bins else "query"] = coordinate_head(width, 3)
         if config.auxiliary:
             heads["inter_feat"] = coordinate_head(config.encoder_channels[-1], 3 * len(config.joints))
@@ -159,9 +160,9 @@ class DaptNet(nn.Module):
         )
 
     def batch(self, clouds: list[np.ndarray], *, layout: str | None = None) -> Tables[Tensor]:
-        """Clouds (n, 3) m, each in its person's frame, as the network's device and precision read them.
+        """Tables of clouds (n, 3) m, each in its person's frame, on the network's device and in its precision.
 
-        layout: as in `build_tables`; None takes the one that suits the device.
+        layout: as in `build_tables`; None selects the faster one for the device.
         """
         parameter = next(self.parameters())
         layout = layout or ("ragged" if parameter.device.type == "cpu" else "padded")
@@ -170,12 +171,12 @@ class DaptNet(nn.Module):
     def outputs(self, clouds: list[np.ndarray]) -> dict[str, np.ndarray]:
         """Raw results, in evaluation mode, of people's clouds (n, 3) m, each in its person's frame.
 
-        By name, where the network has the head: anchors, logits_x, logits_y, logits_z, inter, coordinates, and of all
-        points in the order given point_feat_last (points, C) and parts (points, P); float32. A cloud may be of any
-        float type and may be empty. Raises InputError for anything else.
+        By name, if the network has the head: anchors, logits_x, logits_y, logits_z, inter, coordinates, voted, and for
+        all points in the given order point_feat_last (points, C) and parts (points, P); float32. A cloud may be of any
+        float or integer type and may be empty. Raises InputError for anything else.
         """
         clouds = [_cloud(cloud, k) for k, cloud in enumerate(clouds)]
-        # nobody: the shapes of somebody, cut to none
+        # without clouds, one empty cloud gives the shapes; its results are removed
         batch = self.batch(clouds or [np.zeros((0, 3), np.float32)])
         was_training = self.training
         self.eval()
@@ -193,7 +194,7 @@ class DaptNet(nn.Module):
 
 
 class _Backbone(nn.Module):
-    """Encoder, decoder, and the anchors that read it: after each of its stages, or the last one's voxels."""
+    """Encoder, decoder, and the anchors, which read the voxels after each decoder stage or after the last one alone."""
 
     def __init__(self, config: DaptConfig):
         super().__init__()
@@ -214,7 +215,7 @@ class _Backbone(nn.Module):
         necks: dict[int, nn.Module] = {}
         for s, drops in enumerate(_drop_rates(config.decoder_depths, config.drop_path)):
             coarser = up_widths[s + 1], widths[s]
-            # within a stage the first block drops most
+            # within a decoder stage, the first block has the highest rate
             stages.append(Stage(up_widths[s], config.decoder_heads[s], config.mlp_ratio, drops[::-1], coarser=coarser))
             anchor_in, anchor_out = config.anchor_channels[s + 1], config.anchor_channels[s]
             if self.neck == "mde":
@@ -234,7 +235,7 @@ class _Backbone(nn.Module):
             self.keypoint_embedding = nn.Parameter(torch.randn(len(config.joints), width) * scale)
 
     def forward(self, batch: Tables[Tensor]) -> tuple[Tensor | None, Tensor, Tensor]:
-        """Anchors (B, J, A), None without; level 0's rows (M, C); the bottleneck's maximum over each person (B, C')."""
+        """Anchors (B, J, A) or None; rows (M, C) of level 0; the bottleneck's maximum over each person (B, C')."""
         stem: Any = self.embedding.stem
         rows = F.gelu(stem.norm(stem.conv(batch.features, batch.stem)))
         skips = []
@@ -244,7 +245,7 @@ class _Backbone(nn.Module):
                 rows = stage.down(rows, batch.levels[s - 1].children)
             rows = stage.blocks(rows, rows, level, stale_convolution=self.stale_convolution)
             skips.append(rows)
-        # rows of a person are repeated in its empty slots, which a maximum does not notice
+        # empty slots repeat rows of the same person, which does not change the maximum
         bottleneck = rows[batch.levels[-1].slots].amax(1)
 
         anchors = None if self.neck == "prn" else self.keypoint_embedding.expand(bottleneck.shape[0], -1, -1)
@@ -258,12 +259,12 @@ class _Backbone(nn.Module):
 
 
 class HeatmapHead(nn.Module):
-    """Paper: "Heatmap decoder for joints". Three perceptrons, one an axis, shared by all joints."""
+    """Paper: "Heatmap decoder for joints". Three perceptrons, one per axis, shared by all joints."""
 
     def __init__(self, channels: int, config: DaptConfig):
         super().__init__()
         self.fcs = nn.ModuleList(Perceptron(channels, channels, bins) for bins in config.bins)
-        # kept in the released files, read by nobody here: the configuration knows the ranges exactly
+        # part of the released files, not used by the network: the configuration has the exact ranges
         self.register_buffer("coord_range", torch.tensor(config.ranges))
         self.register_buffer("joint_wise_weight", torch.ones(len(config.joints)))
 
@@ -284,7 +285,7 @@ def part_head(channels: int, parts: int) -> nn.Sequential:
 
 
 def _drop_rates(depths: tuple[int, ...], max_rate: float) -> list[list[float]]:
-    """Of each stage those of its blocks, rising from 0 to `max_rate` over all stages."""
+    """Drop rates of each stage's blocks, rising from 0 to `max_rate` over all stages."""
     rates = np.linspace(0, max_rate, sum(depths))
     return [stage.tolist() for stage in np.split(rates, np.cumsum(depths)[:-1])]
 
@@ -299,7 +300,7 @@ def _cloud(cloud: np.ndarray, number: int) -> np.ndarray:
 
 
 def to_tensors(record: Any, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Any:
-    """A record of arrays as the same record of tensors, floats as `dtype`."""
+    """A record of arrays as the same record of tensors, with floats as `dtype`."""
     if isinstance(record, np.ndarray):
         return torch.as_tensor(record).to(device, dtype if record.dtype.kind == "f" else None)
     if isinstance(record, tuple):

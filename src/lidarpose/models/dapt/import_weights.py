@@ -1,7 +1,7 @@
-"""The authors' weights: a safetensors file of theirs, checked tensor by tensor, becomes a `DaptNet`.
+"""Imports the authors' weights: a safetensors file of theirs, checked tensor by tensor, becomes a `DaptNet`.
 
-Only safetensors is read. What the authors published as .pth or .bin is a pickle, which can run any program when it is
-opened, so its conversion is left to whoever trusts it.
+Only safetensors is read. The authors' .pth and .bin files are pickles, which can run any program when they are opened,
+so their conversion is left to users who trust them.
 """
 
 import json
@@ -16,7 +16,7 @@ from lidarpose.models.checkpoint import Header, SafetensorsFile, save_checkpoint
 from lidarpose.models.dapt.dapt_config import CONFIGS, RELEASED_FAULTS, DaptConfig, named_config
 from lidarpose.models.dapt.dapt_net import DaptNet
 
-# what a wrapper for several GPUs puts before every name
+# prefix that a multi-GPU wrapper adds to every name
 _PREFIX = "module."
 _PICKLES = (".pth", ".pt", ".bin", ".ckpt", ".pkl")
 
@@ -25,13 +25,13 @@ def import_dapt(path: str | os.PathLike, config: DaptConfig | dict | str | None 
     """The released network in evaluation mode, float32 on the CPU, with the data flow that it was trained with.
 
     Args:
-        path: the weights as .safetensors. Names of tensors may all begin with "module.".
+        path: the weights as .safetensors. All names of tensors may begin with "module.".
         config: a `DaptConfig`, its entries or the authors' constructor arguments as a dict (`DaptConfig.from_dict`), or
             a name (waymo, humanm3, lidarhuman26m, sloper4d, pretrain); None reads the file's header, entry "config".
             `RELEASED_FAULTS` are on unless a `DaptConfig` or a dict says otherwise.
 
     Raises:
-        InputError: one line that names the file and the tensor, for all that does not fit.
+        InputError: one line that names the file and the tensor, if anything does not fit.
     """
     path = Path(path)
     if path.suffix.lower() in _PICKLES:
@@ -44,7 +44,7 @@ def import_dapt(path: str | os.PathLike, config: DaptConfig | dict | str | None 
     config = _config(path, file.metadata, config)
     remedy = f"name the configuration that it was trained with ({', '.join(CONFIGS)})"
     network = file.network(config, source=f"the configuration {config.name}", remedy=remedy)
-    # the released heatmap head carries its ranges: they must be those that its logits will be read with
+    # the released heatmap head stores its ranges: they must equal those with which its logits will be decoded
     ranges = network.state_dict().get("heads.query.coord_range")
     if ranges is not None and not torch.allclose(ranges, torch.tensor(config.ranges), atol=1e-4):
         raise file_error(
@@ -56,9 +56,9 @@ def import_dapt(path: str | os.PathLike, config: DaptConfig | dict | str | None 
 
 
 def import_released(source: str | os.PathLike, out: str | os.PathLike, *, config: str | None = None) -> Header:
-    """Writes the authors' weights at `source` as a checkpoint of this package; config: as `import_dapt` takes it.
+    """Writes the authors' weights at `source` as a checkpoint of this package; config: as for `import_dapt`.
 
-    Raises InputError, one line that names the file and the tensor, for all that does not fit; then nothing is written.
+    Raises InputError, one line that names the file and the tensor, if anything does not fit; then nothing is written.
     """
     check_suffix(out, ".safetensors")
     check_not_input(out, source)

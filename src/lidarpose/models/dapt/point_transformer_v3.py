@@ -1,7 +1,7 @@
-"""Blocks of Point Transformer V3 as DAPT's released code has them: convolutions over voxels, patch attention, pooling.
+"""Blocks of Point Transformer V3 as in DAPT's released code: convolutions over voxels, patch attention, pooling.
 
-Legend: M voxels of all people at a level, one after the other, C channels, Q patches, K voxels a patch at most, H
-heads, D channels a head. Modules bear the names of the released weights. Stale convolutions: see `dapt_net`.
+Legend: M voxels of all people at a level, concatenated, C channels, Q patches, K voxels per patch at most, H heads, D
+channels per head. Modules have the names of the released weights. Stale convolutions: see `dapt_net`.
 """
 
 from typing import cast
@@ -13,12 +13,12 @@ from torch.nn import functional as F
 from lidarpose.models.dapt.voxel_tables import Level, Neighbors
 from lidarpose.models.layers import DropPath, attend
 
-# of the released code's batch norms
+# eps and momentum of the released code's batch norms
 _EPS, _MOMENTUM = 1e-3, 0.01
 
 
 class RowNorm(nn.BatchNorm1d):
-    """Batch norm over rows (M, C); one row alone has no variance and is normed by the running statistics."""
+    """Batch norm over rows (M, C); a single row has no variance and is normalized by the running statistics."""
 
     def __init__(self, channels: int, eps: float = _EPS, momentum: float = _MOMENTUM):
         super().__init__(channels, eps=eps, momentum=momentum)
@@ -30,7 +30,7 @@ class RowNorm(nn.BatchNorm1d):
 
 
 class SubmanifoldConvolution(nn.Module):
-    """A convolution that computes at occupied cells only and reads occupied cells only.
+    """A convolution that reads and writes only occupied cells.
 
     out[p] = sum over taps k of weight[:, k] @ rows[p + k - middle] + bias. weight (C', k, k, k, C) over x, y, z.
     """
@@ -44,12 +44,13 @@ class SubmanifoldConvolution(nn.Module):
 
     def forward(self, rows: Tensor, near: Neighbors[Tensor]) -> Tensor:
         """rows (M, C) -> (M, C')."""
-        # unbound once: slicing tap after tap would give each slice's gradient the size of the whole weight
+        # unbound once: if sliced tap by tap, the gradient of each slice would have the size of the whole weight
         weights = self.weight.flatten(1, 3).unbind(1)
         out = F.linear(rows, weights[len(weights) // 2], self.bias)
         if near.table is not None:
-            # the row after the last is an empty cell, also of the middle tap, done above: it reads the voxel's own row,
-            # set to zero. One row for all of them would be read so often that its gradient takes most of a GPU's step
+            # row number M marks an empty cell, and the middle tap, which is computed above: these taps read the voxel's
+            # own row, set to zero. If they shared one zero row, it would be read so often that its gradient takes most
+            # of a training step on a GPU
             count, width = near.table.shape
             is_empty = near.table == count
             own = torch.arange(count, device=rows.device)[:, None]
@@ -57,7 +58,7 @@ class SubmanifoldConvolution(nn.Module):
             neighbor_rows = rows.index_select(0, index).view(count, width, -1).masked_fill(is_empty[..., None], 0)
             neighbor_rows = neighbor_rows.flatten(1)
             return out + F.linear(neighbor_rows, self.weight.flatten(1))
-        # all set where there is no table
+        # all three are set if there is no table
         all_sources, all_targets, pairs = cast("tuple[Tensor, Tensor, Tensor]", (near.source, near.target, near.counts))
         counts = pairs.tolist()
         for weight, source, target in zip(weights, all_sources.split(counts), all_targets.split(counts), strict=True):
@@ -67,7 +68,7 @@ class SubmanifoldConvolution(nn.Module):
 
 
 class PatchAttention(nn.Module):
-    """Attention among the voxels of a patch: full attention of a person who is no larger than the patch."""
+    """Attention among the voxels of a patch: full attention for a person with no more voxels than a patch."""
 
     def __init__(self, channels: int, heads: int):
         super().__init__()
@@ -81,12 +82,12 @@ class PatchAttention(nn.Module):
         if level.patch_slots is not None:
             order = order % level.patch_slots.shape[0]
             blocks = qkv[level.patch_slots[order]].unflatten(-1, (3, self.heads, -1))
-            # set with the slots
+            # set together with patch_slots
             place = cast("Tensor", level.patch_place)[order]
             output = self._attend(blocks, level.patch_valid).flatten(0, 1)[place]
             return self.proj(output)
         sequence = level.sequence[order % level.sequence.shape[0]]
-        # one curve alone: rows already stand patch after patch
+        # with one curve, rows are already in the order of the patches
         is_sorted = level.sequence.shape[0] == 1
         qkv = (qkv if is_sorted else qkv[sequence]).unflatten(-1, (3, self.heads, -1))
         lengths = level.patch_lengths.tolist()
@@ -98,7 +99,7 @@ class PatchAttention(nn.Module):
 
     @staticmethod
     def _attend(qkv: Tensor, mask: Tensor | None) -> Tensor:
-        """qkv (Q, K, 3, H, D), mask (Q, K) True = to be read, None for all -> (Q, K, H * D)."""
+        """qkv (Q, K, 3, H, D), mask (Q, K) True for valid keys, None if all are -> (Q, K, H * D)."""
         query, key, value = qkv.permute(2, 0, 3, 1, 4)
         mask = None if mask is None else mask[:, None, None]
         return attend(query, key, value, mask).transpose(1, 2).flatten(2)
@@ -119,7 +120,7 @@ class Perceptron(nn.Module):
 class Block(nn.Module):
     """Convolution as position encoding, attention and feed-forward, each a residual branch; pre-norm.
 
-    The released code loses the sum at a block's end: the next block's convolution reads the last branch alone.
+    In the released code, the next block's convolution does not read the sum at the end of a block, but the last branch.
     """
 
     def __init__(self, channels: int, heads: int, mlp_ratio: int, drop_path: float, order: int):
@@ -137,7 +138,7 @@ class Block(nn.Module):
         self.drop_path = DropPath(drop_path)
 
     def forward(self, rows: Tensor, stale: Tensor, level: Level) -> tuple[Tensor, Tensor]:
-        """rows (M, C) and what the convolution reads (M, C): the rows, or the stale branch -> rows, last branch."""
+        """rows (M, C) and the convolution's input (M, C), either the rows or the stale branch -> rows, last branch."""
         convolution, mix, norm = self.cpe
         rows = rows + norm(mix(convolution(stale, level.near)))
         rows = rows + self.drop_path(self.attn(self.norm1(rows), level, self.order))
@@ -146,10 +147,10 @@ class Block(nn.Module):
 
 
 class Stage(nn.Module):
-    """The blocks of one level and the way to it: `down` from the finer level or `up` from the coarser one.
+    """The blocks of one level and the transition to it: `down` from the finer level or `up` from the coarser one.
 
-    drops: `DropPath` of each block; finer: channels of the level to pool; coarser: channels of the level to unpool and
-    of the encoder's rows of this one.
+    drops: drop probability of each block; finer: channels of the level to pool; coarser: channels of the level to
+    unpool and of the encoder's rows at this level.
     """
 
     def __init__(
@@ -173,7 +174,7 @@ class Stage(nn.Module):
             self.add_module(f"block{k}", block)
 
     def blocks(self, rows: Tensor, stale: Tensor, level: Level, *, stale_convolution: bool) -> Tensor:
-        """rows (M, C) -> (M, C); `stale` is what the first convolution reads where convolutions are stale."""
+        """rows (M, C) -> (M, C); `stale` is the input of the first convolution if convolutions are stale."""
         for k in range(self.depth):
             block = getattr(self, f"block{k}")
             rows, stale = block(rows, stale if stale_convolution else rows, level)
@@ -181,7 +182,7 @@ class Stage(nn.Module):
 
 
 class Pooling(nn.Module):
-    """Rows of a level to the voxels of the next: Linear, the maximum of the children, norm, GELU."""
+    """Pools rows of a level to the voxels of the next: Linear, the maximum of the children, norm, GELU."""
 
     def __init__(self, channels: int, out_channels: int):
         super().__init__()
@@ -193,7 +194,7 @@ class Pooling(nn.Module):
 
 
 class Unpooling(nn.Module):
-    """Rows of the coarser level, brought to their children, plus the encoder's rows of this level."""
+    """Rows of the coarser level, copied to their children, plus the encoder's rows of this level."""
 
     def __init__(self, channels: int, skip_channels: int, out_channels: int):
         super().__init__()
@@ -201,6 +202,6 @@ class Unpooling(nn.Module):
         self.proj_skip = nn.Sequential(nn.Linear(skip_channels, out_channels), RowNorm(out_channels), nn.GELU())
 
     def forward(self, coarse: Tensor, skip: Tensor, parent: Tensor) -> tuple[Tensor, Tensor]:
-        """The sum (M, C), and the skip alone, which is what the released code's first convolution reads."""
+        """The sum (M, C), and the skip alone, which the released code's first convolution reads."""
         skip = self.proj_skip(skip)
         return skip + self.proj(coarse)[parent], skip

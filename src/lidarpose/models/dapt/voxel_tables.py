@@ -1,14 +1,14 @@
-"""From people's points to integer tables: voxels, levels, neighbors, patches. Numpy only.
+"""Converts people's points to integer tables: voxels, levels, neighbors, patches. Numpy only.
 
-Legend: B people, n points of a cloud, M voxels of all people at a level, one after the other, T taps of a kernel,
-P pairs of neighbors, W children at most, N voxels a person at most, Q patches, K voxels a patch at most, O curves.
+Legend: B people, n points of a cloud, M voxels of all people at a level, concatenated, T taps of a kernel, P pairs of
+neighbors, W children at most, N voxels per person at most, Q patches, K voxels per patch at most, O curves.
 
-Paper (via Point Transformer V3): points of a large cloud are put in the order of a curve and cut into patches, within
-which attention is full.
+Paper (via Point Transformer V3): points of a large cloud are sorted along a curve and cut into patches, within which
+attention is full.
 
-Voxels stand in Z-order within each person, at every level: the order of points never matters, and the children of a
-parent are neighbors in memory. A person without points is given one voxel at the center: every level then has a row
-for everybody, and nobody's batch mates need to know.
+Voxels are in Z-order within each person, at every level: the order of points never matters, and the children of a
+parent are adjacent in memory. A person without points gets one voxel at the center: every level then has a row for
+every person, and the other people in the batch are not affected.
 """
 
 from dataclasses import dataclass
@@ -20,19 +20,20 @@ from lidarpose.errors import InputError, check_name
 from lidarpose.models.dapt.dapt_config import CELL_BITS, DaptConfig
 from lidarpose.models.voxelize import Array
 
-# bits an axis of a neighbor's cell: one more, so that a step across the edge meets no cell
+# bits per axis of a neighbor's cell: one more, so that a step across the edge hits no cell
 _WIDE = CELL_BITS + 1
 _MOST_PEOPLE = 1 << (63 - 3 * _WIDE)
-# how convolutions and attention run: see `build_tables`
+# table layouts for convolutions and attention: see `build_tables`
 LAYOUTS = ("ragged", "padded")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Neighbors(Generic[Array]):
-    """The occupied cells about each voxel, taps in the order of a kernel's (x, y, z) offsets, the middle tap left out.
+    """The occupied cells around each voxel; taps in the order of a kernel's (x, y, z) offsets, without the middle tap.
 
-    ragged: source (P,) rows of the neighbors, tap after tap; counts (T,) pairs of each tap (0 for the middle one);
-    target (P,) the rows that they are neighbors of. padded: table (M, T) rows, M for an empty cell; else None.
+    ragged: source (P,) rows of the neighbors, tap by tap; counts (T,) pairs of each tap (0 for the middle one); target
+    (P,) the rows that they are neighbors of. padded: table (M, T) rows, M for an empty cell. Fields of the other layout
+    are None.
     """
 
     source: Array | None = None
@@ -46,12 +47,12 @@ class Level(Generic[Array]):
     """Voxels of one width.
 
     lengths (B,): voxels of each person, at least 1; near: neighbors of 3 x 3 x 3; parent (M,): row of the next level,
-    None at the last; children (M', W): rows of this level under each row of the next, the first repeated, None at the
-    last; slots (B, N): rows of each person, the first repeated; valid (B, N) bool.
+    None at the last; children (M', W): rows of this level under each row of the next, padded with the first, None at
+    the last; slots (B, N): rows of each person, padded with the first; valid (B, N) bool.
 
-    Patches: sequence (O, M) rows in the order of each curve, O = 1 where nobody exceeds the patch; patch_lengths (Q,):
-    how many each patch holds, one after the other; in the padded layout patch_slots (O, Q, K) rows, patch_valid (Q, K),
-    None where all are, and patch_place (O, M), the place of each row among the Q * K.
+    Patches: sequence (O, M) rows in the order of each curve, O = 1 if no person exceeds the patch; patch_lengths (Q,):
+    number of voxels of each consecutive patch; in the padded layout patch_slots (O, Q, K) rows, patch_valid (Q, K),
+    None if all are valid, and patch_place (O, M), the index of each row among the Q * K.
     """
 
     lengths: Array
@@ -69,10 +70,10 @@ class Level(Generic[Array]):
 
 @dataclass(frozen=True, kw_only=True)
 class Tables(Generic[Array]):
-    """What the network reads of a batch of people, as numpy's arrays or torch's tensors.
+    """The network's inputs for a batch of people, as numpy arrays or torch tensors.
 
     features (M, 3) float32 m: the kept point of each voxel of level 0; stem: its neighbors of 5 x 5 x 5; levels, fine
-    to coarse; kept (M,): index of the kept point among all points, -1 for the stand-in of a person without points;
+    to coarse; kept (M,): index of the kept point among all points, -1 for the placeholder of a person without points;
     point_voxel (all points,): each point's row of level 0.
     """
 
@@ -90,19 +91,20 @@ def build_tables(
     layout: str = "ragged",
     rng: np.random.Generator | None = None,
 ) -> Tables[np.ndarray]:
-    """Tables of people's clouds, each (n, 3) m in its person's frame, n = 0 included.
+    """Tables of people's clouds, each (n, 3) m in its person's frame; n may be 0.
 
     layout: "ragged", pair lists and one patch after the other, for CPUs; "padded", gather tables and one block of
-    patches, for accelerators: the same results. Of each voxel the point nearest its middle is kept. Curves go from
-    block to block in the configuration's order, with `rng` in a random one, as in training. Cells are floor(p / grid);
-    with `config.grid_from_minimum` the cloud's own minimum is subtracted, so that an outlier decides which voxels share
-    a parent. Raises InputError for clouds wider than the cells can count, and for more people than a batch can hold.
+    patches, for accelerators; results are the same. The point nearest the center of each voxel is kept. Curves change
+    from block to block in the configuration's order, or with `rng` in a random order, as in training. Cells are floor(p
+    / grid); with `config.grid_from_minimum` the cloud's own minimum is subtracted, so that an outlier decides which
+    voxels share a parent. Raises InputError for clouds wider than the range of cell indices, and for more people than a
+    batch can hold.
     """
     check_name("layout", layout, LAYOUTS)
     if not 1 <= len(clouds) < _MOST_PEOPLE:
         raise InputError(f"a batch holds 1 to {_MOST_PEOPLE - 1} people, got {len(clouds)}: split it")
     has_points = [len(cloud) > 0 for cloud in clouds]
-    # a stand-in: a voxel that no neighbor or parent can tell from a real one
+    # a placeholder, which neighbors and parents treat like a real voxel
     clouds = [np.asarray(cloud, np.float32) if len(cloud) else np.zeros((1, 3), np.float32) for cloud in clouds]
     lengths = np.array([len(cloud) for cloud in clouds], np.int64)
     points, person = np.concatenate(clouds), np.repeat(np.arange(len(clouds)), lengths)
@@ -115,7 +117,7 @@ def build_tables(
     levels: list[Level[np.ndarray]] = []
     stem = _neighbors(key, cells, 2, 0, layout)
     bits = 0
-    # the last level has no next one
+    # the last level has no next level
     for stride in (*config.strides, 1):
         shift = stride.bit_length() - 1
         parent_key, starts, parent = _grouped(key >> (3 * shift))
@@ -159,11 +161,11 @@ def _cells(points: np.ndarray, lengths: np.ndarray, config: DaptConfig) -> np.nd
 
 
 def _one_a_voxel(key: np.ndarray, points: np.ndarray, grid: float) -> tuple[np.ndarray, np.ndarray]:
-    """Indices (M,) of one point a voxel, in order of the keys, and each point's voxel."""
+    """Indices (M,) of one point per voxel, in order of the keys, and each point's voxel."""
     order = np.argsort(key, kind="stable")
     _, starts, voxel = _grouped(key[order])
     if len(starts) < len(key):
-        # of several points the nearest one comes first; coordinates settle ties, whatever the input order
+        # the point nearest the center of a voxel comes first; coordinates break ties, whatever the input order
         offset = (points / grid - np.floor(points / grid) - 0.5).astype(np.float64)
         order = np.lexsort((*points.T, (offset**2).sum(1), key))
     point_voxel = np.empty(len(key), np.int64)
@@ -172,25 +174,25 @@ def _one_a_voxel(key: np.ndarray, points: np.ndarray, grid: float) -> tuple[np.n
 
 
 def _grouped(key: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sorted keys (n,) -> the distinct ones (m,), where each begins (m,), and which one each is (n,)."""
+    """Sorted keys (n,) -> the distinct keys (m,), the start of each (m,), and the number of each key's group (n,)."""
     is_start = np.diff(key, prepend=-1) > 0
     starts = np.flatnonzero(is_start)
     return key[starts], starts, np.cumsum(is_start) - 1
 
 
 def _spread(starts: np.ndarray, rows: int) -> np.ndarray:
-    """(m, W) rows of groups that begin at `starts` and end where the next begins, the first row repeated."""
+    """(m, W) rows of groups that begin at `starts` and end where the next begins, padded with the first row."""
     lengths = np.diff(starts, append=rows)
     column = np.arange(lengths.max())
     return starts[:, None] + np.where(column < lengths[:, None], column, 0)
 
 
 def _neighbors(key: np.ndarray, cells: np.ndarray, reach: int, bits: int, layout: str) -> Neighbors:
-    """Neighbors within `reach` cells an axis of rows whose sorted `key` has lost `bits` bits an axis."""
+    """Neighbors within `reach` cells per axis of rows whose sorted `key` is shortened by `bits` bits per axis."""
     side = 2 * reach + 1
     taps, rows = side**3, len(key)
     axis_bits = _WIDE - bits
-    # of each axis, one after the other: its bits for every step, in the places of the code
+    # for each axis: the bits of every shifted cell, at their positions in the code
     x, y, z = (
         np.stack([dilated(cells[:, k] + step & (1 << axis_bits) - 1) << 2 - k for step in range(-reach, reach + 1)])
         for k in range(3)
@@ -201,7 +203,7 @@ def _neighbors(key: np.ndarray, cells: np.ndarray, reach: int, bits: int, layout
     candidate_rows = np.searchsorted(key, codes.ravel())
     candidate_rows[candidate_rows == rows] = 0
     pairs = np.flatnonzero(key[candidate_rows] == codes.ravel())
-    # the second half of the taps is the first one mirrored, seen from the neighbor
+    # the second half of the taps mirrors the first half: the same pairs, seen from the neighbor
     tap, target, source = pairs // rows, pairs % rows, candidate_rows[pairs]
     if layout == "padded":
         table = np.full((rows, taps), rows)
@@ -225,7 +227,7 @@ def _people(
     layout: str,
     rng: np.random.Generator | None,
 ) -> dict[str, Any]:
-    """The entries of a `Level` about whose rows are whose, and which attend to each other."""
+    """The fields of a `Level` that say which rows belong to each person, and which rows attend to each other."""
     lengths = np.bincount(person, minlength=people)
     starts = np.cumsum(lengths) - lengths
     slots = _spread(starts, len(person))
@@ -235,7 +237,7 @@ def _people(
     else:
         orders = list(config.orders) if rng is None else rng.permutation(config.orders)
         sequence = np.stack([np.lexsort((curve(str(order), cells), person)) for order in orders])
-        # full patches of each person, and what is left
+        # ends of each person's full patches, and of the remainder
         ends = [np.append(np.arange(config.patch, n, config.patch), n) for n in lengths]
         patch_lengths = np.concatenate([np.diff(end, prepend=0) for end in ends])
     entries |= {"sequence": sequence, "patch_lengths": patch_lengths}
@@ -253,20 +255,20 @@ def _people(
     }
 
 
-# ---- space-filling curves: cells near on the curve are near in space
+# ---- space-filling curves: cells that are close on the curve are close in space
 
 
 def z_order(cells: np.ndarray) -> np.ndarray:
-    """cells (n, 3), of up to 17 bits an axis -> (n,) int64 Z-order (Morton) codes, x the most significant.
+    """cells (n, 3), of up to 17 bits per axis -> (n,) int64 Z-order (Morton) codes, x the most significant.
 
-    A parent's code is the child's without its last three bits.
+    A parent's code is the child's code without its last three bits.
     """
     x, y, z = dilated(cells.T)
     return x << 2 | y << 1 | z
 
 
 def hilbert(cells: np.ndarray, bits: int = CELL_BITS) -> np.ndarray:
-    """cells (n, 3) whole numbers in [0, 2**bits) -> (n,) int64 positions on a Hilbert curve through the cube.
+    """cells (n, 3) integers in [0, 2**bits) -> (n,) int64 positions on a Hilbert curve through the cube.
 
     Consecutive positions are neighboring cells. Method: Skilling 2004, "Programming the Hilbert curve": the axes are
     turned into the transposed Gray code in place.
@@ -275,7 +277,7 @@ def hilbert(cells: np.ndarray, bits: int = CELL_BITS) -> np.ndarray:
     for bit in range(bits - 1, 0, -1):
         mask = (1 << bit) - 1
         for k in range(3):
-            # where the bit is set the lower bits of x are inverted, elsewhere exchanged with those of axis k
+            # where the bit is set, the lower bits of x are inverted; elsewhere they are exchanged with those of axis k
             is_set = (axes[k] >> bit & 1).astype(bool)
             swap_bits = np.where(is_set, 0, (axes[0] ^ axes[k]) & mask)
             axes[0] = axes[0] ^ np.where(is_set, mask, swap_bits)
@@ -290,7 +292,7 @@ def hilbert(cells: np.ndarray, bits: int = CELL_BITS) -> np.ndarray:
 
 
 def dilated(values: np.ndarray) -> np.ndarray:
-    """Whole numbers (int64) of up to 17 bits with two zero bits put before each of their bits."""
+    """Integers (int64) of up to 17 bits with two zero bits inserted before each of their bits."""
     values = (values | values << 32) & 0x1F00000000FFFF
     values = (values | values << 16) & 0x1F0000FF0000FF
     values = (values | values << 8) & 0x100F00F00F00F00F

@@ -1,4 +1,4 @@
-"""People found in whole scans: ground, places where somebody may stand, and the network that scores them.
+"""Detects people in whole scans: ground, positions where a person may stand, and the network that scores them.
 
 Legend of this package: n points of a scan, K candidates. Level frame: z up, m.
 """

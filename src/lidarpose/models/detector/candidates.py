@@ -1,6 +1,6 @@
-"""Places where a person may stand, cut out of a scan: the points there, what the sensor sees past them, what is around.
+"""Candidates: positions where a person may stand, their points, the sensor's view past them, and the surroundings.
 
-`render` makes the network's inputs of them, and says what these are.
+`render` makes the network's inputs from them and describes these.
 """
 
 from collections.abc import Iterator
@@ -12,38 +12,38 @@ from lidarpose.models.detector.ground import Ground
 from lidarpose.models.detector.proposals import heights_above
 from lidarpose.models.detector.range_image import BOTTOM, CELL, RANGE_CHANNELS, SIDE, SLICES, RangeImage, log_bytes
 
-# cells of a margin to each side of a stored range view, so that it can be moved and scaled
+# margin on each side of a stored range view, in cells, so that the view can be shifted and scaled
 MARGIN = 3
-# context: channels, cells of a side, their size m, what height is 1
+# context: channels, cells per side, size of a cell, m, and height that is encoded as 1, m
 CONTEXT_CHANNELS, CONTEXT_SIDE, CONTEXT_CELL, _TALL = 4, 20, 0.5, 4.0
-# points of a candidate lie within this, and so far above and below the slices, m
+# points of a candidate: maximum distance, and margin above and below the slices, m
 RADIUS, _ROOM = 1.75, 0.2
-# heights above the ground at which points are looked at, m
+# heights above the ground between which points are used, m
 _USED = (-1.2, 3.2)
-# the most that are kept, and the unit they are kept in, m
+# maximum number of points stored per candidate, and the unit of their coordinates, m
 _MOST_POINTS, UNIT = 1000, 5e-4
-# points lie sorted by cells of this size, m, in tables of at most so many cells
+# size of the cells by which points are sorted, m, and maximum number of cells in the table
 _INDEX_CELL, _MOST_INDEX_CELLS = 0.5, 4_000_000
-# of which each keeps at most so many points, and points that are looked at in one go
+# maximum number of points kept per cell, and of points processed at once
 _MOST_IN_CELL, _MOST_AT_ONCE = 10_000, 4_000_000
-# candidates that are drawn at a time
+# candidates that are rendered at a time
 CHUNK = 64
 _LEAST_DISTANCE = 0.5
-# heights above the ground: of the slices whose filling is counted, and what is near the ground, m
+# heights above the ground: band whose filled slices are counted, m; number of slices; limit of "near the ground", m
 _BAND, _BAND_SLICES, _NEAR_GROUND = (0.3, 2.1), 6, 0.2
-# of each byte the ones; numpy counts them from 2.0 on
+# number of ones in each byte; numpy can count them from 2.0 on
 _BIT_COUNTS = np.array([byte.bit_count() for byte in range(256)], np.uint8)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Candidates:
-    """K places where a person may stand, ready to be drawn: small, so that many can be kept.
+    """K positions where a person may stand, ready to be rendered: small, so that many can be stored.
 
-    centers (K, 3) m, level frame: x, y, and z of the ground; yaw (K,) rad of the view frames' x; distance (K,) m from
-    the sensor and its height (K,) m above the ground there, 0 if unknown; count (K,): points within `RADIUS` at a
-    person's heights, of which xyz (3, n) int16 holds up to 1000 in the view frame, in units of 0.5 mm, one candidate's
-    after the other's, `sizes` (K,) of each; range_views (K, 4, 34, 30) and contexts (K, 4, 20, 20) uint8: as drawn,
-    before augmentation.
+    centers (K, 3) m, level frame: x, y, and z of the ground; yaw (K,) rad of the view frames' x axes; distance (K,) m
+    from the sensor; sensor_height (K,) m of the sensor above the ground at the candidate, both 0 if unknown; count
+    (K,): points within `RADIUS` at the heights of a person, of which xyz (3, n) int16 holds up to 1000 per candidate in
+    the view frame, in units of 0.5 mm, concatenated, `sizes` (K,) of each; range_views (K, 4, 34, 30) and contexts (K,
+    4, 20, 20) uint8: as rendered, before augmentation.
     """
 
     centers: np.ndarray
@@ -60,7 +60,7 @@ class Candidates:
         return len(self.centers)
 
     def take(self, rows: np.ndarray) -> "Candidates":
-        """Some of them."""
+        """The candidates of the given rows."""
         ends = np.cumsum(self.sizes)
         columns = [np.zeros(0, int), *(np.arange(ends[k] - self.sizes[k], ends[k]) for k in rows)]
         arrays = {name: values[rows] for name, values in vars(self).items() if name != "xyz"}
@@ -68,13 +68,13 @@ class Candidates:
 
 
 class SceneIndex:
-    """A scan prepared once, from which candidates are cut.
+    """A scan, prepared once, from which candidates are cut.
 
     Args:
         points: (n, 3) m, z up.
-        ground: under them.
-        origin: (3,) m, the sensor, or None where it is unknown.
-        heights: (n,) m of the points above the ground, where they are known.
+        ground: under the points.
+        origin: (3,) m, sensor position, or None if unknown.
+        heights: (n,) m of the points above the ground, if already computed.
     """
 
     def __init__(
@@ -91,18 +91,18 @@ class SceneIndex:
         # a wide map has larger cells instead of a larger table
         self._cell = max(_INDEX_CELL, float(np.sqrt(extent.prod() / _MOST_INDEX_CELLS)))
         self._shape = tuple(int(n) for n in extent // self._cell + 2)
-        # relative to the corner, float32 holds millimeters of the widest map
+        # relative to the corner, float32 resolves millimeters even in the widest map
         x, y = ((columns[i] - self._corner[i]).astype(np.float32) for i in (0, 1))
         row, column = ((values * np.float32(1 / self._cell)).astype(np.int32) for values in (x, y))
         all_cells = row * self._shape[1] + column
         self._maps = _draw_maps(all_cells, heights, self._shape)
-        # what lies high above everybody is context alone
+        # points high above any person are used for the context alone
         used_rows = np.flatnonzero((heights > _USED[0]) & (heights < _USED[1]))
         z = columns[2].astype(np.float32)
-        # in an order of their own: thinned in the file's, beam after beam, whole beams would go
+        # in pseudo-random order: subsampling in the file's order, beam by beam, would drop whole beams
         used_rows = used_rows[np.argsort(_scrambled(x[used_rows], y[used_rows], z[used_rows]), kind="stable")]
         cells = all_cells[used_rows]
-        # very dense cells are thinned, so that no candidate costs more than so much
+        # very dense cells are subsampled, which limits the cost of each candidate
         selection, count = _thinned(np.bincount(cells, minlength=self._shape[0] * self._shape[1]), _MOST_IN_CELL)
         sorted_rows = used_rows[_order(cells)][selection]
         self._x, self._y, self._z = x[sorted_rows], y[sorted_rows], z[sorted_rows]
@@ -110,14 +110,16 @@ class SceneIndex:
         self._image = None if self.origin is None else RangeImage(points, self.origin)
 
     def candidates(self, centers: np.ndarray) -> Candidates:
-        """Those at centers (K, 3) m: x, y, and z of the ground there."""
+        """Candidates at centers (K, 3) m: x, y, and z of the ground there."""
         parts = list(self.pieces(centers, MARGIN)) or [self._cut(np.zeros((0, 3)), MARGIN)]
         columns = {name: [vars(part)[name] for part in parts] for name in vars(parts[0])}
         return Candidates(**{name: np.concatenate(arrays, axis=int(name == "xyz")) for name, arrays in columns.items()})
 
     def pieces(self, centers: np.ndarray, margin: int = 0) -> Iterator[Candidates]:
-        """Those at centers (K, 3) m, at most `CHUNK` at a time, which have no more than so many points to look at
-        together. Their range views have so many cells of a margin."""
+        """Candidates at centers (K, 3) m, in pieces of at most `CHUNK` with a limited number of points to process.
+
+        Their range views have a margin of the given number of cells.
+        """
         centers = np.asarray(centers, float)
         for start in range(0, len(centers), CHUNK):
             piece = centers[start : start + CHUNK]
@@ -126,7 +128,7 @@ class SceneIndex:
                 yield self._cut(part, margin)
 
     def yaws(self, centers: np.ndarray) -> np.ndarray:
-        """Of the view frames' x at centers (K, 2 or 3) m, (K,) rad."""
+        """(K,) rad: yaw of the view frames' x axes at centers (K, 2 or 3) m."""
         if self.origin is None:
             return np.zeros(len(centers))
         return np.arctan2(centers[:, 1] - self.origin[1], centers[:, 0] - self.origin[0])
@@ -157,8 +159,10 @@ class SceneIndex:
         )
 
     def _near(self, centers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Points within `RADIUS` and at the heights looked at of centers (K, 3) m, one center's after the other's:
-        where they lie from their center, x, y, z (m,) float32 m, and how many each has (K,)."""
+        """Points within `RADIUS` of centers (K, 3) m and at the heights of the slices, grouped by center.
+
+        Returns their positions relative to the center, x, y, z (m,) float32 m, and the number per center (K,).
+        """
         owner, start, size = self._runs(centers[:, :2] - self._corner)
         row = np.arange(size.sum()) + np.repeat(start - (np.cumsum(size) - size), size)
         sizes = np.bincount(owner, size, minlength=len(centers)).astype(np.int64)
@@ -172,11 +176,11 @@ class SceneIndex:
         return x[inside_index], y[inside_index], z, count
 
     def _runs(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Runs of sorted rows in the cells about places (K, 2) m from the corner: owner, first row, length."""
+        """Runs of sorted rows in the cells around positions (K, 2) m from the corner: owner, first row, length."""
         low = np.floor((place - RADIUS) / self._cell).astype(np.int64)
         high = np.floor((place + RADIUS) / self._cell).astype(np.int64)
         low, high = np.maximum(low, 0), np.minimum(high, np.array(self._shape) - 1)
-        # one for each row of the square of cells: its points lie one after the other
+        # one run for each row of the square of cells, since its points are consecutive
         row_counts = np.maximum(high[:, 0] - low[:, 0] + 1, 0)
         row_counts[(high < low).any(1)] = 0
         owner = np.repeat(np.arange(len(place)), row_counts)
@@ -186,7 +190,7 @@ class SceneIndex:
         return owner, start, end - start
 
     def _context(self, centers: np.ndarray, yaw: np.ndarray) -> np.ndarray:
-        """Contexts (K, 4, 20, 20) uint8, nearest cells of the maps."""
+        """Contexts (K, 4, 20, 20) uint8, from the nearest cells of the maps."""
         side = (np.arange(CONTEXT_SIDE) - (CONTEXT_SIDE - 1) / 2) * CONTEXT_CELL
         x, y = np.repeat(side, CONTEXT_SIDE), np.tile(side, CONTEXT_SIDE)
         c, s = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
@@ -194,16 +198,16 @@ class SceneIndex:
         i = np.floor((place[:, :1] + c * x - s * y) / self._cell).astype(np.int64)
         j = np.floor((place[:, 1:] + s * x + c * y) / self._cell).astype(np.int64)
         is_inside = (i >= 0) & (j >= 0) & (i < self._shape[0]) & (j < self._shape[1])
-        # outside is the cell after the last, which is empty
+        # positions outside read the cell after the last, which is empty
         cells = self._maps[np.where(is_inside, i * self._shape[1] + j, len(self._maps) - 1)]
         values = np.moveaxis(cells.view(np.uint8).reshape(*is_inside.shape, CONTEXT_CHANNELS), -1, 1)
         return np.ascontiguousarray(values).reshape(-1, CONTEXT_CHANNELS, CONTEXT_SIDE, CONTEXT_SIDE)
 
 
 def _thinned(count: np.ndarray, limit: int) -> tuple[slice | np.ndarray, np.ndarray]:
-    """Which rows stay where groups of `count` (K,) rows, one after the other, keep `limit` each; how many each keeps.
+    """Subsamples consecutive groups of `count` (K,) rows to `limit` each: remaining rows, and their number per group.
 
-    Every so manieth row stays of a group that has too many.
+    Of a group with too many rows, rows at regular intervals remain.
     """
     if count.max(initial=0) <= limit:
         return slice(None), count
@@ -215,14 +219,14 @@ def _thinned(count: np.ndarray, limit: int) -> tuple[slice | np.ndarray, np.ndar
 
 
 def _scrambled(*columns: np.ndarray) -> np.ndarray:
-    """(n,) uint16 without pattern, of each row of columns (n,) float32 the same wherever it stands."""
+    """(n,) uint16 pseudo-random numbers that depend only on the values of each row of columns (n,) float32."""
     factors = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)
     hashes = sum(values.view(np.uint32) * np.uint32(factor) for values, factor in zip(columns, factors, strict=True))
     return (np.asarray(hashes) >> 16).astype(np.uint16)
 
 
 def _order(cells: np.ndarray) -> np.ndarray:
-    """Rows that sort flat cells (n,), those of one cell in their own order: by 16 bits at a time, which is linear."""
+    """Rows that sort flat cells (n,), stable within a cell: by 16 bits at a time, which takes linear time."""
     order = np.argsort((cells & 0xFFFF).astype(np.uint16), kind="stable")
     if len(cells) and cells.max() > 0xFFFF:
         order = order[np.argsort((cells >> 16)[order].astype(np.uint16), kind="stable")]
@@ -248,9 +252,9 @@ def _draw_maps(cells: np.ndarray, heights: np.ndarray, shape: tuple[int, ...]) -
 
 
 def suppress_near(centers: np.ndarray, strength: np.ndarray, radius: float) -> np.ndarray:
-    """Indices of the candidates that stay, the strongest first, where of two nearer than `radius` the weaker goes.
+    """Indices of the candidates that remain, strongest first: of two nearer than `radius`, the weaker is suppressed.
 
-    centers: (K, 2 or 3) m, of which x and y count; strength (K,); radius m.
+    centers: (K, 2 or 3) m, of which x and y are used; strength (K,); radius m.
     """
     order = np.argsort(-np.asarray(strength), kind="stable")
     x, y = np.asarray(centers, float)[order, :2].T
@@ -259,9 +263,9 @@ def suppress_near(centers: np.ndarray, strength: np.ndarray, radius: float) -> n
 
 
 def _that_stay(count: int, pairs: np.ndarray) -> np.ndarray:
-    """(count,) bool, by falling strength: who is in no pair (P, 2), ascending, with a stronger one that stays."""
+    """(count,) bool, by decreasing strength: False if in a pair (P, 2), ascending, with a stronger one that remains."""
     is_kept = np.ones(count, bool)
-    # in the order of the stronger one: whether it stays is known when its pairs come
+    # pairs are sorted by the stronger candidate, so it is known whether that one remains
     for stronger, weaker in pairs.tolist():
         if is_kept[stronger]:
             is_kept[weaker] = False

@@ -1,4 +1,4 @@
-"""The people of a whole scan: proposals, scored by a network, of which those that meet are one person."""
+"""Detects the people in a whole scan: a network scores proposals, and duplicate detections are suppressed."""
 
 import os
 from collections.abc import Callable
@@ -20,35 +20,34 @@ from lidarpose.models.detector.range_image import SIDE, SLICES
 from lidarpose.models.detector.render import render
 from lidarpose.models.onnx import check_names, map_in_threads, open_network, thread_count
 
-# how far people are looked for by default, m; what lies farther beyond the range is left out, m: a candidate at its end
-# still has its surroundings
+# default detection range, m; points farther than this beyond the range are ignored, m: a candidate at the end of the
+# range still has its surroundings
 MAX_RANGE, BEYOND = 40.0, 6.0
-# of an unknown sensor there is no range: points so far, m, from nearly all others, percents, are stray ones, which
-# would make the cells of all that is looked at larger
+# if the sensor is unknown, there is no range: points farther than this, m, from nearly all others, percentiles, are
+# stray points, which would enlarge the cells of `SceneIndex`
 _STRAY, _NEARLY_ALL = 100.0, (0.1, 99.9)
-# detections nearer than this are one person, m: the network moves those of one to the same place
+# detections nearer than this are one person, m: the network moves candidates of one person to the same position
 SAME = 0.15
-# beside people somebody is looked for so far away; a proposal depends on what is so far about it, m
+# distances from a person at which further people are searched, m; radius of the points that a proposal depends on, m
 _BESIDE, _COLUMN = (0.3, 0.85), 1.0
-# what is looked at for a place: so far around it, m, and in its direction so far to both sides, m, and a bit more, rad,
-# by so many bins of directions
+# points used for a candidate: radius, m; half width of its view, m, plus a margin, rad; number of direction bins
 _CONTEXT, _VIEW, _VIEW_MARGIN, _BINS = 8.0, 2.0, 0.1, 512
-# a box: side, side of somebody mounted, what is added to the height; and bounds of what the network says, m
+# boxes: side, side for a person who is mounted, margin added to the height, m; and bounds of the network's outputs, m
 _SIDE, _MOUNTED_SIDE, _ROOM = 0.9, 1.1, 0.1
 _MOST_SHIFT, _MOST_FOOT, _HEIGHTS = 0.6, 1.0, (0.5, 2.3)
 
 # the network's inputs by name, see `render.render` -> (K, 6): logit of a person; true center minus candidate in the
-# view frame, m; feet above the ground, m; height, m; logit of somebody who rides or sits in a wheelchair
+# view frame, m; feet above the ground, m; height, m; logit of a person who rides or sits in a wheelchair
 Scorer = Callable[[dict[str, np.ndarray]], np.ndarray]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Detections:
-    """D people, the surest first, in the level frame, meters.
+    """D detected people, highest-scoring first, in the level frame, meters.
 
-    centers (D, 3): of their boxes, which are square, at yaw 0; sizes (D, 3); logit (D,); score (D,): the probability
-    that it is a person; mounted (D,): the probability that somebody rides or sits in a wheelchair; ground: under them;
-    has_ground: whether it was found.
+    centers (D, 3): of their boxes, which are square, at yaw 0; sizes (D, 3); logit (D,); score (D,): probability of a
+    person; mounted (D,): probability that the person rides or sits in a wheelchair; ground: under the people;
+    has_ground: whether a ground was found.
     """
 
     centers: np.ndarray
@@ -64,14 +63,14 @@ class Detections:
 
 
 class Detector:
-    """Finds people in scans.
+    """Detects people in scans.
 
     Args:
-        scorer: a network's ONNX file, None for the bundled one; or a function in place of the network.
-        threads: over which candidates are spread, None for all that may be used.
+        scorer: ONNX file of a network, None for the bundled one; or a function in place of the network.
+        threads: number of threads for the candidates, None for all available.
 
     Raises:
-        InputError: one line, for a file that is damaged or something else.
+        InputError: one line, for a file that is damaged or not a detector.
     """
 
     def __init__(self, scorer: str | os.PathLike | Scorer | None = None, *, threads: int | None = None):
@@ -93,18 +92,18 @@ class Detector:
         limit: int | None = None,
         moving: np.ndarray | None = None,
     ) -> Detections:
-        """The people in a scan.
+        """Detects the people in a scan.
 
         Args:
             points: (n, 3) m, level frame: z up.
-            origin: (3,) m, the sensor; None where it is unknown: then there is no range.
-            max_range: level distance from the sensor, m, up to which people are looked for; None for any.
-            limit: the most that are returned.
-            moving: (n,) bool, where a background is known: points that do not belong to it. People are looked for
-                among these alone, and seen with all points around them.
+            origin: (3,) m, sensor position; None if unknown: then the range is not limited.
+            max_range: horizontal distance from the sensor up to which people are detected, m; None for no limit.
+            limit: maximum number of detections.
+            moving: (n,) bool, if a background is known: points that do not belong to it. Candidates are proposed from
+                these points alone, but rendered with all points around them.
 
         Returns:
-            All candidates after suppression, whatever their score.
+            All candidates after suppression, without a score threshold.
         """
         columns = list(np.asarray(points).T)
         if origin is not None and max_range is not None:
@@ -114,7 +113,7 @@ class Detector:
             rows = np.flatnonzero(_is_near_others(columns[0]) & _is_near_others(columns[1]))
         if len(rows) < len(points):
             columns = [values[rows] for values in columns]
-        # x after x in memory: every step reads one axis at a time
+        # each axis contiguous in memory, since every step reads one axis at a time
         points = np.ascontiguousarray(columns).T
         ground = estimate_ground(points, origin)
         has_ground = ground is not None
@@ -137,13 +136,13 @@ class Detector:
         *,
         moving: np.ndarray | None = None,
     ) -> Detections:
-        """Who stands beside people whom `detect` returned, and was taken for one with them.
+        """Detects people beside those that `detect` returned, if they shared one detection.
 
         Args:
-            points, origin, moving: as of `detect`.
-            ground: as `detect` returned it.
-            rows: (m,) of the points that are not on these people.
-            people: (K, 2) m, where they are.
+            points, origin, moving: as for `detect`.
+            ground: as returned by `detect`.
+            rows: (m,) of the points that do not belong to these people.
+            people: (K, 2) m, positions of the people.
         """
         selected_rows = rows if moving is None else rows[moving[rows]]
         near_rows = rows_near(people, points[selected_rows], _BESIDE[1] + _COLUMN)
@@ -151,7 +150,7 @@ class Detector:
         places = propose(near_points, ground)
         distance = np.linalg.norm(places[:, None, :2] - people[None], axis=-1).min(1, initial=np.inf)
         places = places[(distance > _BESIDE[0]) & (distance < _BESIDE[1])]
-        # x after x in memory, as above
+        # each axis contiguous in memory, as above
         points = np.ascontiguousarray(points[rows[rows_that_matter(points[rows], origin, places)]].T).T
         return self._detections(SceneIndex(points, ground, origin), places, True, None)
 
@@ -177,14 +176,14 @@ class Detector:
         )
 
     def _outputs(self, scene: SceneIndex, places: np.ndarray) -> np.ndarray:
-        """What the network says of places (K, 3) m, K at least 1: (K, 6)."""
-        # memory that each piece uses again: to get as much anew takes longer than all else
+        """The network's outputs (K, 6) for positions (K, 3) m, K at least 1."""
+        # memory that all pieces share: allocating it for each takes longer than everything else
         fine = np.empty((min(len(places), CHUNK), SLICES, SIDE, SIDE), np.float32)
         pieces = (render(piece, fine=fine[: len(piece)]) for piece in scene.pieces(places))
         return np.concatenate([np.asarray(self._score(inputs), float) for inputs in pieces])
 
     def probability(self, logit: np.ndarray) -> np.ndarray:
-        """Of a person at a logit (D,), by the calibration in the file."""
+        """Probability of a person at each logit (D,), by the calibration in the file."""
         if "calibration" not in self.header:
             return sigmoid(logit)
         logits, probabilities = self.header["calibration"]
@@ -192,15 +191,17 @@ class Detector:
 
 
 def rows_that_matter(points: np.ndarray, origin: np.ndarray | None, places: np.ndarray) -> np.ndarray:
-    """The rows (k,) of points (n, 3) m that `SceneIndex` looks at for few places (K, 3) m: those around each, and all
-    that a sensor at origin (3,) m sees in its direction."""
+    """The rows (k,) of points (n, 3) m that `SceneIndex` uses for a few positions (K, 3) m.
+
+    These are the points around each position, and all points in its direction from a sensor at origin (3,) m.
+    """
     is_used = np.zeros(len(points), bool)
     for rows in rows_near(places, points, _CONTEXT):
         is_used[rows] = True
     if origin is not None and len(places):
         x, y = (places[:, i] - origin[i] for i in (0, 1))
         half_widths = np.arcsin(np.minimum(_VIEW / np.hypot(x, y).clip(1e-6), 1)) + _VIEW_MARGIN
-        # by whole bins; who is nearer than a view is wide may be seen anywhere
+        # in whole bins; a candidate nearer than its view is wide may cover any direction
         half_widths[np.hypot(x, y) < _VIEW] = np.pi
         middles = (np.arange(_BINS) + 0.5) * (2 * np.pi / _BINS) - np.pi
         turns = np.abs((middles[:, None] - np.arctan2(y, x) + np.pi) % (2 * np.pi) - np.pi)
@@ -212,7 +213,7 @@ def rows_that_matter(points: np.ndarray, origin: np.ndarray | None, places: np.n
 
 
 def predicted_boxes(places: np.ndarray, yaw: np.ndarray, outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the network puts people, within bounds: centers (K, 3) and heights (K,) m.
+    """The positions that the network predicts, within bounds: centers (K, 3) and heights (K,) m of boxes.
 
     places: (K, 3) m of candidates, on the ground; yaw: (K,) rad of their view frames; outputs: (K, 6), see `Scorer`.
     """
@@ -229,7 +230,7 @@ def _is_near_others(values: np.ndarray) -> np.ndarray:
     """Coordinates (n,) m of points -> (n,) bool: False for stray ones."""
     if not len(values):
         return np.zeros(0, bool)
-    # enough of them tell
+    # a sample of the points is enough
     sample = values[:: -(-len(values) // 20_000)]
     low = np.percentile(sample, _NEARLY_ALL[0], method="higher")
     high = np.percentile(sample, _NEARLY_ALL[1], method="lower")
@@ -237,15 +238,17 @@ def _is_near_others(values: np.ndarray) -> np.ndarray:
 
 
 def detector_path(suffix: str = ".onnx") -> Path:
-    """Where the package keeps the bundled detector, or with the suffix .safetensors its checkpoint."""
+    """Path of the bundled detector, or, with the suffix .safetensors, of its checkpoint."""
     return weights_file(f"detector{suffix}")
 
 
 def open_detector(path: str | os.PathLike | None = None) -> tuple[Any, dict]:
-    """The session of a detector (None: the bundled one), and its header: "version", and the card of its training, with
-    "calibration" ([logits], [probabilities]), "default_score" and "verification" once it is calibrated.
+    """The session of a detector (None: the bundled one), and its header.
 
-    Raises InputError, one line, for a file that is damaged, something else, or another network's.
+    The header holds "version" and the card of its training, with "calibration" ([logits], [probabilities]),
+    "default_score" and "verification" once it is calibrated.
+
+    Raises InputError, one line, for a file that is damaged, of another format, or holds another network.
     """
     path = detector_path() if path is None else path
     session, header = open_network(path)

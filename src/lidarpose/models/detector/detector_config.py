@@ -1,4 +1,4 @@
-"""The shape of the detector's network, and of what it reads. No torch, no numpy here."""
+"""The configuration of the detector's network and the shapes of its inputs. No torch, no numpy here."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -7,8 +7,8 @@ from lidarpose.models.config import Config
 
 # inputs of the network in their order, see `render.render`
 INPUTS = ("fine", "range_view", "context", "scalars")
-# the name of what it gives (K, 6), and its columns: logit of a person; true center minus candidate in the view frame,
-# m; feet above the estimated ground, m; height, m; logit of somebody who rides or sits in a wheelchair
+# name of the network's output (K, 6), and its columns: logit of a person; true center minus candidate in the view
+# frame, m; feet above the estimated ground, m; height, m; logit of a person who rides or sits in a wheelchair
 OUTPUT = "scores"
 OUTPUTS = ("logit", "dx", "dy", "foot", "height", "mounted")
 
@@ -17,8 +17,9 @@ OUTPUTS = ("logit", "dx", "dy", "foot", "height", "mounted")
 class DetectorConfig(Config):
     """Inputs and widths of a `DetectorNet`.
 
-    fine, range_view, context: channels, rows and columns of what it reads; scalars: numbers beside; channels: of the
-    three levels of the fine branch; coarse_channels: of the two levels of the others; hidden: of the last layer.
+    fine, range_view, context: channels, rows and columns of each input; scalars: number of scalar inputs; channels: of
+    the stem and the two levels of the fine branch; coarse_channels: of the two levels of the other branches; hidden:
+    width of the hidden layer.
     """
 
     kind: ClassVar[str] = "detector"
@@ -35,10 +36,10 @@ class DetectorConfig(Config):
 
     @property
     def layers(self) -> int:
-        """A lower bound of the tensors."""
+        """A lower bound of the number of tensors."""
         return 2
 
     def shapes(self, candidates: int) -> dict[str, tuple[int, ...]]:
-        """The shape of each of `INPUTS` for so many candidates."""
+        """The shape of each of `INPUTS` for the given number of candidates."""
         input_shapes = (self.fine, self.range_view, self.context, (self.scalars,))
         return {name: (candidates, *shape) for name, shape in zip(INPUTS, input_shapes, strict=True)}

@@ -1,8 +1,9 @@
-"""The ground under a scan: a map of heights from the lowest points of cells, and the up direction of a tilted cloud.
+"""The ground under a scan: a height map from the lowest points of cells, and the up axis of a tilted cloud.
 
-Of each cell of 1 m the lowest 10 cm that hold company; the plane that most of these share is taken off; what stands
-above a cone around its neighbors (car roofs, tables, wall tops) or lies alone below (mirrored returns) is dropped;
-holes are filled from coarser and coarser means, so the plane goes on where nothing was seen.
+The height of each cell of 1 m comes from its lowest 10 cm of points that are not isolated. The plane shared by most
+cells is subtracted. Cells above a cone around their neighbors (car roofs, tables, wall tops) and isolated points below
+(mirrored returns) are dropped. Holes are filled from increasingly coarse means, so that the plane continues where
+nothing was observed.
 """
 
 from dataclasses import dataclass, replace
@@ -11,50 +12,50 @@ import numpy as np
 
 from lidarpose.geometry import rotation_between
 
-# sizes in m: of a cell, of the bins in which its lowest points are looked for
+# sizes in m: of a cell, and of the height bins for its lowest points
 CELL, _BIN = 1.0, 0.1
-# how often points that lie alone below the others of their cell are left out
+# how many times isolated points below the other points of their cell are skipped
 _MOST_ALONE = 4
-# cells an axis; points farther from the middle are left out
+# cells per axis; points farther from the middle are ignored
 _MOST_CELLS = 1024
-# a floor may rise by so much a meter over the shared plane, and lie so high above its neighbors besides
+# cone above which a cell is not ground: slope relative to the shared plane, additional height, m, and reach, cells
 _CONE_SLOPE, _CONE_ROOM, _CONE_REACH = 0.12, 0.12, 16
-# the same within some m of the sensor
+# the cone's slope near the sensor, and the distance up to which it applies, m
 _OWN_SLOPE, _OWN_REACH = 0.04, 4.0
-# a cell has support where so many of the cells within 2 m lie at its height, to so many m and so many m a meter
+# a cell is supported if this many cells within 2 m are at its height; the tolerance, m, and its increase with distance
 _SUPPORT, _SUPPORT_ROOM, _SUPPORT_SLOPE = 3, 0.1, 0.15
-# or where it lies this near the shared plane
+# or if it is nearer than this to the shared plane, m
 _NEAR_PLANE = 0.25
-# slopes of the plane: the steepest, and the width of the bins in which the commonest is looked for
+# slopes of the plane: the maximum, and the width of the bins for finding the most common one
 _STEEPEST, _SLOPE_BIN = 0.9, 0.06
-# cells within so many m count most for the plane; its cells must lie so far below the sensor, m, and the plane that is
-# fitted to them may lie no farther than that above it
+# distance at which a cell has half its weight for the plane, m; minimum depth of its cells below the sensor, m, which
+# is also the maximum height of the fitted plane above the sensor
 _NEAR, _BELOW_SENSOR = 10.0, 0.1
-# how many of the commonest slopes are tried, and the slope that is half as likely as none
+# number of the most common slopes that are tried, and the slope that halves a plane's score
 _SLOPES, _COMMON_SLOPE = 6, 0.5
-# a tilt is believed where so many cells and such a share lie on its plane, and no more than this below it
+# a tilt is accepted if at least this number and share of cells lie on its plane, and at most this share below it
 _TILT_CELLS, _TILT_SHARE, _TILT_BELOW = 20, 0.4, 0.1
-# points so far below the ground, m, lower it where they are so many: fewer may be mirrored ones
+# points between these depths below the ground, m, lower it if they are at least this many: fewer may be mirrored ones
 _LEAST_DEPTH, _MOST_DEPTH, _SOLID = 0.15, 1.5, 5
-# how many cells the plane counts for where a hole is filled
+# number of cells that the plane counts for when a hole is filled
 _PLANE_WEIGHT = 0.5
-# there is a ground where at least so many cells belong to it, and this share of all that lie below the sensor, or,
-# where that is unknown, within so many m above
+# a ground exists if at least this number of cells belong to it, and this share of all cells below the sensor, or, if
+# the sensor is unknown, of all cells up to this height above the plane, m
 _LEAST_CELLS, _LEAST_SHARE, _TALL = 6, 0.2, 2.0
-# a cloud whose plane leans more is tilted rather than on a slope, degrees
+# a cloud whose plane is inclined by more than this is tilted, not on a slope, degrees
 TILTED = 10.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ground:
-    """Heights (X, Y) float32 m of the ground at the centers of cells; corner (2,) m: of the first cell; cell m."""
+    """Heights (X, Y) float32 m of the ground at cells' centers; corner (2,) m: of the first cell; cell: size, m."""
 
     corner: np.ndarray
     heights: np.ndarray
     cell: float = CELL
 
     def at(self, xy: np.ndarray) -> np.ndarray:
-        """Height (n,) float32 m of the ground at xy (n, 2) m: bilinear, outside as at the border."""
+        """Height (n,) float32 m of the ground at xy (n, 2) m: bilinear; outside the map, the height at its border."""
         (rows, columns), xy = self.heights.shape, np.asarray(xy)
         x, y = (
             np.clip((xy[:, i] - (self.corner[i] + self.cell / 2)) / self.cell, 0, count - 1).astype(np.float32)
@@ -72,14 +73,14 @@ class Ground:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Floors:
-    """Heights (X, Y) m of the lowest points of cells, NaN where there are none; their counts (X, Y); corner (2,) m."""
+    """Heights (X, Y) m of cells' lowest points, NaN without any; counts (X, Y) of these points; corner (2,) m."""
 
     corner: np.ndarray
     heights: np.ndarray
     counts: np.ndarray
 
     def positions(self) -> tuple[np.ndarray, np.ndarray]:
-        """x (X, 1) and y (1, Y) m of the centers."""
+        """x (X, 1) and y (1, Y) m of the cells' centers."""
         x, y = (self.corner[i] + CELL * (np.arange(n) + 0.5) for i, n in enumerate(self.heights.shape))
         return x[:, None], y[None]
 
@@ -88,11 +89,11 @@ def estimate_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Gro
     """The ground under points (n, 3) m, z up.
 
     Args:
-        points: (n, 3) m, any order; what lies more than 512 m from the middle is left out.
-        origin: (3,) m, the sensor, where it is known: the middle; else the points' median.
+        points: (n, 3) m, in any order; points more than 512 m from the middle are ignored.
+        origin: (3,) m, sensor position, which is the middle; if None, the points' median is.
 
     Returns:
-        The ground, or None where there is none: too few cells whose lowest points form a surface.
+        The ground, or None if the lowest points of too few cells form a surface.
     """
     floors = _lowest(points, origin)
     if floors is None:
@@ -102,7 +103,7 @@ def estimate_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Gro
         return None
     slope, height = plane[:2], plane[2]
     if np.abs(slope).max() > _SLOPE_BIN:
-        # the lowest points of a cell lie at its lower side: look again along the plane
+        # on a slope, the lowest points of a cell lie at its lower side: repeat relative to the plane
         points = np.asarray(points)
         leveled_points = np.column_stack([points[:, :2], points[:, 2] - points[:, :2] @ slope])
         floors = _lowest(leveled_points, origin) or floors
@@ -114,17 +115,17 @@ def estimate_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Gro
     x, y = floors.positions()
     is_floor &= _is_low(np.where(is_floor, residual, np.nan), _CONE_SLOPE)
     if origin is not None:
-        # what carries the sensor has a hole around it, in which a steeper cone reaches over hood and roof
+        # the vehicle that carries the sensor hides the ground around it: the steeper cone would accept hood and roof
         is_near = np.hypot(x - origin[0], y - origin[1]) < _OWN_REACH
         is_floor &= ~is_near | _is_low(np.where(is_floor, residual, np.nan), _OWN_SLOPE)
-    # below the sensor, whose height is without the slope as theirs are; of an unknown one what is not tall
+    # cells below the sensor, both heights without the slope; if the sensor is unknown, cells that are not tall
     is_low = residual < _TALL if origin is None else floors.heights < origin[2] - origin[:2] @ slope
     is_seen = np.isfinite(residual) & is_low
     if is_floor.sum() < max(_LEAST_CELLS, _LEAST_SHARE * is_seen.sum()):
         return None
     residual = np.where(is_floor, residual, np.nan)
     surface = _fill(residual)
-    # nothing stands below the ground: somebody's feet where no ground is seen
+    # nothing can stand below the ground: for example a person's feet where no ground is visible
     depth = surface - (floors.heights - height)
     is_lower = ~is_floor & (depth > _LEAST_DEPTH) & (depth < _MOST_DEPTH) & (floors.counts >= _SOLID)
     if is_lower.any():
@@ -134,7 +135,7 @@ def estimate_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Gro
 
 
 def without_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Ground:
-    """A stand-in where `estimate_ground` gives None: the lowest points within 2 m. points (n, 3) m."""
+    """A substitute if `estimate_ground` gives None: the lowest points nearby. points (n, 3) m."""
     floors = _lowest(points, origin, least=1)
     if floors is None:
         return Ground(corner=np.zeros(2), heights=np.zeros((1, 1), np.float32))
@@ -146,10 +147,10 @@ def without_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Grou
 
 
 def estimate_up(points: np.ndarray, origin: np.ndarray | None = None) -> np.ndarray | None:
-    """The up direction (3,) of a cloud tilted by up to some 40 degrees; None where it is level to `TILTED` degrees.
+    """The up axis (3,) of a cloud tilted by up to about 40 degrees; None if it is level to within `TILTED` degrees.
 
-    A level cloud on a slope and a tilted one on a plane look alike: a plane that leans less than `TILTED` is a slope.
-    points (n, 3) m, z about up. None too where there is no ground to tell by.
+    A level cloud on a slope and a tilted cloud on a plane look the same: a plane inclined by less than `TILTED` is
+    taken for a slope. points (n, 3) m, z roughly up. Also None if there is no ground to estimate the axis from.
     """
     upright = np.array([0.0, 0.0, 1.0])
     up, residual, R_level_input = upright, np.zeros(0), np.eye(3)
@@ -183,14 +184,14 @@ def estimate_up(points: np.ndarray, origin: np.ndarray | None = None) -> np.ndar
 
 
 def _lowest(points: np.ndarray, origin: np.ndarray | None, *, least: int = 2) -> _Floors | None:
-    """Of each cell the mean of the lowest 10 cm of points that, with the next 10 cm, are at least `least`."""
+    """Mean height per cell of its lowest 10 cm of points that, with the next 10 cm, are at least `least` points."""
     if not len(points):
         return None
     x, y, z = (np.asarray(points)[:, i] for i in range(3))
     middle = np.array([np.median(x), np.median(y)]) if origin is None else np.asarray(origin, float)[:2]
     reach = _MOST_CELLS / 2 * CELL
     is_inside = (np.abs(x - middle[0]) < reach) & (np.abs(y - middle[1]) < reach)
-    # heights that no ground around has
+    # removes heights that the ground in this area cannot have
     low, high = np.quantile(z[is_inside][:: max(1, len(z) // 20_000)], [0.002, 0.98]) if is_inside.any() else (0, 0)
     is_inside &= (z >= low - 3) & (z <= high + 1)
     if not is_inside.all():
@@ -213,7 +214,7 @@ def _lowest(points: np.ndarray, origin: np.ndarray | None, *, least: int = 2) ->
         lowest_counts = np.bincount(cell[is_lowest], minlength=heights.size)
         heights[has_floor] = (z_sum / np.maximum(lowest_counts, 1))[has_floor]
         counts[has_floor] = point_counts[has_floor]
-        # what lies alone is left out, and the next higher points of its cell are tried
+        # isolated points are skipped, and the next higher points of their cell are tried
         is_higher = ~has_floor[cell] & (relative_z >= 2 * _BIN)
         cell, z = cell[is_higher], z[is_higher]
         if not len(z):
@@ -224,10 +225,10 @@ def _lowest(points: np.ndarray, origin: np.ndarray | None, *, least: int = 2) ->
 
 
 def _common_plane(floors: _Floors, origin: np.ndarray | None) -> np.ndarray | None:
-    """(a, b, c) of the plane z = a x + b y + c that most floors share, the nearer ones before all.
+    """(a, b, c) of the plane z = a x + b y + c that most cells share, weighted toward near cells.
 
-    None where floors share none. A plane passes below the sensor at `origin` (3,) m, where that is known, give or
-    take `_BELOW_SENSOR`.
+    None if no plane is shared. If the sensor position `origin` (3,) m is known, the plane passes below it, with a
+    tolerance of `_BELOW_SENSOR`.
     """
     h = floors.heights
     x, y = (np.broadcast_to(values, h.shape) for values in floors.positions())
@@ -243,7 +244,7 @@ def _common_plane(floors: _Floors, origin: np.ndarray | None) -> np.ndarray | No
             a, b = z[lag:, :-lag] - z[corner], z[:-lag, lag:] - z[corner]
             a, b = sign_x * a / (lag * CELL), sign_y * b / (lag * CELL)
             plane = np.stack([a, b, z[corner] - a * u[corner] - b * v[corner]], -1)
-            # false too where a cell is unknown
+            # also False if a cell is unknown
             is_valid = (np.abs(plane[..., :2]) < _STEEPEST).all(-1) & (plane[..., 2] < max_height)
             planes.append(plane[is_valid])
             weights.append(w[corner][is_valid])
@@ -251,7 +252,7 @@ def _common_plane(floors: _Floors, origin: np.ndarray | None) -> np.ndarray | No
     if len(planes_all) < 3:
         return None
     bins = 2 * round(_STEEPEST / _SLOPE_BIN)
-    # a sum may be rounded up to the last bin's end
+    # rounding may give the end of the last bin
     row, column = ((planes_all[:, :2] + _STEEPEST) * (bins / (2 * _STEEPEST))).astype(np.int64).clip(max=bins - 1).T
     counts = _box_sum(np.bincount(row * bins + column, weights_all, minlength=bins * bins).reshape(bins, bins), 1)
     top_bins = np.argsort(-counts, axis=None)[: _SLOPES * 9 : 9]
@@ -267,7 +268,7 @@ def _common_plane(floors: _Floors, origin: np.ndarray | None) -> np.ndarray | No
         if is_below.any():
             candidate_planes.append(np.array([*slope, _lowest_mode(residual[is_below], weight[is_below])]))
             residual = residual - candidate_planes[-1][2]
-            # much that lies below says that it is no ground
+            # many cells below a plane indicate that it is not the ground
             scores.append(weight[np.abs(residual) < _NEAR_PLANE].sum() - weight[residual < -2 * _NEAR_PLANE].sum())
             scores[-1] /= 1 + slope @ slope / _COMMON_SLOPE**2
     if not scores:
@@ -278,7 +279,7 @@ def _common_plane(floors: _Floors, origin: np.ndarray | None) -> np.ndarray | No
         inlier_weight = np.where(np.abs(residual) < tolerance, weight, 0.0)
         if np.count_nonzero(inlier_weight) < 4:
             return None
-        # a weak pull to the plane so far where cells lie on a line
+        # a weak pull toward the current plane, for cells that lie on a line
         ridge = np.diag([1.0, 1.0, 1e-6])
         plane = plane + np.linalg.solve(
             (basis * inlier_weight[:, None]).T @ basis + ridge, basis.T @ (inlier_weight * residual)
@@ -289,7 +290,7 @@ def _common_plane(floors: _Floors, origin: np.ndarray | None) -> np.ndarray | No
 
 
 def _lowest_mode(values: np.ndarray, weights: np.ndarray) -> float:
-    """The lowest height that is nearly as common as the commonest."""
+    """The lowest height that is nearly as common as the most common one."""
     step = 0.2
     start = values.min()
     counts = np.bincount(((values - start) / step).astype(np.int64), weights)
@@ -298,7 +299,7 @@ def _lowest_mode(values: np.ndarray, weights: np.ndarray) -> float:
 
 
 def _is_supported(heights: np.ndarray) -> np.ndarray:
-    """Cells (X, Y) of whose neighbors within 2 m `_SUPPORT` lie at their height."""
+    """Cells (X, Y) with at least `_SUPPORT` neighbors within 2 m at their height."""
     padded = np.pad(heights, 2, constant_values=np.nan)
     support = np.zeros(heights.shape, np.int64)
     rows, columns = heights.shape
@@ -311,16 +312,17 @@ def _is_supported(heights: np.ndarray) -> np.ndarray:
 
 
 def _is_low(heights: np.ndarray, slope: float) -> np.ndarray:
-    """Cells (X, Y) that no neighbor's cone lies below."""
+    """Cells (X, Y) that are not above the cone of any neighbor."""
     finite_heights = np.where(np.isnan(heights), np.inf, heights)
     cone = _spread_minimum(finite_heights, slope * CELL, _CONE_REACH)
     return finite_heights <= cone + _CONE_ROOM
 
 
 def _spread_minimum(heights: np.ndarray, rise: float, reach: int) -> np.ndarray:
-    """The least of heights (X, Y) plus `rise` times the distance in cells, up to `reach` cells away along each axis.
+    """The minimum over nearby cells of heights (X, Y) plus `rise` times the distance in cells.
 
-    Steps of 1, 2, 4, ... cells to eight sides reach every cell, by a way that is little longer than the straight one.
+    Steps of 1, 2, 4, ... up to `reach` cells in eight directions reach every cell nearby, on a path that is little
+    longer than the straight one.
     """
     lowest = heights.copy()
     step = 1
@@ -337,7 +339,7 @@ def _spread_minimum(heights: np.ndarray, rise: float, reach: int) -> np.ndarray:
 
 
 def _fill(heights: np.ndarray) -> np.ndarray:
-    """Heights (X, Y) with NaN filled by means of ever larger squares around, in which 0 counts as one cell more."""
+    """Heights (X, Y) with NaN filled by means of ever larger squares, in which 0 counts as `_PLANE_WEIGHT` cells."""
     is_known = np.isfinite(heights)
     values, weight = np.where(is_known, heights, 0.0), is_known.astype(float)
     filled_heights, reach = heights.copy(), 1
@@ -350,7 +352,7 @@ def _fill(heights: np.ndarray) -> np.ndarray:
 
 
 def _box_sum(values: np.ndarray, reach: int) -> np.ndarray:
-    """Sums (X, Y) over the squares that reach `reach` cells to each side."""
+    """Sums (X, Y) over the squares that extend `reach` cells to each side."""
     for axis in (0, 1):
         size = values.shape[axis]
         sums = np.concatenate([np.zeros_like(values.take([0], axis)), np.cumsum(values, axis)], axis)

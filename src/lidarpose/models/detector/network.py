@@ -1,4 +1,4 @@
-"""`DetectorNet`: is there a person at a candidate, and where exactly. Small enough for hundreds of candidates a scan.
+"""`DetectorNet`: whether there is a person at a candidate, and where. Fast enough for hundreds of candidates per scan.
 
 Legend: K candidates, C channels.
 """
@@ -8,16 +8,16 @@ from torch import Tensor, nn
 
 from lidarpose.models.detector.detector_config import OUTPUTS, DetectorConfig
 
-# channels whose place in the last map matters to the head
+# channels of the last map that the head reads cell by cell
 _PLACED = 8
-# standard deviation of a stem's input is far below 1: empty cells are 0
+# initial prediction of a person's height, m
 _HEIGHT = 1.7
-# how much of a block's second convolution is added in the beginning
+# initial gain of a block's second convolution
 _GAIN = 0.1
 
 
 class _Block(nn.Module):
-    """A 3 x 3 convolution that halves the map, then a residual one that begins as the identity."""
+    """A 3 x 3 convolution that halves the map, then a residual one that is close to the identity at first."""
 
     def __init__(self, in_channels: int, out_channels: int):
         super().__init__()
@@ -31,14 +31,14 @@ class _Block(nn.Module):
 
 
 class _Branch(nn.Module):
-    """Maps (K, C, H, W) -> features (K, F): the largest of each channel, and some channels cell by cell."""
+    """Maps (K, C, H, W) -> features (K, F): the maximum of each channel, and some channels cell by cell."""
 
     def __init__(self, shape: tuple[int, int, int], stem: int, *levels: int):
         super().__init__()
         in_channels, rows, columns = shape
         layers: list[nn.Module] = []
         if stem:
-            # vertical structure first: rows of the input are channels
+            # vertical structure first: the input's channels are slices of height
             layers += [nn.Conv2d(in_channels, stem, 1), nn.ReLU()]
             in_channels = stem
         for out_channels in levels:
@@ -54,7 +54,7 @@ class _Branch(nn.Module):
 
 
 class DetectorNet(nn.Module):
-    """Candidates' inputs -> (K, 6), see `OUTPUTS`. Without batch statistics: a candidate's answer is its own."""
+    """Inputs of candidates -> (K, 6), see `OUTPUTS`. No batch statistics: outputs do not depend on other candidates."""
 
     def __init__(self, config: DetectorConfig):
         super().__init__()
@@ -72,7 +72,7 @@ class DetectorNet(nn.Module):
                 module.bias = nn.Parameter(torch.zeros(len(module.weight)))
         nn.init.normal_(self.last.weight, std=0.01)
         with torch.no_grad():
-            # people are rare, and of usual height
+            # people are rare, and most are of usual height
             self.last.bias.copy_(torch.tensor([-2.0, 0.0, 0.0, 0.0, _HEIGHT, -2.0]))
 
     def forward(self, fine: Tensor, range_view: Tensor, context: Tensor, scalars: Tensor) -> Tensor:

@@ -1,10 +1,10 @@
-"""Places where a person may stand: columns that hold more points above the ground than what is around them.
+"""Proposes positions of people: columns that hold more points above the ground than their surroundings.
 
-Points 0.3-2.1 m above the ground are counted on a grid of 10 cm. Peaks of the smoothed counts, drawn to the mean of
-the points around them, give one kind of candidate; peaks of the counts of each column's upper end, where two people
-side by side are still apart, give another. Two who stand 0.3 m from each other are two in both. Nothing is clustered,
-so a person at a wall or a hedge has a candidate as good as one in the open. What is next to never a person is left out
-in the end, by a look at each column and the two rings around it.
+Points 0.3-2.1 m above the ground are counted on a grid of 10 cm. Peaks of the smoothed counts, shifted to the mean of
+the points around them, give one kind of candidate. Peaks of the counts at each column's upper end, where two people
+side by side are still separate, give another. Both separate two people who stand 0.3 m apart. Nothing is clustered, so
+a person at a wall or a hedge gets as good a candidate as one in the open. Finally, columns that are almost never a
+person are dropped, by features of each column and the two rings around it.
 """
 
 import threading
@@ -17,49 +17,49 @@ import numpy as np
 from lidarpose.models import weights_file
 from lidarpose.models.detector.ground import Ground
 
-# m: of a cell; heights above ground that count; a tile of the grid, and how much tiles overlap
+# m: size of a cell; heights above ground that count; a tile of the grid, and the overlap of tiles
 CELL = 0.1
 LOW, HIGH = 0.3, 2.1
 _TILE, _OVERLAP = 64.0, 1.0
-# what a candidate must have: points, the height of its top over the ground, and from its lowest to its highest point
+# minimum of a candidate: points; height of its top above the ground, m, and the same for a person cut off by the field
+# of view; extent from its lowest to its highest point, m
 LEAST_POINTS = 5
 _LEAST_TOP, _LEAST_PART, _LEAST_EXTENT = 0.6, 0.45, 0.25
-# a head or shoulder that looks over something may be as low as this where its top is that high over the ground, m
+# minimum extent of a head or shoulder visible above an occluder, and minimum height of its top above the ground, m
 _LEAST_HEAD, _HEAD_TOP = 0.08, 1.1
-# counts are summed over so many cells to each side
+# counts are summed over this many cells to each side
 _SUMMED = 1
-# radii in cells of the disc and the two rings around it that a column is told by, and how many numbers that gives
+# radii in cells of the disc and the two rings around it that give a column's features, and the number of features
 _RINGS, FEATURES = (3, 6, 9), 13
-# cells to each side: of the surroundings that a peak tops, of the mean shift, of a candidate's column, of the grid
+# cells to each side: of a peak's neighborhood, of the mean shift, of a candidate's column, of the grid's margin
 _PEAK, _SHIFT, _COLUMN, _MARGIN = 2, 2, 3, 16
 _SHIFTS = 2
-# of heads: points so far below the highest point within 0.3 m belong to it, m
+# points up to this far below the highest point within 0.3 m belong to a head, m
 _HEAD = 0.3
 _TALLEST = 2.05
-# the lowest height of a cell that holds nothing, m
+# the lowest height of an empty cell, m
 _EMPTY = np.float32(HIGH + 1)
-# a column is dropped this near to a head or to a stronger column, m
+# a column nearer than this to a head or to a stronger column is dropped, m
 _APART = 0.3
 
-# a column stays whose logit is above this: at 0, three in a thousand of those who have columns lose all of theirs, and
-# in a row of people, who are rare in training, those in the middle
+# logit threshold of columns. At a threshold of 0, three in a thousand of the people who have columns lose all of them,
+# as do the people in the middle of a row, since rows of people are rare in training
 _LEAST_LOGIT = -0.75
 _MOST = 600
 
-# points whose heights are looked up in one go
+# number of points whose heights are looked up at once
 _PIECE = 16_384
 
 _kept = threading.local()
 
 
 def propose(points: np.ndarray, ground: Ground, *, heights: np.ndarray | None = None) -> np.ndarray:
-    """Centers (K, 3) m of columns that may be people, `_MOST` at most: x, y, and z of the ground there; the likeliest
-    first.
+    """Centers (K, 3) m of columns that may be people, at most `_MOST`, likeliest first: x, y, and z of the ground.
 
     Args:
         points: (n, 3) m, z up.
-        ground: under them.
-        heights: (n,) m of the points above the ground, where they are known.
+        ground: under the points.
+        heights: (n,) m of the points above the ground, if already computed.
     """
     xy, features = columns(points, heights_above(points, ground) if heights is None else heights)
     logit = _likeness(features)
@@ -69,13 +69,13 @@ def propose(points: np.ndarray, ground: Ground, *, heights: np.ndarray | None = 
 
 
 def columns(points: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """All columns: places (K, 2) m, and what each and its surroundings are like (K, `FEATURES`).
+    """All columns: positions (K, 2) m, and features of each and its surroundings (K, `FEATURES`).
 
-    points (n, 3) m; heights (n,) m: theirs above the ground.
+    points (n, 3) m; heights (n,) m: of the points above the ground.
     """
     points = np.asarray(points)
     band_rows = np.flatnonzero((heights > LOW) & (heights < HIGH))
-    # one after the other: numpy reduces long rows faster than pairs
+    # separate arrays, since numpy reduces long rows faster than pairs
     x, y, heights = points[band_rows, 0], points[band_rows, 1], heights[band_rows]
     places, features = [np.zeros((0, 2))], [np.zeros((0, FEATURES), np.float32)]
     for corner, bounds, rows in _tiles(x, y):
@@ -92,13 +92,13 @@ def columns(points: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.nda
 
 @cache
 def _weights() -> dict[str, np.ndarray]:
-    """A small perceptron's layers, and the logit below which next to nobody is."""
+    """The layers of a small perceptron, and the logit below which almost no column is a person."""
     with np.load(weights_file("proposals.npz"), allow_pickle=False) as file:
         return dict(file)
 
 
 def _likeness(features: np.ndarray) -> np.ndarray:
-    """Logits (K,) of features (K, `FEATURES`): low for what is next to never a person, as most of a wall is."""
+    """Logits (K,) of features (K, `FEATURES`): low for columns that are almost never a person, as in most of a wall."""
     w = _weights()
     hidden = np.maximum((features - w["mean"]) / w["deviation"] @ w["hidden_weight"] + w["hidden_bias"], 0)
     return hidden @ w["weight"] + w["bias"] - w["least"]
@@ -107,7 +107,7 @@ def _likeness(features: np.ndarray) -> np.ndarray:
 def heights_above(points: np.ndarray, ground: Ground) -> np.ndarray:
     """Heights (n,) float32 m of points (n, 3) m above the ground."""
     points, heights = np.asarray(points), np.empty(len(points), np.float32)
-    # in pieces that the processor's cache holds
+    # in pieces that fit the processor's cache
     for start in range(0, len(points), _PIECE):
         piece = points[start : start + _PIECE]
         heights[start : start + _PIECE] = piece[:, 2] - ground.at(piece[:, :2])
@@ -115,7 +115,7 @@ def heights_above(points: np.ndarray, ground: Ground) -> np.ndarray:
 
 
 def _tiles(x: np.ndarray, y: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray | slice]]:
-    """(corner, bounds (2, 2) of what is its own, rows) of tiles with points in them: bounded grids for any extent."""
+    """(corner, bounds (2, 2) without overlap, rows) of each tile with points: limits the grid size for any extent."""
     if not len(x):
         return
     start = np.floor(np.array([x.min(), y.min()], float) / CELL) * CELL - _OVERLAP
@@ -124,7 +124,7 @@ def _tiles(x: np.ndarray, y: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarra
         return
     position = np.stack([x, y], 1) - start
     tile = np.floor(position / _TILE).astype(np.int64)
-    # (i, j, row) of each point in its own tile, and in those beyond the borders that it is near to
+    # (i, j, row) of each point in its own tile, and in the neighboring tiles that it is near to
     entries = [np.column_stack([tile, np.arange(len(x))])]
     for shift in product((-_OVERLAP, 0, _OVERLAP), repeat=2):
         near_tile = np.floor((position + shift) / _TILE).astype(np.int64)
@@ -132,7 +132,7 @@ def _tiles(x: np.ndarray, y: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarra
         entries.append(np.column_stack([near_tile[near_rows], near_rows]))
     table = np.concatenate(entries)
     table = table[np.lexsort(table.T[::-1])]
-    # near a corner one tile comes by several shifts
+    # near a corner, several shifts give the same tile
     table = table[np.append(True, np.diff(table, axis=0).any(1))]
     ends = np.flatnonzero(np.diff(table[:, :2], axis=0).any(1)) + 1
     for tile_table in np.split(table, ends):
@@ -141,8 +141,10 @@ def _tiles(x: np.ndarray, y: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarra
 
 
 def _is_dense_somewhere(x: np.ndarray, y: np.ndarray) -> bool:
-    """Whether a column may have its `LEAST_POINTS`: it is less than 1 m wide, so 2 x 2 cells of 1 m hold it. x, y (n,)
-    m, at least 0. Most of a map of kilometers, thinned, has none."""
+    """Whether any column can have `LEAST_POINTS`: it is less than 1 m wide, so 2 x 2 cells of 1 m contain it.
+
+    x, y (n,) m, at least 0. In a subsampled map of kilometers, most tiles have no such column.
+    """
     row, column = (values.astype(np.int64) for values in (x, y))
     shape = int(row.max()) + 2, int(column.max()) + 2
     counts = np.bincount(row * shape[1] + column, minlength=shape[0] * shape[1]).reshape(shape)
@@ -151,11 +153,11 @@ def _is_dense_somewhere(x: np.ndarray, y: np.ndarray) -> bool:
 
 
 def _peaks(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places (K, 2) m and features of a tile's columns. x, y (n,) m from its corner, heights (n,) m."""
+    """Positions (K, 2) m and features of a tile's columns. x, y (n,) m from its corner, heights (n,) m."""
     row, column = ((values * (1 / CELL)).astype(np.int32) + _MARGIN for values in (x, y))
     width = int(column.max()) + _MARGIN + 1
     point_cells = row * width + column
-    # of each cell: points; the highest, and how far the lowest is below `_EMPTY`, m; what is looked at in turn
+    # per cell: number of points; highest point, m; distance of the lowest point below `_EMPTY`, m; a working grid
     count, top, depth, grid = _grids(4, (int(row.max()) + _MARGIN + 1) * width)
     np.add.at(count, point_cells, np.float32(1))
     np.maximum.at(top, point_cells, heights)
@@ -167,7 +169,7 @@ def _peaks(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> tuple[np.ndarra
     max_height = top[occupied_cells]
     for step in _disc(_COLUMN, width):
         np.maximum(max_height, top[occupied_cells + step], out=max_height)
-    # nobody's head reaches through the band: a wall
+    # a column that reaches the end of the band is a wall, not a head
     max_height[max_height > _TALLEST] = np.inf
     grid[occupied_cells] = max_height - _HEAD
     is_head = heights > grid[point_cells]
@@ -185,11 +187,11 @@ def _peaks(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> tuple[np.ndarra
     is_tall = max_height - min_height > _LEAST_EXTENT
     is_tall |= (max_height - min_height > _LEAST_HEAD) & (max_height > _HEAD_TOP) & (point_count >= 2 * LEAST_POINTS)
     is_valid = (point_count >= LEAST_POINTS) & (max_height > _LEAST_TOP) & is_tall
-    # cut off by the field of view
+    # or a person cut off by the field of view
     is_valid |= (point_count >= 6 * LEAST_POINTS) & (max_height > _LEAST_PART) & (max_height - min_height > _LEAST_HEAD)
     is_body = np.arange(len(centers)) < len(body_centers)
     centers, point_count, is_body = centers[is_valid], point_count[is_valid], is_body[is_valid]
-    # where two are equally strong, the order of places: not that of the points
+    # equally strong columns are ordered by position, so the order of the points does not matter
     order = np.lexsort((centers[:, 1], centers[:, 0], -point_count, is_body))
     grid[:] = 0
     order = order[_apart(centers[order], grid.view(bool).reshape(-1, 2 * width))]
@@ -198,7 +200,7 @@ def _peaks(x: np.ndarray, y: np.ndarray, heights: np.ndarray) -> tuple[np.ndarra
 
 
 def _grids(number: int, size: int) -> np.ndarray:
-    """Zeros (number, size) float32 in memory that the thread keeps: to get as much anew takes longer than all else."""
+    """Zeros (number, size) float32 in memory that the thread reuses: allocation takes longer than everything else."""
     if number * size > len(getattr(_kept, "memory", ())):
         _kept.memory = np.empty(number * size, np.float32)
     grids = _kept.memory[: number * size].reshape(number, size)
@@ -207,10 +209,10 @@ def _grids(number: int, size: int) -> np.ndarray:
 
 
 def _features(cells: np.ndarray, count: np.ndarray, top: np.ndarray, depth: np.ndarray, width: int) -> np.ndarray:
-    """What flat cells (K,) and the rings around them are like, of grids of counts, heights and depths."""
+    """Features of flat cells (K,) and the rings around them, from grids of counts, heights and depths."""
     offset = _offsets(_RINGS[-1])
     square_distance = (offset**2).sum(1)
-    # the disc first, then ring after ring
+    # the disc first, then ring by ring
     order = np.argsort(square_distance, kind="stable")
     ends = np.searchsorted(square_distance[order], [(radius + 0.3) ** 2 for radius in _RINGS])
     offset = offset[order[: ends[-1]]]
@@ -222,7 +224,7 @@ def _features(cells: np.ndarray, count: np.ndarray, top: np.ndarray, depth: np.n
     features += [occupancy[ring].mean(0) for ring in rings]
     features += [cell_tops[ring].max(0) for ring in rings]
     features += [_EMPTY - depth[ring_cells[ring]].max(0) for ring in rings[:2]]
-    # how long and how wide what is filled is, cells
+    # length and width of the occupied area, cells
     occupied_count = np.maximum(occupancy.sum(0), 1)
     x, y = offset.T.astype(np.float32)
     mean_x, mean_y = x @ occupancy / occupied_count, y @ occupancy / occupied_count
@@ -234,13 +236,13 @@ def _features(cells: np.ndarray, count: np.ndarray, top: np.ndarray, depth: np.n
 
 
 def _smooth(grid: np.ndarray, cells: np.ndarray, values: np.ndarray, width: int) -> None:
-    """Adds values (n,) at flat cells (n,), all different, to the square around each in a grid (size,)."""
+    """Adds values (n,) at distinct flat cells (n,) to the square around each in a grid (size,)."""
     for step in _square(_SUMMED, width):
         grid[cells + step] += values
 
 
 def _maxima(grid: np.ndarray, width: int) -> np.ndarray:
-    """Flat cells that hold something and are the maximum of the square around them."""
+    """Flat cells that are not empty and are the maximum of the square around them."""
     cells = np.flatnonzero(grid > 0)
     for step in (-1, 1, -width, width):
         cells = cells[grid[cells] >= grid[cells + step]]
@@ -248,7 +250,7 @@ def _maxima(grid: np.ndarray, width: int) -> np.ndarray:
 
 
 def _shifted(cells: np.ndarray, count: np.ndarray, width: int) -> np.ndarray:
-    """Positions (K, 2) in cells of flat cells after a few steps to the mean of the points around them."""
+    """Positions (K, 2) in cells of flat cells (K,), after a few steps to the mean of the points around them."""
     position = _positions(cells, width).astype(np.float32)
     offset = _offsets(_SHIFT).astype(np.float32).T[..., None]
     steps = _square(_SHIFT, width)[:, None]
@@ -265,7 +267,7 @@ def _shifted(cells: np.ndarray, count: np.ndarray, width: int) -> np.ndarray:
 
 
 def _positions(cells: np.ndarray, width: int) -> np.ndarray:
-    """Middles (K, 2) in cells of flat cells (K,)."""
+    """Centers (K, 2) in cells of flat cells (K,)."""
     return np.stack([cells // width, cells % width], 1) + 0.5
 
 
@@ -275,19 +277,21 @@ def _offsets(reach: int) -> np.ndarray:
 
 
 def _square(reach: int, width: int) -> np.ndarray:
-    """Steps (N,) from a flat cell to those of the square around it."""
+    """Steps (N,) from a flat cell to the cells of the square around it."""
     return _offsets(reach) @ [width, 1]
 
 
 def _disc(reach: int, width: int) -> np.ndarray:
-    """Steps (N,) from a flat cell to those of the disc around it."""
+    """Steps (N,) from a flat cell to the cells of the disc around it."""
     offset = _offsets(reach)
     return offset[(offset**2).sum(1) <= (reach + 0.3) ** 2] @ [width, 1]
 
 
 def _apart(centers: np.ndarray, is_blocked: np.ndarray) -> np.ndarray:
-    """Rows of positions (K, 2) in cells, the strongest first, that have `_APART` to all earlier ones that stay;
-    is_blocked: False for each half cell, which is exact enough."""
+    """Rows of positions (K, 2) in cells, strongest first, that are `_APART` from all stronger rows that remain.
+
+    is_blocked: False for each half cell, which is precise enough.
+    """
     reach = round(2 * _APART / CELL)
     disc = (_offsets(reach) ** 2).sum(1).reshape(2 * reach + 1, -1) < reach**2
     rows = []

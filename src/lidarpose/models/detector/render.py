@@ -1,16 +1,16 @@
-"""What the detector's network sees of a candidate: the points there, what the sensor sees past it, and what is around.
+"""Renders the detector network's inputs for a candidate: its points, the sensor's view past it, and its surroundings.
 
-The view frame of a candidate: x away from the sensor, level, y left, z up from the ground at the candidate's center;
-of an unknown sensor, x and y are the level frame's. Inputs, K candidates first:
+The view frame of a candidate: x level and away from the sensor, y left, z up from the ground at the candidate's
+center. If the sensor is unknown, x and y are those of the level frame. Inputs, with K candidates as the first axis:
 
     fine (K, 28, 24, 24): slices of 10 cm from -0.5 to 2.3 m, cells of 10 cm: .5 + .125 log2(1 + points), 0 if empty
-    range_view (K, 4, 28, 24): directions, as a picture of 2.4 x 2.8 m at the candidate's distance, rows from below,
-        columns from the right to the left: nearest and farthest return beyond the candidate (m / 4, to +-1), how many
-        returns there are, and how many around, .125 log2(1 + returns)
-    context (K, 4, 20, 20): 10 x 10 m from above, x first: highest point above the ground (m / 4, to 1), share of the
-        heights 0.3-2.1 m that hold points, .125 log2(1 + points), the same of points near the ground
-    scalars (K, 4): log of the distance, height of the sensor above the ground there (m / 4), log of the number of
-        points, 1 where the sensor is known; without a sensor, range_view and the first two are 0
+    range_view (K, 4, 28, 24): directions, as a view of 2.4 x 2.8 m at the candidate's distance, rows from bottom to
+        top, columns from right to left: nearest and farthest return beyond the candidate (m / 4, clipped to +-1),
+        number of returns, and number of returns in a cell of twice the size, both as .125 log2(1 + returns)
+    context (K, 4, 20, 20): 10 x 10 m from above, x first: highest point above the ground (m / 4, clipped to 1), share
+        of the heights 0.3-2.1 m that hold points, .125 log2(1 + points), the same for points near the ground
+    scalars (K, 4): log of the distance, height of the sensor above the ground at the candidate (m / 4), log of the
+        number of points, 1 if the sensor is known; without a sensor, range_view and the first two are 0
 """
 
 from dataclasses import dataclass, fields
@@ -24,11 +24,11 @@ from lidarpose.models.detector.range_image import BOTTOM, CELL, RANGE_CHANNELS, 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CandidateAugmentation:
-    """How candidates are changed in training. Of points in the view frame, in this order: mirror, turn, scale, shift.
+    """Training augmentation of candidates. Points in the view frame are, in order, mirrored, turned, scaled, shifted.
 
-    Each field is an array with an entry for each of K candidates, or one value for all. turn rad about z; mirror: y to
-    -y; scale; shift (K, 2) m; keep: share of points; noise m: standard deviation along x, away from the sensor;
-    drop_origin: as if the sensor was unknown; seed of what is drawn for each point.
+    Each field is an array with one entry per candidate (K), or one value for all. turn: rad about z; mirror: y to -y;
+    scale; shift (K, 2) m; keep: share of points; noise: standard deviation along x, away from the sensor, m;
+    drop_origin: treat the sensor as unknown; seed: of the random numbers drawn for each point.
     """
 
     turn: Any = 0.0
@@ -41,20 +41,20 @@ class CandidateAugmentation:
     seed: Any = 0
 
     def over(self, count: int) -> "CandidateAugmentation":
-        """The same, with an entry for each of so many candidates."""
+        """The same, with one entry for each of `count` candidates."""
         shapes = {"shift": (count, 2)}
         values = {f.name: np.broadcast_to(getattr(self, f.name), shapes.get(f.name, (count,))) for f in fields(self)}
         return CandidateAugmentation(**values)
 
     @property
     def matrix(self) -> np.ndarray:
-        """(K, 2, 2) of x and y."""
+        """(K, 2, 2): mirroring, turn and scale of x and y."""
         c, s = self.scale * np.cos(self.turn), self.scale * np.sin(self.turn)
         sign = np.where(self.mirror, -1, 1)
         return np.stack([np.stack([c, -s * sign], -1), np.stack([s, c * sign], -1)], -2)
 
     def apply(self, places: np.ndarray) -> np.ndarray:
-        """x and y (K, 2) m of places, one a candidate, mirrored, turned, scaled and shifted."""
+        """Positions (K, 2) m, one per candidate, mirrored, turned, scaled and shifted."""
         augmentation = self.over(len(places))
         return (augmentation.matrix @ places[..., None])[..., 0] + augmentation.shift
 
@@ -62,7 +62,7 @@ class CandidateAugmentation:
 def render(
     candidates: Candidates, augmentation: CandidateAugmentation | None = None, *, fine: np.ndarray | None = None
 ) -> dict[str, np.ndarray]:
-    """The network's inputs, float32: see the module. fine: memory (K, 28, 24, 24) float32 for that input."""
+    """The network's inputs, float32: see the module. fine: memory (K, 28, 24, 24) float32 to reuse for that input."""
     has_sensor, count = candidates.distance > 0, candidates.count
     points = candidates.xyz * np.float32(UNIT)
     owner = np.repeat(np.arange(len(candidates)), candidates.sizes)
@@ -78,7 +78,7 @@ def render(
     scalars[:, 2] = np.log1p(count)
     scalars[:, 3] = has_sensor
     return {
-        # of a place with more points than are kept, those stand for all
+        # if a candidate has more points than are stored, each stored point stands for several
         "fine": _fine(points, owner, candidates.count / np.maximum(candidates.sizes, 1), fine),
         "range_view": _range_views(candidates.range_views, has_sensor, change),
         "context": contexts * np.float32(1 / 255),
@@ -89,8 +89,8 @@ def render(
 def _moved_points(
     points: np.ndarray, owner: np.ndarray, sizes: np.ndarray, change: CandidateAugmentation
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (3, n) float32 m of owners (n,), `sizes` (K,) of each, as they are changed, and the owners of those that
-    are kept."""
+    """Augmented points (3, n) float32 m, and the candidates that own them; some points are dropped. owner (n,):
+    candidate of each given point; sizes (K,): number of points of each candidate."""
     draws = [np.zeros((2, 0), np.float32)]
     for size, seed, deviation in zip(sizes.tolist(), change.seed.tolist(), change.noise.tolist(), strict=True):
         rng = np.random.default_rng(seed)
@@ -105,11 +105,11 @@ def _moved_points(
 
 
 def _fine(points: np.ndarray, owner: np.ndarray, weight: np.ndarray, fine: np.ndarray | None) -> np.ndarray:
-    """(K, 28, 24, 24) of points (3, n) m, of whose owners (n,) each stands for `weight` (K,) points."""
+    """(K, 28, 24, 24) of points (3, n) m of candidates `owner` (n,), each of which stands for `weight` (K,) points."""
     shape = (len(weight), SLICES, SIDE, SIDE)
     origin_cell = np.array([[SIDE // 2], [SIDE // 2], [-BOTTOM / CELL]], np.float32)
     j, k, i = np.floor(points * np.float32(1 / CELL) + origin_cell).astype(np.int64)
-    # as unsigned numbers, what is below 0 is large
+    # as unsigned integers, negative indices are large
     is_inside = np.logical_and.reduce([axis.view(np.uint64) < n for axis, n in zip((i, j, k), shape[1:], strict=True)])
     cell_index = (((owner * SLICES + i) * SIDE + j) * SIDE + k)[is_inside]
     fine = np.empty(shape, np.float32) if fine is None else fine
@@ -143,7 +143,7 @@ def _range_views(pixels: np.ndarray, has_sensor: np.ndarray, change: CandidateAu
 
 
 def _lose_returns(views: np.ndarray, share: np.ndarray, seeds: list[int]) -> None:
-    """Keeps a share (K,) of the returns of range views (K, 4, H, W), in place: a cell is empty where all are lost."""
+    """Drops all but a share (K,) of the returns of range views (K, 4, H, W), in place; a cell may become empty."""
     share = share[:, None, None]
     count = np.exp2(views[:, 2] / (0.125 * 255)) - 1
     chance = np.empty(count.shape, np.float32)
