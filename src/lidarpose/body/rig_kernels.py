@@ -1,7 +1,7 @@
 """The compiled inner loops of `rig`: importing this module needs numba.
 
-All arrays are float32 and C-contiguous. Every kernel works on one core without the interpreter lock, so threads can
-pose people side by side. Slow twins: tests/reference/rig.py.
+All arrays are float32 and C-contiguous. Every kernel runs on one core and releases the GIL, so threads can pose people
+in parallel. Slow reference implementations: tests/reference/rig.py.
 """
 
 import numba
@@ -9,18 +9,18 @@ import numpy as np
 
 from lidarpose.skeleton import SMPL24
 
-# numbers that the compiler knows
+# compile-time constants
 _HEAD = SMPL24.index("head")
 _JOINTS = len(SMPL24)
-# float32 sums may be reordered and fused: differences stay at rounding level, vector units are used
+# float32 sums may be reordered and fused for vectorization: differences stay at rounding level
 _jit = numba.njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
 
 
 @_jit
 def pose_people(rest_vertices, rest_joints, rotations, translation, parents, weight_index, weight, vertices, joints):
-    """n people, one after the other: rest_vertices (n, V, 3), rest_joints (n, 26, 3), rotations (n, 24, 3, 3) and
+    """Poses n people sequentially: rest_vertices (n, V, 3), rest_joints (n, 26, 3), rotations (n, 24, 3, 3) and
     translation (n, 3) -> fills vertices (n, V, 3) and joints (n, 26, 3)."""
-    # rows of [G | p - G rest]: what a bone does to a point of the rest pose
+    # rows of [G | p - G rest]: the transform that a bone applies to a point of the rest pose
     motion = np.empty((_JOINTS, 12), np.float32)
     for i in range(rotations.shape[0]):
         for j in range(_JOINTS):
@@ -72,8 +72,8 @@ def pose_people(rest_vertices, rest_joints, rotations, translation, parents, wei
 
 @_jit
 def vertex_normals(faces, vertices, normals):
-    """Fills normals (V, 3) with the outward unit normals of one mesh, area-weighted means over the faces around a
-    vertex: faces (F, 3) int32, vertices (V, 3)."""
+    """Fills normals (V, 3) with the outward unit normals of one mesh, area-weighted over the faces at each vertex:
+    faces (F, 3) int32, vertices (V, 3)."""
     normals[:] = 0
     for f in range(faces.shape[0]):
         i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -94,8 +94,8 @@ def vertex_normals(faces, vertices, normals):
 
 @_jit
 def dress_people(faces, vertices, offset, low, high):
-    """Moves vertices (n, V, 3) by offset (n, V) m along their normals, in place, and fills low and high (n, 3) with
-    their least and greatest x, y, z afterwards."""
+    """Moves vertices (n, V, 3) in place by offset (n, V) m along their normals, and fills low and high (n, 3) with the
+    minimum and maximum x, y, z of the result."""
     normals = np.empty(vertices.shape[1:], np.float32)
     for i in range(vertices.shape[0]):
         vertex_normals(faces, vertices[i], normals)
@@ -110,9 +110,11 @@ def dress_people(faces, vertices, offset, low, high):
 
 @_jit
 def fold_clothing(template, direction, phase, gain, offset):
-    """Multiplies offset (n, V) in place by 1 + gain times the sum of a person's waves at template (V, 3) m: W waves
-    along direction (n, W, 3), periods a meter, at phase (n, W) periods. A wave is made of parabolas, much like a
-    sine."""
+    """Multiplies offset (n, V) in place by 1 + gain times the sum of each person's waves at template (V, 3) m.
+
+    Each of the W waves has a wave vector direction (n, W, 3) in periods per meter and a phase (n, W) in periods. Its
+    shape is a sine approximated by parabolas.
+    """
     for i in range(offset.shape[0]):
         for v in range(offset.shape[1]):
             total = np.float32(0)

@@ -1,10 +1,10 @@
 """The user's own SMPL, SMPL+H or SMPL-X file as a body: shapes, pose-dependent shapes and linear blend skinning.
 
-Frames. SMPL's own has y up; at rest the body stands in a T-pose, faces +z, its left is +x. The level frame has z up;
-the body of `body.rig` faces +x. With C = R_level_smpl, local rotations are R_smpl = C^-1 R_level C.
+Frames: In SMPL's frame y is up; at rest the body stands in a T-pose and faces +z, with its left along +x. In the level
+frame z is up; the body of `body.rig` faces +x. With C = R_level_smpl, local rotations are R_smpl = C^-1 R_level C.
 
 n people, V vertices, F faces, J joints (24 for SMPL, 52 for SMPL+H, 55 for SMPL-X), S shape coefficients.
-Model: Loper et al. 2015, SMPL; the equation numbers below are of that paper.
+Model: Loper et al. 2015, SMPL; equation numbers below refer to that paper.
 """
 
 import os
@@ -25,20 +25,20 @@ from lidarpose.skeleton import SMPL24
 
 _R_LEVEL_SMPL = UP_AXES["y"]
 _KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
-# all of the family share these joints; then come hands, and in SMPL-X the jaw and the eyes
+# the models share the joints before this index; then come the hands, and in SMPL-X the jaw and the eyes
 _SHARED = SMPL24.index("left_hand")
 _HEAD = SMPL24.index("head")
 _HANDS = {SMPL24.index(f"{side}_wrist"): SMPL24.index(f"{side}_hand") for side in ("left", "right")}
-# J and S of SMPL-X's files, and how many of S are shapes; the rest are expressions of the face
+# (J, S) of SMPL-X files -> number of shape coefficients; the remaining ones are facial expressions
 _EXPRESSIONS = {(55, 400): 300, (55, 20): 10}
-# how far the weights of a vertex, and of a joint's regressor, may be from 1: files keep them rounded
+# tolerance for the sum of a vertex's weights and of a joint's regressor, which files store rounded
 _SUM_TOLERANCE = 1e-2
-# a body in other units than meters is larger or smaller than this
+# plausible heights, m; others mean that the unit is not meters
 _HEIGHTS = (0.3, 3.0)
 
 
 def smpl_axis_angles(rotations: np.ndarray, R_world_level: np.ndarray) -> np.ndarray:
-    """Poses (n, 24, 3, 3) of `body.rig` as SMPL's (n, 24, 3) rad, in a world that the level frame is turned to."""
+    """Poses (n, 24, 3, 3) of `body.rig` as SMPL's axis-angles (n, 24, 3) rad in the world frame."""
     local = _R_LEVEL_SMPL.T @ np.asarray(rotations, float) @ _R_LEVEL_SMPL
     local[:, 0] = R_world_level @ _R_LEVEL_SMPL @ local[:, 0]
     return rotation_vector(local)
@@ -48,9 +48,10 @@ def smpl_axis_angles(rotations: np.ndarray, R_world_level: np.ndarray) -> np.nda
 class SmplBody:
     """A body of the SMPL family. Arrays are read-only, meters, SMPL's frame.
 
-    template (V, 3); shapes (V, 3, S), per unit of coefficient; pose_shapes (V, 3, 9 (J - 1)); regressor (J, V): the
-    joints of a shape; weights (V, J), rows sum to 1; parents (J,), -1 for the root; faces (F, 3) int32; face_part (F,)
-    uint8 = 1 + SMPL joint, as in `body.rig`: fingers are hands, jaw and eyes are the head; source: the file.
+    template (V, 3); shapes (V, 3, S), per unit of coefficient; pose_shapes (V, 3, 9 (J - 1)); regressor (J, V):
+    joints from the vertices at rest; weights (V, J), rows sum to 1; parents (J,), -1 for the root; faces (F, 3) int32;
+    face_part (F,) uint8 = 1 + SMPL joint, as in `body.rig`: fingers count as hands, jaw and eyes as the head; source:
+    the file.
     """
 
     template: np.ndarray
@@ -71,11 +72,11 @@ class SmplBody:
 
     @property
     def shape_count(self) -> int:
-        """S, the most shape coefficients that can be given."""
+        """S, the maximum number of shape coefficients."""
         return self.shapes.shape[-1]
 
     def rest(self, betas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """T-posed vertices (n, V, 3) and joints (n, J, 3) m of shapes betas (n, <= S), in SMPL's frame.
+        """T-posed vertices (n, V, 3) and joints (n, J, 3) m for shape coefficients betas (n, <= S), in SMPL's frame.
 
         Source: Loper et al. 2015, Eq. 8 and 10.
         """
@@ -88,14 +89,15 @@ class SmplBody:
     def pose(
         self, betas: np.ndarray, rotations: np.ndarray, translation: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Poses the published model, in SMPL's frame.
+        """Poses the model as published, in SMPL's frame.
 
         Args:
             betas: (n, <= S) shape coefficients.
-            rotations: Local, as matrices (n, 24 or J, 3, 3), axis-angles (n, 24 or J, 3) or rows of these
-                (n, 72 or 3 J) rad. With 24 rotations on SMPL+H and SMPL-X, the hands' turn all fingers at their
-                bases; face and fingers rest.
-            translation: (n, 3) m, by default 0, added to everything: the pelvis goes to its rest position plus it.
+            rotations: Local rotations, as matrices (n, 24 or J, 3, 3), axis-angles (n, 24 or J, 3) or flattened
+                axis-angles (n, 72 or 3 J) rad. If 24 rotations are given for SMPL+H or SMPL-X, the hands' rotations
+                turn all fingers at their bases; the face and the other finger joints stay at rest.
+            translation: (n, 3) m, by default 0, added to all points: the pelvis goes to its rest position plus
+                `translation`.
 
         Returns:
             Vertices (n, V, 3) and joints (n, J, 3), float64 m.
@@ -116,12 +118,12 @@ class SmplBody:
         Args:
             betas: (n, <= S) shape coefficients.
             rotations: (n, 24, 3, 3) local, in the rest frame of `body.rig`.
-            translation: (n, 3) m, where the pelvis goes.
+            translation: (n, 3) m, position of the pelvis.
 
         Returns:
-            Vertices (n, V, 3) and joints (n, 26, 3), float32 m, the joints in BODY26's order. nose is the foremost
-            vertex of the head at rest, head_center the middle of its leftmost and its rightmost (the ears), both
-            carried by the head; the hands of SMPL+H and SMPL-X are the mean of the fingers' bases, without the thumb's.
+            Vertices (n, V, 3) and joints (n, 26, 3), float32 m, the joints in BODY26's order. `nose` is the foremost
+            vertex of the head at rest, `head_center` the middle of its leftmost and rightmost vertices (the ears); both
+            move with the head. The hands of SMPL+H and SMPL-X are the mean of the finger bases without the thumb.
 
         Raises:
             InputError: For other shapes and for values that are not finite.
@@ -139,14 +141,14 @@ class SmplBody:
         body26 = np.concatenate([positions[:, :_SHARED], self._hands(positions), head_points], 1)
         return tuple((x @ _R_LEVEL_SMPL.T).astype(np.float32) for x in (posed_vertices, body26))
 
-    # its name before 0.3
+    # alias: the name before version 0.3
     pose_house = pose_level
 
     def rig(self, betas: np.ndarray) -> Rig:
-        """The body as synthesis poses it, its people those of betas (n, <= S): four bones a vertex, and no shapes that
-        follow the pose."""
+        """The body as a `Rig` for synthesis, with betas (n, <= S) as its table of people. Each vertex has at most four
+        bones, and there are no pose-dependent shapes."""
         betas = np.asarray(betas, float)
-        # raises for betas that cannot be
+        # raises InputError for invalid betas
         self.rest(betas[:1])
         count = betas.shape[1]
         joint_weights = on_smpl(self.weights, self.parents)
@@ -155,7 +157,7 @@ class SmplBody:
         level_shapes = [
             self._level_rest(shape) for shape in (self.template, *np.moveaxis(self.shapes[..., :count], -1, 0))
         ]
-        # a unit of a coefficient moves vertices and joints alike
+        # index 0 is the template, the others are the changes of vertices and joints per unit of coefficient
         vertices, joints = (
             np.ascontiguousarray(np.stack(arrays), np.float32) for arrays in zip(*level_shapes, strict=True)
         )
@@ -174,8 +176,8 @@ class SmplBody:
         )
 
     def _level_rest(self, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (V, 3) at rest, or what a shape adds to them, and the joints of BODY26 (26, 3), level frame about
-        the pelvis; linear in the vertices."""
+        """Rest vertices (V, 3), or a shape's offsets of them, in the level frame relative to the pelvis, and the
+        corresponding joints of BODY26 (26, 3); linear in the vertices."""
         joints = self.regressor @ vertices
         nose, ears = self._head_vertices
         head_points = np.stack([vertices[nose], vertices[ears].mean(0)])
@@ -185,16 +187,16 @@ class SmplBody:
     def _posed(
         self, vertices: np.ndarray, joints: np.ndarray, rotations: np.ndarray, root: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Vertices (n, V, 3), joints (n, J, 3) and their global rotations; Eq. 9 and 2 to 4."""
+        """Vertices (n, V, 3), joints (n, J, 3) and the joints' global rotations; Eq. 9 and 2 to 4."""
         global_rotations, positions = forward_kinematics(self.parents, joints, rotations, root)
         pose_features = (rotations[:, 1:] - np.eye(3)).reshape(len(rotations), -1)
         translations = positions - (global_rotations @ joints[..., None])[..., 0]
-        # a bone's motion as rows (R | t), so that one product blends both
+        # each bone's transform as (R | t), so that one product blends rotation and translation
         motion = np.concatenate([global_rotations, translations[..., None]], -1).reshape(
             len(positions), len(self.parents), 12
         )
         posed_vertices = np.empty_like(vertices)
-        # one person at a time: the blended motions of all would fill the memory
+        # one person at a time, to limit the memory of the blended transforms
         for i, rest_vertices in enumerate(vertices):
             blend = (self.weights @ motion[i]).reshape(-1, 3, 4)
             rest_vertices = rest_vertices + self.pose_shapes @ pose_features[i]
@@ -209,7 +211,7 @@ class SmplBody:
         return translation
 
     def _all_rotations(self, rotations: np.ndarray, count: int) -> np.ndarray:
-        """(n, J, 3, 3) from any of the forms of `pose`."""
+        """Matrices (n, J, 3, 3) from any form of rotations that `pose` accepts."""
         try:
             rotations = np.asarray(rotations, float)
         except (TypeError, ValueError):
@@ -233,7 +235,7 @@ class SmplBody:
         return all_rotations
 
     def _hands(self, joints: np.ndarray) -> np.ndarray:
-        """The hands (n, 2, 3) of joints (n, J, 3): the mean of the fingers' bases, without the thumb's."""
+        """Hand positions (n, 2, 3) from joints (n, J, 3): the mean of the finger bases without the thumb."""
         fingers = [self._fingers(wrist) for wrist in _HANDS]
         # the thumb is the last finger of SMPL+H and SMPL-X
         return np.stack([joints[:, bases[:-1] if len(bases) > 1 else bases].mean(1) for bases in fingers], 1)
@@ -243,22 +245,22 @@ class SmplBody:
 
     @cached_property
     def _head_vertices(self) -> tuple[int, np.ndarray]:
-        """The nose's vertex and the two ears'; shapes move them with the head."""
+        """Indices of the nose's vertex and of the two ears' vertices; shapes move them with the head."""
         head = np.flatnonzero(on_smpl(self.weights, self.parents).argmax(1) == _HEAD)
         x, _, z = self.template[head].T
         return int(head[z.argmax()]), head[[x.argmax(), x.argmin()]]
 
 
 def load_body(path: str | os.PathLike) -> SmplBody:
-    """Reads the body of a user's file: SMPL, SMPL+H or SMPL-X, .pkl or .npz. Nothing in the file is run.
+    """Reads a user's body model: SMPL, SMPL+H or SMPL-X, .pkl or .npz. No code in the file is executed.
 
     Raises:
-        InputError: For a missing or damaged file, a missing key, arrays whose shapes do not fit together, values that
-            are not finite, a tree that is not SMPL's, and units other than meters.
+        InputError: For a missing or corrupted file, a missing key, inconsistent array shapes, non-finite values, a
+            joint tree other than SMPL's, and units other than meters.
     """
     suffix = Path(os.fspath(path)).suffix.lower() if isinstance(path, str | os.PathLike) else ""
     if suffix == ".npz":
-        # SMPL-X's files also have keys of Python objects, which are not read
+        # SMPL-X files also hold pickled Python objects, which are not read
         arrays, names = read_npz(path, _KEYS, expected="an SMPL .npz")
     elif suffix == ".pkl":
         arrays = load_pickle(path)
@@ -311,7 +313,7 @@ def _body(path: object, content: Mapping) -> SmplBody:
     faces = faces.astype(np.int32)
     return SmplBody(
         template=template,
-        # small numbers: half the memory costs nanometers
+        # float32 halves the memory; the values are small, so the error is nanometers
         shapes=shapes[..., : _EXPRESSIONS.get((joint_count, shape_count), shape_count)].astype(np.float32),
         pose_shapes=pose_shapes.astype(np.float32),
         regressor=regressor,
@@ -324,10 +326,10 @@ def _body(path: object, content: Mapping) -> SmplBody:
 
 
 def _numbers(path: object, key: str, value: object) -> np.ndarray:
-    """A float64 copy of an array of numbers, C-contiguous: the caller's array is not made read-only."""
+    """A C-contiguous float64 copy of a numeric array; a copy, so that the caller's array stays writable."""
     if isinstance(value, Unread):
         raise file_error(path, f"{key} is a {value.name} that holds no numbers: ask for npz")
-    # lists that hold one list many times over would grow without end
+    # nested lists are refused: lists that repeat references to one list could expand without bound
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
         raise file_error(path, f"{key} must be an array of numbers, got {type(value).__name__}: ask for npz")
     array = value.astype(float, order="C")
@@ -337,7 +339,7 @@ def _numbers(path: object, key: str, value: object) -> np.ndarray:
 
 
 def _parents(path: object, tree: np.ndarray) -> np.ndarray:
-    """(J,) from kintree_table, whose first row has the parents; the root's is -1 as an unsigned number of any width."""
+    """Parents (J,) from the first row of kintree_table; the root's parent is stored as -1 cast to any unsigned type."""
     joint_count = tree.shape[1]
     parents = np.where(np.arange(joint_count) == 0, -1, np.clip(tree[0], -1, joint_count)).astype(int)
     is_ordered = joint_count >= 24 and (parents[1:] >= 0).all() and (parents < np.arange(joint_count)).all()
@@ -348,7 +350,7 @@ def _parents(path: object, tree: np.ndarray) -> np.ndarray:
 
 
 def on_smpl(weights: np.ndarray, parents: np.ndarray) -> np.ndarray:
-    """(V, 24): what belongs to SMPL's joints; what hangs on a wrist is its hand, what hangs on the head is the head."""
+    """Weights (V, J) -> SMPL's (V, 24): joints below a wrist are added to its hand, joints below the head to it."""
     smpl_joint = np.empty(len(parents), int)
     for j, parent in enumerate(parents):
         smpl_joint[j] = j if j < _SHARED else _HANDS.get(smpl_joint[parent], smpl_joint[parent])

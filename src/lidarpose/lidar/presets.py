@@ -1,17 +1,17 @@
-"""The sensors that ship, by name, and the user's own by a file's table of beams.
+"""Shipped sensors by name, and user-defined sensors from files with tables of beams.
 
-Files, angles in degrees, in any order of lasers (they are sorted by elevation, their offsets with them). Makers count
-azimuths clockwise as seen from above, this package counter-clockwise, and so do azimuth_offset(s):
+File formats: angles in degrees, lasers in any order (they are sorted by elevation, together with their offsets).
+Manufacturers count azimuths clockwise as seen from above; this package and azimuth_offset(s) count counter-clockwise:
 
-    JSON of an Ouster sensor     beam_altitude_angles, beam_azimuth_angles, lidar_mode; at the top or, as newer
-                                 firmware writes it, in sections (beam_intrinsics, config_params, ...); without a
-                                 mode it is taken to have 1024 columns
+    JSON of an Ouster sensor     beam_altitude_angles, beam_azimuth_angles, lidar_mode; at the top level or, from newer
+                                 firmware, in sections (beam_intrinsics, config_params, ...); 1024 columns if no mode
+                                 is given
     JSON list                    elevations
     JSON object                  elevations_deg, and optionally azimuth_offsets_deg, columns, range_min, range_max,
                                  range_sigma, dropout, height, tilt_deg, name
     CSV                          a column of elevations, or columns with a header: elevation and azimuth_offset, or
-                                 azimuth (clockwise, as in Hesai's correction files); others are ignored, but not
-                                 such as seem to be angles
+                                 azimuth (clockwise, as in Hesai's correction files); other columns are ignored,
+                                 unless no offset is found and one seems to be an azimuth (an error)
 """
 
 import csv
@@ -47,7 +47,7 @@ _VLP_32C = _degrees(
     -0.667 -0.333 0 0.333 0.667 1 1.333 1.667 2.333 3.333 4.667 7 10.333 15"""
 )
 
-# Hesai's default correction of the Pandar64, lowest laser first: elevation, and azimuth offset, there clockwise
+# Hesai's default correction of the Pandar64, lowest laser first: elevation, and azimuth offset (clockwise in the file)
 _PANDAR64 = _degrees(
     """-24.897 -18.889 -13.93 -12.974 -12.006 -11.032 -9.885 -9.06 -8.059 -7.063 -6.061 -5.898 -5.726 -5.565 -5.391
     -5.229 -5.057 -4.892 -4.72 -4.558 -4.385 -4.221 -4.05 -3.884 -3.712 -3.548 -3.375 -3.21 -3.04 -2.873 -2.7 -2.536
@@ -60,28 +60,28 @@ _AV2_ORDER = np.argsort(np.concatenate([_VLP_32C, -_VLP_32C]), kind="stable")
 
 
 def _spinning(name: str, elevations: np.ndarray, columns: int, **fields: Any) -> Sensor:
-    """A sensor of elevations rad and so many columns a turn."""
+    """A sensor with elevations, rad, and the number of columns per turn."""
     return Sensor(name=name, elevations=elevations, azimuth_step=_turn(columns), **fields)
 
 
-# Range noise is the makers' typical one-sigma figure or the middle of theirs; heights are those of the usual mount.
+# Range noise is the manufacturer's typical one-sigma figure or the middle of its range; heights are of usual mounts.
 _SENSORS = (
     *PATTERNS,
-    # Paper: implementation details (64 lines, 2650 angles); the fan and the height are the released code's. Its
-    # 2650 azimuths run from -pi to +pi with both ends, so 2649 of them differ.
+    # Paper: implementation details (64 lines, 2650 angles); elevations and height are the released code's. Its
+    # 2650 azimuths run from -pi to +pi inclusive, so 2649 of them are distinct.
     _spinning("dapt64", np.radians(np.linspace(-10, 10, 64)), 2649, range_sigma=0.01, dropout=0.0, height=0.5),
     # Waymo Open Dataset (arXiv:1912.04838, table 2): 64 rings over -17.6..+2.4 deg, 2650 columns. Even spacing is
-    # a stand-in: the true inclinations are in each segment's calibration.
+    # an approximation: the true inclinations are in each segment's calibration.
     _spinning("waymo-top", np.radians(np.linspace(-17.6, 2.4, 64)), 2650, range_max=75.0, height=2.0),
     # Velodyne VLP-16 manual: 16 rings 2 deg apart; 0.2 deg at 10 Hz; +-3 cm
     _spinning("vlp-16", np.radians(np.arange(-15.0, 16, 2)), 1800, height=0.7),
-    # +-3 cm; 0.2 deg at 10 Hz. Its lasers stand 1.4 and 4.2 deg to either side: 7 and 21 whole columns.
+    # +-3 cm; 0.2 deg at 10 Hz. Azimuth offsets of its lasers are 1.4 and 4.2 deg to either side: 7 and 21 columns.
     _spinning("vlp-32c", _VLP_32C, 1800, range_min=1.0, range_max=200.0, height=1.8),
     # Velodyne HDL-32E manual: 32 rings 4/3 deg apart from -30.67 to +10.67; 0.16 deg at 10 Hz; +-2 cm
     _spinning("hdl-32e", np.radians(np.linspace(-92 / 3, 32 / 3, 32)), 2250, range_min=1.0, height=1.8),
     # Velodyne HDL-64E manual: upper block 1/3 deg apart from +2 down, lower block 1/2 deg apart to -24.33;
-    # 0.1728 deg at 10 Hz. Nominal: each unit has its own table (one published calibration, an S2.1's, reaches from
-    # -24.8 to +5.0 deg), and its two blocks have origins 10 cm apart.
+    # 0.1728 deg at 10 Hz. Nominal: each unit has its own table (one published calibration, of an S2.1, ranges from
+    # -24.8 to +5.0 deg), and the origins of its two blocks are 10 cm apart.
     _spinning(
         "hdl-64e",
         np.radians(np.concatenate([np.linspace(-24.33, -8.83, 32), np.linspace(-8.83 + 0.5, 2, 32)])),
@@ -90,8 +90,8 @@ _SENSORS = (
         range_max=120.0,
         height=1.73,
     ),
-    # Ouster OS1, OS0 and OS2, uniform. Beams of a column leave in four azimuth groups 8 columns of 1024 apart:
-    # whole columns, so they shift when a beam fires, not where it points. Real units deviate by some 0.01 deg.
+    # Ouster OS1, OS0 and OS2, uniform. A column's beams form four azimuth groups, 8 columns of 1024 apart: these
+    # are whole columns, so they change when a beam fires, not where it points. Real units deviate by about 0.01 deg.
     _spinning("os1-64", np.radians(np.linspace(-22.5, 22.5, 64)), 1024, range_max=120.0, height=1.5),
     _spinning("os1-128", np.radians(np.linspace(-22.5, 22.5, 128)), 2048, range_max=120.0, height=1.5),
     _spinning("os0-128", np.radians(np.linspace(-45, 45, 128)), 2048, range_min=0.3, range_max=50.0, height=1.5),
@@ -101,9 +101,9 @@ _SENSORS = (
         "pandar64", _PANDAR64, 1800, azimuth_offsets=_PANDAR64_OFFSETS, range_min=0.3, range_max=200.0, height=1.8
     ),
     # Argoverse 2 (Wilson et al. 2021): two VLP-32C stacked on the roof, one upside down: rings at the table's
-    # angles and at their negatives. In its sweeps the second one's beams meet 11 cm below the first's, and the
-    # ground lies 2 m below. Both turn the same way and look away from each other: one passes a person half a turn
-    # after the other. That its columns lie half a step further is a stand-in for a free phase.
+    # angles and at their negatives. In its sweeps, the second one's origin is 11 cm below the first's, and the ground
+    # is 2 m below. Both rotate in the same direction with opposite headings, so one passes a person half a turn after
+    # the other. The second one's offset of half a column is a stand-in for an arbitrary phase.
     _spinning(
         "av2",
         np.concatenate([_VLP_32C, -_VLP_32C])[_AV2_ORDER],
@@ -120,9 +120,9 @@ SENSORS: dict[str, Sensor | RayPattern] = {sensor.name: sensor for sensor in _SE
 
 
 def sensor(name: str | os.PathLike) -> Sensor | RayPattern:
-    """A named sensor, or that of a .json or .csv file (`load_sensor`), which is read again once it has
-    changed: a `Sensor`, or a `RayPattern` for what does not spin. An unknown name raises an InputError that lists the
-    nearest ones."""
+    """A shipped sensor by name, or the sensor of a .json or .csv file (`load_sensor`), which is read again if it has
+    changed: a `Sensor`, or a `RayPattern` if it does not spin. For an unknown name, raises an InputError that lists
+    the nearest names."""
     name = os.fspath(name) if isinstance(name, os.PathLike) else str(name)
     if name in SENSORS:
         return SENSORS[name]
@@ -133,27 +133,27 @@ def sensor(name: str | os.PathLike) -> Sensor | RayPattern:
 
 @cache
 def _of_file(path: str, *stamp: object) -> Sensor:
-    """Read once as long as its stamp stays: generators ask for every person."""
+    """`load_sensor`, cached per stamp, because generators request the sensor for every person."""
     return load_sensor(path)
 
 
 def _stamp(path: str) -> tuple[object, ...]:
-    """What tells a file from another of its name, or from itself after a change."""
+    """Identifies a file and its version; empty if the file cannot be accessed."""
     try:
         stat = os.stat(path)
     except (OSError, ValueError):
-        # reading it says why
+        # reading the file will raise the error
         return ()
     return stat.st_dev, stat.st_ino, stat.st_size, stat.st_mtime_ns
 
 
-# where the beams of a sensor come from: its maker's table, a paper, or the maker's field of view in equal steps
+# source of a sensor's beams: manufacturer's table, paper, or nominal, the manufacturer's field of view in equal steps
 _SOURCES = {"dapt64": "paper", "waymo-top": "nominal", "hdl-64e": "nominal", "av2": "maker", "depth-camera": "typical"}
 
 
 def listing() -> list[str]:
-    """Lines of a table of the sensors that ship: name, kind, beams (rings x columns, or rays a frame), field of view,
-    ranges, usual height, and where its beams come from."""
+    """Lines of a table of the shipped sensors: name, kind, beams (rings x columns, or rays per frame), field of view,
+    range limits, usual height, and source of the beams."""
     rows = [("sensor", "kind", "beams", "azimuth", "elevation deg", "range m", "height m", "source")]
     for name in sorted(SENSORS):
         device = SENSORS[name]
@@ -173,24 +173,24 @@ def listing() -> list[str]:
     return ["  ".join(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
-# --- the user's tables of beams
+# --- user-defined tables of beams
 
-# columns a turn where a file does not say: 0.2 degrees
+# default number of columns per turn of a file: 0.2 degrees
 _COLUMNS = 1800
 _OUSTER_COLUMNS = 1024
 _EXPECTED = "a sensor's table (.json, .csv)"
-# tables take some kilobytes
+# tables have some kilobytes
 _MOST_BYTES = 2**24
 _NUMBERS = ("range_min", "range_max", "range_sigma", "dropout", "height", "tilt_deg")
 _KEYS = ("elevations_deg", "azimuth_offsets_deg", "columns", "name", *_NUMBERS)
-# a CSV's columns, - and blanks read as _; the last ones are clockwise
+# names of a CSV's columns, with - and blanks replaced by _; those of `_CLOCKWISE` count clockwise
 _ELEVATIONS = ("elevation", "elevation_deg", "elevations", "elevations_deg", "vertical", "altitude")
 _OFFSETS = ("azimuth_offset", "azimuth_offset_deg", "azimuth_offsets", "azimuth_offsets_deg")
 _CLOCKWISE = ("azimuth", "azimuth_deg", "horizontal")
 
 
 def load_sensor(path: str | Path) -> Sensor:
-    """The sensor that a file describes; forms of files above. Raises InputError that says what is wrong."""
+    """Reads a sensor from a file; formats at the top of this module. Raises InputError that describes the problem."""
     data = read_bytes(path, expected=_EXPECTED)
     path = Path(os.fsdecode(path))
     if len(data) > _MOST_BYTES:
@@ -202,7 +202,7 @@ def load_sensor(path: str | Path) -> Sensor:
         raise file_error(path, "holds no elevations; expected one a laser, in degrees")
     if np.abs(elevations).max() >= 90:
         raise file_error(path, f"elevations must be within +-90 degrees, got {np.abs(elevations).max():g}")
-    # a fan of under 2.3 degrees with more than three lasers is in radians
+    # more than three lasers within less than 2.3 degrees are assumed to be in radians
     if len(elevations) > 3 and np.ptp(elevations) < 2.3 and np.abs(elevations).max() < 1.6:
         raise file_error(path, f"elevations reach over {np.ptp(elevations):g}: they seem to be radians, give degrees")
     order = np.argsort(elevations, kind="stable")
@@ -228,7 +228,7 @@ def load_sensor(path: str | Path) -> Sensor:
 
 
 def _angles(path: Path, name: str, values: object) -> np.ndarray:
-    """(n,) finite degrees."""
+    """Finite angles (n,), degrees."""
     try:
         angles = np.array(values, float)
     except (TypeError, ValueError, OverflowError):
@@ -242,8 +242,7 @@ def _angles(path: Path, name: str, values: object) -> np.ndarray:
 
 
 def _from_json(path: Path, text: str) -> dict:
-    """Fields as `load_sensor` reads them: elevations, offsets (both in degrees), clockwise, columns, and those of
-    `Sensor`."""
+    """Fields for `load_sensor`: elevations, offsets (both in degrees), clockwise, columns, and fields of `Sensor`."""
     try:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -252,14 +251,14 @@ def _from_json(path: Path, text: str) -> dict:
         return {"elevations": content}
     if isinstance(content, dict) and "elevations_deg" in content:
         return _own_form(path, content)
-    # newer metadata of Ouster has sections
+    # newer Ouster metadata has sections
     sections = [content, *content.values()] if isinstance(content, dict) else []
     sections = [section for section in sections if isinstance(section, dict)]
     beams = next((section for section in sections if "beam_altitude_angles" in section), None)
     if beams is None:
         raise file_error(path, "holds no beams; expected beam_altitude_angles, elevations_deg or a list of degrees")
     modes = [str(section[key]) for key in ("lidar_mode", "columns_per_frame") for section in sections if key in section]
-    # 1024x10, MODE_1024x10, or a count alone
+    # 1024x10, MODE_1024x10, or only the number of columns
     columns = [int(match[1]) for mode in modes if (match := re.search("([0-9]{3,5})(x|$)", mode))]
     if modes and not columns:
         raise file_error(path, f"expected a lidar_mode such as 1024x10, got {reprlib.repr(modes[0])}")
@@ -282,7 +281,7 @@ def _own_form(path: Path, content: dict) -> dict:
         value = content[key]
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise file_error(path, f"{key} must be a number, got {value!r}")
-        # beyond what a float holds: 1e999, or a whole number of 400 digits
+        # out of a float's range: 1e999, or an integer of 400 digits
         if not abs(value) <= sys.float_info.max:
             raise file_error(path, f"{key} must be a finite number, got {reprlib.repr(value)}")
         fields[key] = float(value)
@@ -295,7 +294,7 @@ def _own_form(path: Path, content: dict) -> dict:
 
 
 def _from_csv(path: Path, text: str) -> dict:
-    """Fields as `load_sensor` reads them."""
+    """Fields for `load_sensor`."""
     try:
         rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines()) if any(c.strip() for c in row)]
     except csv.Error as error:
@@ -314,7 +313,7 @@ def _from_csv(path: Path, text: str) -> dict:
         if elevation_name is None:
             raise file_error(path, f"has no column named elevation, got {', '.join(header)}")
         elevation_column = column_by_name[elevation_name]
-        # beams without their offsets would be another sensor
+        # dropping the beams' azimuth offsets would change the sensor
         if offset_column is None and (
             unknown_column := next((n for n in column_by_name if re.search("azimuth|offset|horiz", n)), None)
         ):

@@ -1,16 +1,16 @@
 """The compiled loops of `raycast.cast_ray_list`: rays of any direction against triangles that may move.
 
-All runs outside the interpreter's lock. A change in `raycast_kernels` does not renew what is cached of this module:
-remove its __pycache__ after one.
+All kernels release the GIL. Numba does not invalidate its cache of this module when `raycast_kernels` changes: delete
+__pycache__ then.
 """
 
 import numpy as np
 
 from lidarpose.lidar.raycast_kernels import AXIS, ROUNDING, STEEP, compiled
 
-# most cells hold no ray, so most triangles meet none; and no more cells than this along a side
+# cells per ray, so that most cells are empty and most triangles need no test; maximum number of cells along a side
 _CELLS_A_RAY, _MOST_CELLS = 4.0, 256.0
-# room for rounding at the edges of a side
+# tolerance for rounding at the edges of a side
 _SLACK = 1.0 + 1e-6
 
 
@@ -18,7 +18,7 @@ _SLACK = 1.0 + 1e-6
 def ray_list(vertices, faces, directions, shift, time):
     """Range (N,) float32 and face (N,) of unit directions (N, 3): rays are binned on the six sides of a cube.
 
-    shift (V, 3): how far the vertices move from time 0 to 1, time (N,) of the rays; both None if nothing moves.
+    shift (V, 3): displacement of the vertices from time 0 to 1; time (N,) of the rays; both None if nothing moves.
     """
     count = len(directions)
     best_depth = np.full(count, np.inf)
@@ -91,7 +91,7 @@ def ray_list(vertices, faces, directions, shift, time):
                     max_depth = max(max_depth, w[j] + dw[j])
                     low_p, high_p = min(low_p, p[j] + dp[j]), max(high_p, p[j] + dp[j])
                     low_q, high_q = min(low_q, q[j] + dq[j]), max(high_q, q[j] + dq[j])
-            # rays of this side go at most as far aside as ahead: what lies farther aside meets none of them
+            # rays of this side go at most as far sideways as ahead: a triangle farther to the side cannot be hit
             least_aside = max(low_p, -high_p, low_q, -high_q)
             if max_depth <= 0 or max_depth * _SLACK < least_aside:
                 continue
@@ -106,8 +106,8 @@ def ray_list(vertices, faces, directions, shift, time):
                         w0, w1, w2 = w[0] + t * dw[0], w[1] + t * dw[1], w[2] + t * dw[2]
                         p0, p1, p2 = p[0] + t * dp[0], p[1] + t * dp[1], p[2] + t * dp[2]
                         q0, q1, q2 = q[0] + t * dq[0], q[1] + t * dq[1], q[2] + t * dq[2]
-                    # the corners as seen along the ray (Woop, Benthin and Wald 2013): equal for all triangles of a
-                    # corner, and an edge's function changes just its sign when the edge is turned, so no ray slips
+                    # the corners in the ray's coordinates (Woop, Benthin and Wald 2013): equal for all triangles that
+                    # share a corner. Reversing an edge only changes the sign of its edge function, so no ray slips
                     # between triangles
                     x0, x1, x2 = p0 - u[i] * w0, p1 - u[i] * w1, p2 - u[i] * w2
                     y0, y1, y2 = q0 - v[i] * w0, q1 - v[i] * w1, q2 - v[i] * w2
@@ -126,8 +126,8 @@ def ray_list(vertices, faces, directions, shift, time):
 
 @compiled
 def _cells(vertices, shift, axis, sign, u0, v0, scale_u, scale_v, grid, cells):
-    """Fills cells (V * 4) with the cells of a side of the cube that a vertex is in from time 0 to 1: first and last
-    along u, v, interleaved as u, v, u, v; -1 or `grid` beyond the side's rays, all cells if it is not ahead."""
+    """Fills cells (V * 4) with the range of cells of a cube side in which a vertex is from time 0 to 1: first and last
+    along u and v, in the order u, v, u, v; -1 or `grid` beyond the side's rays, all cells if it is not ahead."""
     across, along = (axis + 1) % 3, (axis + 2) % 3
     for i in range(len(vertices)):
         w, p, q = sign * vertices[i, axis], vertices[i, across], vertices[i, along]
@@ -136,7 +136,7 @@ def _cells(vertices, shift, axis, sign, u0, v0, scale_u, scale_v, grid, cells):
         low_u, low_v = p * inverse, q * inverse
         high_u, high_v = low_u, low_v
         if shift is not None:
-            # what moves along a line that is all ahead moves along a line on the cube's side: its ends bound it
+            # a straight path that is entirely ahead is also straight on the cube's side, so its ends bound it
             w, p, q = w + sign * shift[i, axis], p + shift[i, across], q + shift[i, along]
             is_ahead_later = (w > AXIS) & (w * STEEP > abs(p)) & (w * STEEP > abs(q))
             inverse = 1 / (w if is_ahead_later else 1.0)

@@ -1,33 +1,33 @@
 """Exact LiDAR returns of triangle meshes, by rasterizing triangles onto the columns of beams.
 
-The sensor stands at the origin. A beam of azimuth a and elevation e points to (cos a cos e, sin a cos e, sin e).
-A column is all beams of one azimuth: a half plane, which cuts a triangle in a segment, and the segment covers the
-rows between the elevations of its ends. No tree is built: one body is seen by fewer beams than it has triangles.
+The sensor is at the origin. A beam of azimuth a and elevation e has the direction (cos a cos e, sin a cos e, sin e).
+A column consists of all beams of one azimuth: a half plane that cuts a triangle in a segment. The segment covers the
+rows between the elevations of its ends. No tree is built, as fewer beams hit a body than it has triangles.
 
-How a sector of columns (at most a quarter turn) is cast:
-    1. Vertices are turned so that the sector looks along +x and projected to Y = y/x, Z = z/x, I = 1/x. Lines stay
-       lines and I is affine over a triangle, so interpolating I gives the exact hit.
+A sector of columns (at most a quarter turn) is cast as follows:
+    1. Vertices are rotated so that +x points to the sector's middle, and projected to Y = y/x, Z = z/x, I = 1/x. Lines
+       stay lines and I is affine over a triangle, so interpolating I gives the exact hit.
     2. Columns are lines Y = tan(a); on a column, rows are T = tan(e) with T = Z cos(a). Finding the first column
        right of a vertex or the first row above a crossing is one table look-up.
     3. Triangles that cross no column are dropped.
     4. Two edges of a triangle cross a column. A crossing is computed from the edge alone, from its right to its left
-       end, so both triangles of an edge get the same number, rows are half-open intervals between crossings: a
+       end, so both triangles of an edge get the same number. Rows are half-open intervals between crossings, so a
        closed mesh has no holes and no beam is counted twice. The largest I wins.
-Vertices beside or behind the sensor have no Y and Z: edges that end there are crossed in x, y, z instead.
+Vertices beside or behind the sensor have no Y and Z: crossings of edges that end there are computed in x, y, z.
 
-A LiDAR's beam lights a spot, not a point. A beam of a width becomes S x S rays over its footprint, whose power is
-Gaussian across, 1/e^2 of the middle's at half the divergence, as makers state it. What the rays meet comes back as
-echoes:
-    1. Surfaces nearer together in range than the pulse resolves, c tau / 2 for a pulse of tau seconds, are one echo,
-       whose range is the mean of theirs weighted by the power they return: at an edge, a point in mid-air.
-    2. Power returned falls with the square of the range (LiDAR equation of an extended diffuse target, Wagner et al.
-       2006); how bright a surface is and how it is turned is left aside.
-    3. The strongest echo is the beam's return ("strongest return", the usual mode of spinning sensors), if it is as
-       strong as a whole beam's from the sensor's greatest range. It lies on the beam's axis. There
-       are no second returns.
-So silhouettes grow by up to half the divergence, thin things are seen from farther, edges are smeared.
+A LiDAR beam illuminates a spot, not a point. A beam with a divergence is split into S x S rays over its footprint.
+Their power has a Gaussian profile, 1/e^2 of the maximum at half the divergence, as manufacturers specify it. The rays
+return echoes:
+    1. Surfaces closer together in range than the pulse resolves, c tau / 2 for a pulse of tau seconds, form one echo.
+       Its range is the mean of theirs, weighted by the returned power: at an edge, a point in mid-air.
+    2. The returned power falls with the square of the range (LiDAR equation of an extended diffuse target, Wagner et
+       al. 2006); reflectivity and incidence angle are ignored.
+    3. The strongest echo is the beam's return ("strongest return", the usual mode of spinning sensors), if it is at
+       least as strong as a full beam's echo from the sensor's maximum range. It lies on the beam's axis. There are no
+       second returns.
+So silhouettes grow by up to half the divergence, thin objects are visible from farther away, and edges are smeared.
 
-Letters: V vertices, F faces, C columns, R rows of a window, A azimuths, E elevations, N rays, n hits.
+Legend: V vertices, F faces, C columns, R rows of a window, A azimuths, E elevations, N rays, n hits.
 """
 
 from dataclasses import dataclass
@@ -44,21 +44,21 @@ from lidarpose.lidar.scan_kernels import SECTOR, Beams, bounds, scan_window, sub
 from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import FARTHEST
 
-# m: c tau / 2 of a pulse of 5 ns, as spinning sensors send it
+# m: c tau / 2 of a pulse of 5 ns, typical of spinning sensors
 PULSE = 0.75
 _MOST_SUB_BEAMS = 15
-# rad: a lamp, not a LiDAR
+# rad: no LiDAR has a wider beam
 _WIDEST = 0.1
 _BEAMS: WeakKeyDictionary[Sensor, Beams] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Hits:
-    """What a sensor saw through a window, ordered by column, then ring.
+    """The returns of a sensor inside a window of beams, ordered by column, then ring.
 
-    points (n, 3) float32 m in the sensor's frame; face (n,) int32; column (n,) int32 counted from the window's first,
-    so it runs on over the +-pi seam; ring (n,) int32, the sensor's own number, 0 the lowest; columns, rows: the
-    window's size; column0, row0: where it starts, `(column + column0) % sensor.columns` is the sensor's column.
+    points (n, 3) float32 m in the sensor's frame; face (n,) int32; column (n,) int32, counted from the window's first
+    column, so it is continuous across +-pi; ring (n,) int32, index of the sensor's ring, 0 is the lowest; columns,
+    rows: the window's size; column0, row0: its start; `(column + column0) % sensor.columns` is the sensor's column.
     """
 
     points: np.ndarray
@@ -74,7 +74,7 @@ class Hits:
 def cast_rays(
     vertices: np.ndarray, faces: np.ndarray, azimuth: np.ndarray, elevation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The nearest hits of a grid of beams from the origin; faces count from both sides.
+    """The nearest hits of a grid of beams from the origin; faces are two-sided.
 
     vertices (V, 3) m, x forward, y left, z up; faces (F, 3) indices; azimuth (A,) and elevation (E,) rad in any
     order, |elevation| <= pi/2. Returns range (A, E) float32 m, inf where nothing is hit, and face (A, E) int32, -1
@@ -105,14 +105,14 @@ def cast_rays(
                 vertices, faces, center, np.tan(azimuth_from_center), np.cos(azimuth_from_center), tangents,
                 sector_columns, rows, inverse_x, face,
             )  # fmt: skip
-    # x / (cos a cos e) of x in the sectors' frames
+    # x / (cos a cos e), with x in the sectors' frames
     with np.errstate(divide="ignore"):
         distance = scale[:, None] * (1 / np.cos(elevation)) / inverse_x
     return distance.astype(np.float32), face
 
 
 def _sectors(azimuths: np.ndarray) -> list[np.ndarray]:
-    """Index lists that split sorted azimuths in [0, 2 pi) into sectors, starting after the widest gap."""
+    """Lists of indices that split sorted azimuths in [0, 2 pi) into sectors, starting after the widest gap."""
     gaps = np.diff(azimuths, append=azimuths[0] + 2 * np.pi)
     order = np.roll(np.arange(len(azimuths)), -(int(np.argmax(gaps)) + 1))
     azimuth_from_start = np.mod(azimuths[order] - azimuths[order[0]], 2 * np.pi)
@@ -139,32 +139,34 @@ def scan(
     margin: float = 0.0,
     moved: np.ndarray | None = None,
 ) -> Hits:
-    """What the sensor sees inside the smallest window of beams that holds a body. Paper: Eq. 3 (no margin).
+    """Scans inside the smallest window of beams that contains a body. Paper: Eq. 3 (no margin).
 
     A beam whose nearest hit is outside the sensor's range limits returns nothing. A sensor inside a mesh sees it from
-    inside. Faces count from both sides. Nothing is random.
+    inside. Faces are two-sided. Nothing is random.
 
-    The window holds vertices, not edges: as seen from the sensor, the upper edge of a near wall rises above its two
-    ends. A coarse mesh needs a `margin`, or a finer one as `window_vertices`. A body around the sensor gets the whole
-    turn.
+    The window contains vertices, not edges: seen from the sensor, the upper edge of a near wall rises above its two
+    ends. A coarse mesh needs a `margin`, or a finer mesh as `window_vertices`. For a body around the sensor, the window
+    is the whole turn.
 
-    Beams with a width take about sub_beams times as long. A hit's face is then that of the nearest surface in the
-    returned echo, the window reaches half the divergence farther, and the footprint in azimuth is that at the horizon.
+    With a divergence, casting takes about sub_beams times as long. A hit's face is then that of the nearest surface in
+    the returned echo, the window is wider by half the divergence on each side, and the footprint in azimuth is that at
+    the horizon.
 
     Args:
-        vertices: (V, 3) m in the sensor's frame: the body, and whatever may hide it or stand behind it.
+        vertices: (V, 3) m in the sensor's frame: the body, and objects that may occlude it or be behind it.
         faces: (F, 3) indices.
         sensor: a spinning sensor; one with several origins is cast origin by origin.
-        divergence: of a beam, full, rad; 0.0015 to 0.003 for most sensors; 0: a beam is its axis.
-        sub_beams: along a side of the footprint.
-        pulse: m, how far apart in range two echoes must be to be told apart.
-        window_vertices: (M, 3) m, the body alone; all vertices if not given.
-        margin: rad that the window is wider on each side.
-        moved: (V, 3) m, where the vertices are when the last of the sensor's `ring_lags` passes them, `vertices` when
-            the first one does, on straight lines; None: they stand still. The window holds `window_vertices` alone:
-            give both places.
+        divergence: full divergence of a beam, rad; 0.0015 to 0.003 for most sensors; 0 casts only the beam's axis.
+        sub_beams: number of sub-beams along a side of the footprint.
+        pulse: m, minimum difference in range at which two echoes are separate.
+        window_vertices: (M, 3) m, the body alone; by default all vertices.
+        margin: rad by which the window is wider on each side.
+        moved: (V, 3) m, positions of the vertices when the rings with the largest of the sensor's `ring_lags` pass
+            them, and `vertices` those for the first rings, linear in between; None means no motion. The window only
+            covers `window_vertices`: include both positions there.
 
-    Raises InputError.
+    Raises:
+        InputError: For invalid arguments.
     """
     if not 0 <= divergence <= _WIDEST:
         raise InputError(f"divergence must be between 0 and {_WIDEST} rad, got {divergence}: is it in mrad?")
@@ -205,7 +207,7 @@ def scan(
 
 
 def footprint(divergence: float, sub_beams: int) -> tuple[np.ndarray, np.ndarray]:
-    """Offsets (S,) rad of the sub-beams in azimuth and in elevation, and the power (S, S) in each, in all 1."""
+    """Offsets (S,) rad of the sub-beams in azimuth and in elevation, and their powers (S, S), which sum to 1."""
     offsets = ((np.arange(sub_beams) + 0.5) / sub_beams - 0.5) * divergence
     profile = np.exp(-2 * (offsets / (divergence / 2)) ** 2)
     weights = profile[:, None] * profile
@@ -213,8 +215,8 @@ def footprint(divergence: float, sub_beams: int) -> tuple[np.ndarray, np.ndarray
 
 
 def _join_origins(sensor: Sensor, parts: list[Hits]) -> Hits:
-    """The hits of each of the `Sensor.origins`, ordered by column, then ring, in one window."""
-    # columns of all origins counted from the first one of any
+    """Merges the hits of the `Sensor.origins` into one window, ordered by column, then ring."""
+    # first columns of all origins relative to that of the first origin
     turn_columns, base_column = sensor.columns, parts[0].column0
     starts = [(part.column0 - base_column + turn_columns // 2) % turn_columns - turn_columns // 2 for part in parts]
     first_column = min(starts)
@@ -243,7 +245,7 @@ def _join_origins(sensor: Sensor, parts: list[Hits]) -> Hits:
 
 
 def _compiled_beams(sensor: Sensor) -> Beams:
-    """A sensor for the compiled code of `scan_kernels`; made once."""
+    """A sensor for the compiled code of `scan_kernels`; cached."""
     if sensor not in _BEAMS:
         shifts, rings = zip(*sensor.shift_groups, strict=True)
         sector = min(max(1, int(SECTOR / sensor.azimuth_step)), sensor.columns)
@@ -279,11 +281,11 @@ def scan_pattern(
     body_vertices: int | None = None,
     margin: float = 0.0,
 ) -> Hits:
-    """What the rays of a frame meet, of those that pass a body within `margin` rad.
+    """The hits of those rays of a frame that pass a body within `margin` rad.
 
-    vertices (V, 3) m in the sensor's frame when the frame begins, faces (F, 3); moved (V, 3) m: where the vertices are
-    when it ends (None: they stand still). body_vertices: how many of the first vertices are the body (None: all).
-    Returns `Hits`, ordered by azimuth: ring is the ray's line, column its number in the frame; columns and rows
+    vertices (V, 3) m in the sensor's frame at the start of the frame, faces (F, 3); moved (V, 3) m: the vertices at the
+    end of the frame (None: no motion). body_vertices: the number of leading vertices that are the body (None: all).
+    Returns `Hits`, ordered by azimuth: ring is the ray's line, column its index in the frame; columns and rows
     are 0. A hit outside the pattern's range limits returns nothing. Raises InputError.
     """
     rays = pattern.frame(frame)
@@ -293,7 +295,7 @@ def scan_pattern(
     ray_indices = _rays_near(rays, body, margin)
     time = rays.time[ray_indices] if moved is not None else None
     distance, face = cast_ray_list(vertices, faces, rays.directions[ray_indices], moved=moved, time=time)
-    # no hit is infinitely far
+    # rays without a hit have the distance inf
     hit_rows = np.flatnonzero((distance >= pattern.range_min) & (distance <= pattern.range_max))
     index = ray_indices[hit_rows]
     return Hits(
@@ -309,7 +311,7 @@ def scan_pattern(
 
 
 def _rays_near(rays: Rays, body: np.ndarray, margin: float) -> np.ndarray:
-    """Numbers, ascending, of the rays inside the window of azimuths and elevations that holds a body (M, 3)."""
+    """Ascending indices of the rays inside the window of azimuths and elevations that contains a body (M, 3)."""
     if not len(body):
         return np.zeros(0, np.int64)
     center, left, right, low, high = bounds(np.ascontiguousarray(body, np.float64))
@@ -337,12 +339,12 @@ def cast_ray_list(
     moved: np.ndarray | None = None,
     time: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The nearest hits of any rays from the origin: for scan patterns without columns, such as rosettes.
+    """The nearest hits of arbitrary rays from the origin: for scan patterns without columns, such as rosettes.
 
-    vertices (V, 3) m at time 0, faces (F, 3), directions (N, 3) of any length > 0. moved (V, 3) m: where the vertices
-    are at time 1 (None: where they were); they move on straight lines, and a ray meets the triangles as they stand
-    at its own time (N,) in [0, 1]. Returns range (N,) float32 m, inf for no hit, and face (N,) int32, -1 for no hit.
-    Faces count from both sides. Raises InputError.
+    vertices (V, 3) m at time 0, faces (F, 3), directions (N, 3) of any length > 0. moved (V, 3) m: the vertices at
+    time 1 (None: no motion). Vertices move on straight lines, and each ray is cast at its own time (N,) in [0, 1].
+    Returns range (N,) float32 m, inf for no hit, and face (N,) int32, -1 for no hit. Faces are two-sided. Raises
+    InputError.
     """
     vertices, faces = _as_mesh(vertices, faces)
     directions = _as_points("directions", directions)
@@ -359,11 +361,11 @@ def cast_ray_list(
     return ray_list(vertices, faces, directions, _as_moved(moved, vertices) - vertices, time)
 
 
-# --- checks of arguments: arrays come out in one type each, so that compiled code is compiled once
+# --- argument checks: each array is converted to one type, so that the kernels are compiled only once
 
 
 def _as_points(name: str, values: Any) -> np.ndarray:
-    """A copy (n, 3) float64, C-contiguous, finite; writable, as what compiled code makes."""
+    """A finite, C-contiguous copy (n, 3) float64; writable, like the arrays that compiled code creates."""
     values = _as_floats(name, values, "an (n, 3) array of numbers")
     if values.ndim != 2 or values.shape[1] != 3:
         raise InputError(f"{name} must be (n, 3), got {values.shape}")
@@ -384,7 +386,7 @@ def _as_mesh(vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _as_moved(moved: Any, vertices: np.ndarray) -> np.ndarray:
-    """A copy (V, 3) float64 of where `vertices` (V, 3) have moved to."""
+    """A copy (V, 3) float64 of `moved`, the new positions of `vertices` (V, 3)."""
     moved = _as_points("moved", moved)
     if moved.shape != vertices.shape:
         raise InputError(f"moved must hold the vertices once more, {vertices.shape}, got {moved.shape}")

@@ -1,12 +1,12 @@
-"""The compiled loops of `raycast`, which explains the algorithm and the letters. No Python object crosses them: they
-run outside the interpreter's lock and may be called from many threads.
+"""The compiled loops of `raycast`, which explains the algorithm and the symbols. They use no Python objects, release
+the GIL and may be called from many threads.
 
-Loops over vertices, faces and pairs read flat arrays by unsigned numbers: only then does the compiler know the step
-between elements, and that no index is negative, and use the processor's vectors. That halves the time.
+Loops over vertices, faces and pairs index flat arrays with unsigned integers: only then does the compiler know the
+stride and that no index is negative, and vectorizes the loop. That halves the time.
 
-Compiling is what a first call waits for. So every kernel knows one type of each array (see the checks in `raycast`),
-and what numpy does in one expression, assignment between slices, `max()`, `searchsorted()`, is a loop here: numba takes
-longer to compile one such expression, with its messages, than most of these functions.
+Compilation dominates the first call. Therefore every kernel is compiled for one type of each array (see the checks in
+`raycast`), and NumPy expressions such as slice assignment, `max()` and `searchsorted()` are written as loops: numba
+takes longer to compile one such expression, with its error messages, than most of these functions.
 """
 
 from typing import NamedTuple
@@ -20,25 +20,25 @@ try:
 except ImportError as error:  # pragma: no cover - numba is an optional extra
     raise MissingExtra("casting rays", "synth") from error
 
-# vertices with |y/x| or |z/x| above this are not projected: beyond it float64 loses more than 14 - 2 digits
+# vertices with |y/x| or |z/x| above this are not projected: beyond it, float64 would lose too many digits
 STEEP = 100.0
-# slack against rounding; crossings are good to 1e-13
+# tolerance for rounding; crossings are accurate to 1e-13
 ROUNDING = 1e-9
 _TABLE_BINS = 8192
-# what is less than this ahead of the sensor's axis, m, counts as behind it, and what is nearer is not hit
+# points less than this ahead of the sensor's axis, m, count as behind it; nearer surfaces are not hit
 AXIS = 1e-9
 _LOW = 0xFFFFFFFF
-# pairs of triangle and column that are worked on at a time, to stay near the processor
+# number of (triangle, column) pairs per batch, to stay in the CPU cache
 _BLOCK = 1024
 
 compiled = njit(nogil=True, cache=True, error_model="numpy")
 
 
 class Table(NamedTuple):
-    """Sorted values with an inf behind them, and their look-up table: no value before `lut[bin(t)]` reaches t.
+    """Sorted values followed by inf, and their look-up table: all values before index `lut[bin(t)]` are below t.
 
     bin() is monotone in floating point, so a value in an earlier bin than t's is certainly < t. `single`: no bin
-    holds two values, so one comparison finishes the search.
+    holds two values, so one comparison completes the search.
     """
 
     values: np.ndarray
@@ -89,7 +89,7 @@ def _find(t, table):
 
 @compiled
 def _find_all(t, table):
-    """(n,) int32: `_find` of each of t (n,), without branches where one comparison finishes the search."""
+    """(n,) int32: `_find` for each of t (n,), without branches if the table is `single`."""
     count = np.empty(len(t), np.int32)
     values, lut, low, scale, bins = table.values, table.lut, table.low, table.scale, table.bins
     for m in range(len(t)):
@@ -103,9 +103,9 @@ def _find_all(t, table):
 
 @compiled
 def _projected(vertices, c, s, P, Y):
-    """Fills P (V * 3) with Y, Z, I of vertices turned by an angle of cosine c and sine s, and Y (V,) once more.
+    """Fills P (V * 3) with Y, Z, I of vertices rotated by the angle with cosine c and sine s, and Y (V,) with Y again.
 
-    Returns how many are not ahead; theirs mean nothing.
+    Returns the number of vertices that are not ahead; their values are meaningless.
     """
     flat, beside_count = vertices.reshape(-1), 0
     for i in range(len(vertices)):
@@ -124,7 +124,7 @@ def _projected(vertices, c, s, P, Y):
 
 @compiled
 def _crossing(faces, column):
-    """The faces whose corners do not all lie between the same two columns, ascending."""
+    """Ascending indices of the faces whose corners do not all lie between the same two columns."""
     corners, is_crossing = faces.reshape(-1), np.empty(len(faces), np.bool_)
     for f in range(len(faces)):
         a = column[np.uintp(corners[np.uintp(3 * f)])]
@@ -149,11 +149,11 @@ def _picked(mask):
 def raster(vertices, faces, center, column_tan, column_cos, row_tan, column_index, row_index, inverse_x, face):
     """Casts columns of tan, cos(azimuth - center), sorted, within +-46 deg, and rows of tan(elevation), sorted.
 
-    Writes 1/x in the frame that looks along `center`, and the face, at [column_index, row_index] of the two grids
-    wherever a hit is nearer than what they hold.
+    Where a hit is nearer than the grids' current entry, writes 1/x in the frame whose x axis points along `center`, and
+    the face, at [column_index, row_index] of `inverse_x` and `face`.
     """
     c, s = np.cos(center), np.sin(center)
-    # what is read together is kept together
+    # values that are read together are interleaved
     P, Y = np.empty(3 * len(vertices)), np.empty(len(vertices))
     beside_count = _projected(vertices, c, s, P, Y)
     column, rows = _find_all(Y, _table(column_tan)), _table(row_tan)
@@ -167,7 +167,7 @@ def raster(vertices, faces, center, column_tan, column_cos, row_tan, column_inde
         a, b, d = np.int64(faces[f, 0]), np.int64(faces[f, 1]), np.int64(faces[f, 2])
         if beside_count and not (is_ahead[a] and is_ahead[b] and is_ahead[d]):
             continue
-        # sorted from right to left, by column and vertex
+        # sort the corners from right to left: by column, then by vertex
         a, b, d = a | np.int64(column[a]) << 32, b | np.int64(column[b]) << 32, d | np.int64(column[d]) << 32
         first, last = min(a, b, d), max(a, b, d)
         middle = a ^ b ^ d ^ first ^ last
@@ -193,8 +193,8 @@ def raster(vertices, faces, center, column_tan, column_cos, row_tan, column_inde
 def _fill(pairs, P, lines, rows, column_index, row_index, inverse_x, face):
     """Casts the beams between the crossings of triangles with columns.
 
-    pairs (n * 8): of each, the ends of either edge that crosses the column, a, d and p, q, the column and the face;
-    P (V * 3); lines (C * 2): tan and cos of the columns.
+    pairs (n * 8): for each pair, the end vertices a, d and p, q of the two edges that cross the column, the column and
+    the face; P (V * 3); lines (C * 2): tan and cos of the columns.
     """
     count = len(pairs) // 8
     ends, lower = np.empty(4 * count), np.empty(count)
@@ -231,7 +231,7 @@ def _fill(pairs, P, lines, rows, column_index, row_index, inverse_x, face):
 
 @compiled
 def _ahead(vertices, c, s):
-    """(V,) bool: which vertices are projected by `_projected`."""
+    """(V,) bool: whether `_projected` projects a vertex."""
     is_ahead = np.empty(len(vertices), np.bool_)
     for i in range(len(vertices)):
         x = c * vertices[i, 0] + s * vertices[i, 1]
@@ -244,9 +244,9 @@ def _ahead(vertices, c, s):
 def _raster_beside(
     vertices, faces, c, s, is_ahead, P, column, column_tan, column_cos, table, column_index, row_index, inverse_x, face
 ):  # fmt: skip
-    """The part of `raster` for triangles with a vertex that is not ahead: slower, right for any triangle.
+    """The part of `raster` for triangles with a vertex that is not ahead: slower, but correct for any triangle.
 
-    Crossings of edges between vertices ahead are computed as in `raster`, so the two fit without holes.
+    Crossings of edges between two vertices ahead are computed as in `raster`, so that there are no holes in between.
     """
     row_tan = table.values
     columns, rows = len(column_tan), len(row_tan) - 1
@@ -292,7 +292,7 @@ def _raster_beside(
                     end_x[e] = 1 / end_i[e]
                     end_z[e] = (P[3 * a + 1] + u * (P[3 * b + 1] - P[3 * a + 1])) * end_x[e]
                 else:
-                    # of the sign that the side was found by, or an edge in the column's plane might cross nowhere
+                    # the signs must agree with `is_left`, or an edge in the column's plane might have no crossing
                     distance_p = (P[3 * a] - column_tan[k]) * x[p] if is_ahead[a] else y[p] - column_tan[k] * x[p]
                     distance_q = (P[3 * b] - column_tan[k]) * x[q] if is_ahead[b] else y[q] - column_tan[k] * x[q]
                     u = distance_p / (distance_p - distance_q)
@@ -317,7 +317,7 @@ def _raster_beside(
                         face[column_index[k], row_index[r]] = f
                     r += 1
                 continue
-            # the segment passes over or under the sensor, so it covers the rows up to the zenith or the nadir
+            # the segment passes above or below the sensor, so it covers the rows up to the zenith or down to the nadir
             dx, dz = end_x[far] - end_x[near], end_z[far] - end_z[near]
             height = end_z[near] - end_x[near] / dx * dz
             if height == 0:

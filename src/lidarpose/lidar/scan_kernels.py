@@ -1,8 +1,7 @@
-"""The compiled way from a mesh to the packed hits of a spinning sensor: window, sectors, cast, echoes, points. See
-`raycast`, which explains the letters; S sub-beams along a side of a beam's footprint.
+"""The compiled pipeline from a mesh to the packed hits of a spinning sensor: window, sectors, cast, echoes, points.
 
-All runs outside the interpreter's lock. A change in `raycast_kernels` does not renew what is cached of this module:
-remove its __pycache__ after one.
+The symbols are explained in `raycast`; S sub-beams along a side of a beam's footprint. All kernels release the GIL.
+Numba does not invalidate its cache of this module when `raycast_kernels` changes: delete __pycache__ then.
 """
 
 from typing import NamedTuple
@@ -15,17 +14,17 @@ from lidarpose.lidar.raycast_kernels import AXIS, STEEP, compiled, njit, raster
 SECTOR = np.radians(92.0)
 
 _MOST = np.int64(2**63 - 1)
-# no sub-beam beyond the zenith
+# sub-beams are clamped to the zenith and the nadir
 _ZENITH = np.pi / 2 - 1e-6
 
 
 class Beams(NamedTuple):
-    """A spinning sensor as compiled code reads it; angles in rad. Built by `raycast._compiled_beams`.
+    """A spinning sensor in the form that compiled code reads; angles in rad. Built by `raycast._compiled_beams`.
 
-    tangents, shifts (E,): of the rings; group_shift (G,): the different shifts; group_ring (E,): the
-    rings, group by group, ascending; group_start (G + 1,): where each group starts in it; half_tan, half_cos: of
-    0, 1, 2, ... half steps of azimuth, as far as a sector of `sector` columns reaches from its middle; start, step:
-    azimuth of column 0 and between columns; columns in a turn; nearest, farthest m.
+    tangents, shifts (E,): tan(elevation) and azimuth shift of the rings; group_shift (G,): the distinct shifts;
+    group_ring (E,): the rings, group by group, ascending; group_start (G + 1,): start of each group in group_ring;
+    half_tan, half_cos: tan and cos of 0, 1, 2, ... half azimuth steps, up to half of a sector of `sector` columns;
+    start, step: azimuth of column 0 and between columns; columns per turn; nearest, farthest: range limits, m.
     """
 
     tangents: np.ndarray
@@ -45,21 +44,21 @@ class Beams(NamedTuple):
 
 @compiled
 def _ordered(value):
-    """A whole number that orders as the value does: the least of whole numbers is found many at a time."""
+    """An integer that orders like the value: minima of integers can be vectorized."""
     bits = np.float64(value).view(np.int64)
     return bits ^ ((bits >> 63) & _MOST)
 
 
 @compiled
 def _number(ordered):
-    """The value of `_ordered`."""
+    """The inverse of `_ordered`."""
     return np.int64(ordered ^ ((ordered >> 63) & _MOST)).view(np.float64)
 
 
-# sums may be taken in any order
+# fastmath allows sums in any order
 @njit(nogil=True, cache=True, error_model="numpy", fastmath={"nsz", "reassoc"})
 def bounds(vertices):
-    """Mean azimuth, and the vertices' least and greatest azimuth relative to it and elevation, rad."""
+    """Mean azimuth, minimum and maximum azimuth relative to it, minimum and maximum elevation of the vertices, rad."""
     flat, east, north = vertices.reshape(-1), 0.0, 0.0
     for i in range(len(vertices)):
         east += flat[np.uintp(3 * i)]
@@ -72,7 +71,7 @@ def bounds(vertices):
         x, y = c * vx + s * vy, c * vy - s * vx
         ahead_margin = min(ahead_margin, _ordered(min(x * STEEP - abs(y), x - AXIS)))
         azimuth = _ordered(y * (1 / (x if x > AXIS else 1.0)))
-        # squared, with its sign
+        # squared slope with the slope's sign
         slope = _ordered(vz * abs(vz) / (x * x + y * y if x > AXIS else 1.0))
         left, right = min(left, azimuth), max(right, azimuth)
         low, high = min(low, slope), max(high, slope)
@@ -89,7 +88,7 @@ def bounds(vertices):
         left, right = min(left, azimuth), max(right, azimuth)
         low, high = min(low, elevation), max(high, elevation)
     if right - left >= np.pi:
-        # around the sensor: between vertices, faces may reach over the zenith and behind
+        # the mesh surrounds the sensor: faces may extend over the zenith and behind the sensor
         return center, -np.pi, np.pi, -np.pi / 2, np.pi / 2
     return center, left, right, low, high
 
@@ -108,7 +107,7 @@ def sub_tangents(elevations, offsets):
 def _cast_grid(vertices, faces, beams, window, offsets, tangents):
     """1/x in the sectors' frames and face, both (S, C, R * S), and 1/cos(azimuth - the sector's middle) (C,).
 
-    Sub-columns, at offsets (S,) rad of azimuth, lie apart; sub-rows, of tangents (E, S), together with the rows.
+    Sub-columns, at azimuth offsets (S,) rad, have their own axis; sub-rows, with tangents (E, S), share the rows' axis.
     """
     column0, columns, row0, rows = window
     subs = len(offsets)
@@ -123,7 +122,7 @@ def _cast_grid(vertices, faces, beams, window, offsets, tangents):
         for ring in beams.group_ring[beams.group_start[g] : beams.group_start[g + 1]]:
             if row0 <= ring < row0 + rows:
                 for b in range(subs):
-                    # the sub-rows of rows that are near one another mix: almost in order as they are
+                    # insertion sort: sub-rows are almost sorted, as only those of neighboring rows interleave
                     i = n
                     while i > 0 and row_tan[i - 1] > tangents[ring, b]:
                         row_tan[i], row_index[i] = row_tan[i - 1], row_index[i - 1]
@@ -151,7 +150,7 @@ def _cast_grid(vertices, faces, beams, window, offsets, tangents):
 
 @compiled
 def _collect(inverse_x, face, scale, beams, column0, row0):
-    """The hits of a window within the sensor's range, packed: points (n, 3), face, column and ring (n,)."""
+    """The packed hits of a window within the sensor's range limits: points (n, 3), face, column and ring (n,)."""
     columns, rows = inverse_x.shape
     n = 0
     for k in range(columns):
@@ -189,15 +188,15 @@ def _collect(inverse_x, face, scale, beams, column0, row0):
 
 @compiled
 def strongest_echo(distance, weights, order, pulse, farthest):
-    """Range and number of the nearest sub-beam of the strongest echo of sub-beams (K,), inf and -1 for none.
+    """Range of the strongest echo of K sub-beams and index of its nearest sub-beam; inf and -1 if there is no echo.
 
-    distance (K,) m, inf where nothing is met; weights (K,) in all 1; order (K,) is overwritten.
+    distance (K,) m, inf for sub-beams without a hit; weights (K,) sum to 1; order (K,) is overwritten.
     """
     n = 0
     for k in range(len(distance)):
         if distance[k] == np.inf:
             continue
-        # by range: few and often in order
+        # insertion sort by range: few values, often already sorted
         i = n
         while i > 0 and distance[order[i - 1]] > distance[k]:
             order[i] = order[i - 1]
@@ -224,7 +223,7 @@ def strongest_echo(distance, weights, order, pulse, farthest):
 
 @compiled
 def _merge_echoes(inverse_x, face, scale, beams, row0, tangents, weights, pulse):
-    """1/x and face (C, R) of the beams' returns, as if their axes had met them; inputs as `_cast_grid` gives them."""
+    """1/x and face (C, R) of the beams' returns, as if hit by the beams' axes; inputs as returned by `_cast_grid`."""
     subs, columns, rows = len(weights), len(scale), inverse_x.shape[2] // len(weights)
     merged_inverse_x, merged_face = np.zeros((columns, rows)), np.full((columns, rows), -1, np.int32)
     distance, flat_weights = np.empty(subs * subs), weights.copy().reshape(-1)
@@ -253,8 +252,8 @@ def _merge_echoes(inverse_x, face, scale, beams, row0, tangents, weights, pulse)
 def scan_window(vertices, faces, beams, window, offsets, tangents, weights, pulse):
     """Points (n, 3), face, column and ring (n,) that the beams of a window (column0, columns, row0, rows) return.
 
-    vertices (V, 3) float64, faces (F, 3) int32; sub-beams at offsets (S,) rad of azimuth and of tangents (E, S), of
-    weights (S, S); pulse m as in `raycast.scan`. A single sub-beam is the beam's axis.
+    vertices (V, 3) float64, faces (F, 3) int32; sub-beams at azimuth offsets (S,) rad with tangents (E, S) and weights
+    (S, S); pulse m as in `raycast.scan`. A single sub-beam is the beam's axis.
     """
     column0, _, row0, _ = window
     cast_inverse_x, cast_face, scale = _cast_grid(vertices, faces, beams, window, offsets, tangents)

@@ -1,7 +1,7 @@
-"""Spinning LiDAR sensors: their beams, and a window of them.
+"""Spinning LiDAR sensors: their beams, and windows of beams.
 
-A sensor's columns lie `azimuth_step` apart and start at azimuth -pi; its rings are numbered from the lowest. Sensor
-frame: x forward, y left, z up, the origin is where the beams meet.
+A sensor's columns are `azimuth_step` apart and start at azimuth -pi; its rings are numbered from the lowest. Sensor
+frame: x forward, y left, z up, with the origin at the intersection of the beams.
 """
 
 from dataclasses import dataclass, replace
@@ -29,16 +29,16 @@ class Window:
 class Sensor:
     """A spinning LiDAR.
 
-    elevations (E,) rad, ascending (two lasers may share one); azimuth_step rad divides the turn; azimuth_offsets (E,)
-    rad: a ring's beam leaves at its column's azimuth plus this (None: all rings in line); range_min, range_max m:
-    nearer and farther surfaces return nothing; range_sigma m: standard deviation of the range; dropout: share of
-    returns lost at random; height m above the ground; tilt rad about y, positive looks down; origin_heights (E,) m:
-    how far above the sensor's origin a ring's beams leave, for stacks of several sensors (None: all from the origin);
-    ring_lags (E,) in [0, 1): by what share of a turn a ring passes a place after the first ones, for stacks whose
-    sensors look different ways (None: all at once); turn_time s: of a turn.
+    elevations (E,) rad, ascending (two lasers may share one); azimuth_step rad, must divide 2 pi; azimuth_offsets (E,)
+    rad: azimuth of a ring's beam relative to its column (None: 0 for all rings); range_min, range_max m: nearer and
+    farther surfaces return nothing; range_sigma m: standard deviation of the range; dropout: fraction of returns
+    dropped at random; height m above the ground; tilt rad about y, positive is downward; origin_heights (E,) m: height
+    of a ring's origin above the sensor's, for stacks of several sensors (None: 0 for all rings); ring_lags (E,) in
+    [0, 1): delay, as a fraction of a turn, with which a ring passes an azimuth after the first rings, for stacks of
+    sensors with different headings (None: no delay); turn_time s: duration of a turn.
 
-    Offsets are split into whole columns, which only say when a beam fires, and the rest, which says where: columns
-    are numbered by azimuth, as in an image whose rows have been shifted into line.
+    Offsets are split into whole columns, which only change when a beam fires, and a remainder, which changes its
+    direction. Columns are numbered by azimuth, as in a destaggered range image.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Sensor:
     range_min: float = 0.5
     range_max: float = 100.0
     range_sigma: float = 0.02
-    # measured on people in real sweeps: 2.5 percent of the steps along a ring are missing
+    # measured on people in real sweeps: 2.5 percent of the returns along a ring are missing
     dropout: float = 0.025
     height: float = 1.7
     tilt: float = 0.0
@@ -97,12 +97,12 @@ class Sensor:
 
     @cached_property
     def columns(self) -> int:
-        """Columns in a turn."""
+        """Number of columns per turn."""
         return round(2 * np.pi / self.azimuth_step)
 
     @property
     def rows(self) -> int:
-        """Rings."""
+        """Number of rings."""
         return len(self.elevations)
 
     @property
@@ -117,7 +117,7 @@ class Sensor:
 
     @cached_property
     def azimuth_shifts(self) -> np.ndarray:
-        """(E,) rad: what is left of the azimuth offsets after whole columns, at most half a step."""
+        """(E,) rad: remainder of the azimuth offsets after whole columns, at most half a step."""
         if self.azimuth_offsets is None:
             return np.zeros(self.rows)
         columns = self.azimuth_offsets / self.azimuth_step
@@ -127,19 +127,19 @@ class Sensor:
 
     @cached_property
     def shift_groups(self) -> tuple[tuple[float, np.ndarray], ...]:
-        """Pairs (shift rad, ascending rings that have it)."""
+        """Pairs (shift rad, ascending indices of the rings with this shift)."""
         shifts, ring = np.unique(self.azimuth_shifts.round(9), return_inverse=True)
         return tuple((float(shift), np.flatnonzero(ring == i)) for i, shift in enumerate(shifts))
 
     @cached_property
     def lag(self) -> float:
-        """By what share of a turn the last rings pass a place after the first ones."""
+        """Delay of the last rings after the first ones at the same azimuth, as a fraction of a turn."""
         return 0.0 if self.ring_lags is None else float(np.ptp(self.ring_lags))
 
     @cached_property
     def origins(self) -> tuple[tuple[float, float, "Sensor", np.ndarray], ...]:
-        """(height m, share of `lag`, the sensor of its rings alone, their numbers) of beams that share an origin and
-        pass a place together; none if all do."""
+        """(height m, fraction of `lag`, sensor with only these rings, indices of the rings) for each group of rings
+        with the same origin and lag; empty if all rings are in one group."""
         if self.origin_heights is None and not self.lag:
             return ()
         heights = np.zeros(self.rows) if self.origin_heights is None else self.origin_heights
@@ -167,13 +167,13 @@ class Sensor:
         )
 
     def azimuths(self, window: Window) -> np.ndarray:
-        """(C, R) rad: azimuth of each beam of a window, not wrapped at the seam."""
+        """(C, R) rad: azimuth of each beam of a window, not wrapped at +-pi."""
         columns = self.azimuth_start + (window.column0 + np.arange(window.columns)) * self.azimuth_step
         return columns[:, None] + self.azimuth_shifts[window.row0 : window.row0 + window.rows]
 
 
 def check_limits(sensor: Any) -> None:
-    """Raises InputError for a range, noise, loss or mount that no `Sensor` or `RayPattern` has."""
+    """Raises InputError for invalid range limits, noise, dropout or mounting of a `Sensor` or `RayPattern`."""
     kind = type(sensor).__name__
     for field in ("range_min", "range_max", "range_sigma", "dropout", "height", "tilt"):
         check_finite(f"{kind}.{field}", getattr(sensor, field))

@@ -1,6 +1,6 @@
-"""Whole scans from above: points colored by height, people's boxes, ids, headings, skeletons and tracks.
+"""Whole scans from above: points colored by height; boxes, ids, headings, skeletons and tracks of people.
 
-Drawn with matplotlib's object interface, as in `draw`: no global state is touched.
+Drawn with matplotlib's object interface, as in `draw`: no global state is changed.
 """
 
 from collections.abc import Sequence
@@ -18,29 +18,29 @@ from lidarpose.viz.draw import SIDE_COLORS, draw_people, png_of, shortened, stac
 from lidarpose.viz.person_view import Panel, bone_pairs, bone_sides, box_edges, finite, is_known
 
 MAX_SCANS = 12
-_MAX_POINTS = 120_000  # a scan; more only cover each other at this size
+_MAX_POINTS = 120_000  # per scan; more points would only cover each other at this size
 _DPI, _PANEL, _TITLE = 110, 7.6, 0.6  # inches
-_WIDE, _CARDS_IN_ROW = 11.5, 4  # inches, of a scan over the cards of so many people or more
-_LABEL_RADII, _LABEL_SIZE = (15.0, 26.0, 38.0), 13.0  # points from a box to its number, and about what a number takes
-_MARGIN, _LEAST_SPAN = 3.0, 16.0  # m about the people, and of a view's side at least
-_BELOW, _ABOVE = 0.25, 2.5  # heights above the lowest points over which the colors run, m
+_WIDE, _CARDS_IN_ROW = 11.5, 4  # width of a scan, inches, above the cards of at least this number of people
+_LABEL_RADII, _LABEL_SIZE = (15.0, 26.0, 38.0), 13.0  # pt: distances of a number from its box, size of a number
+_MARGIN, _LEAST_SPAN = 3.0, 16.0  # m: margin around the people, and minimum side of a view
+_BELOW, _ABOVE = 0.25, 2.5  # range of heights that the colors cover, m above the ground
 _GROUND, _HIGH, _INK, _FAINT, _BOX = "#d5d9de", "#eceff2", "#1f2328", "#7a828c", "#b3261e"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ScanPanel:
-    """One scan to draw; everything in one frame, z up, m.
+    """One scan to draw; all coordinates in one frame, z up, m.
 
     Args:
         points: (n, 3).
-        boxes: of people; an id is printed beside its box, the side that a box faces is marked.
-        poses: joints (P, J, 3); labeled: whether they are the true ones.
-        tracks: positions (F, 2) or (F, 3) of people over time.
-        places: (K, 2) or (K, 3), of people whom nobody knows apart.
+        boxes: boxes of people; the id is printed beside a box, and an arrow marks its heading.
+        poses: joints (P, J, 3); labeled: whether these are ground truth.
+        tracks: positions (F, 2) or (F, 3) of each person over time.
+        places: (K, 2) or (K, 3), positions of people without track ids.
         label: printed above.
-        sensor: x, y of the sensor, None where nobody knows it.
-        names: of the P people, in place of their numbers.
-        frames: of the same place over time, each with its people and their points; step: ms between them.
+        sensor: x, y of the sensor; None if unknown.
+        names: names of the P people, shown instead of their numbers.
+        frames: successive frames of the same scene, each with its people and their points; step: ms between frames.
     """
 
     points: np.ndarray
@@ -59,7 +59,7 @@ class ScanPanel:
 def draw_scan_and_people(
     scan: ScanPanel, people: Sequence[Panel], path: str | Path | None = None, *, title: str = ""
 ) -> bytes:
-    """A scan from above and, below it, a card of each person, as `draw_scans` and `draw_people` draw them.
+    """Draws a scan from above and, below it, a card for each person, as `draw_scans` and `draw_people` do.
 
     Returns:
         The PNG's bytes.
@@ -75,13 +75,13 @@ def draw_scan_and_people(
 def draw_scans(
     panels: Sequence[ScanPanel], path: str | Path | None = None, *, title: str = "", panel_width: float = _PANEL
 ) -> bytes:
-    """Scans from above, side by side.
+    """Draws scans from above, side by side.
 
     Args:
         panels: at most the first 12 are drawn.
-        path: where to write the PNG, too.
-        title: above all.
-        panel_width: of each, inches.
+        path: the PNG is also written to this file.
+        title: printed at the top.
+        panel_width: width of each panel, inches.
 
     Returns:
         The PNG's bytes.
@@ -120,7 +120,7 @@ def draw_scans(
 
 
 def _draw_panel(ax, panel: ScanPanel, size: np.ndarray) -> None:
-    """size: width and height of the axes, inches."""
+    """Draws one scan; size: width and height of the axes, inches."""
     from matplotlib.collections import LineCollection
 
     points = finite(panel.points)
@@ -157,8 +157,8 @@ def _draw_panel(ax, panel: ScanPanel, size: np.ndarray) -> None:
 
 
 def _window(panel: ScanPanel, points: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, float]:
-    """What axes of a size (2,) inches show: the center (2,) m, and the meters an inch that show the people, their
-    tracks and the sensor, else most points."""
+    """The section that axes of a size (2,) inches show: center (2,) m, and scale in meters per inch. It contains the
+    people, their tracks and the sensor, else most of the points."""
     extent_points = [box.center[None, :2] for box in panel.boxes] + [np.asarray(track)[:, :2] for track in panel.tracks]
     if panel.places is not None and len(panel.places):
         extent_points.append(np.asarray(panel.places)[:, :2])
@@ -172,7 +172,7 @@ def _window(panel: ScanPanel, points: np.ndarray, size: np.ndarray) -> tuple[np.
 
 
 def _draw_points(ax, points: np.ndarray, ground: Ground | None) -> None:
-    """The ground light gray, what stands on it by height, what is higher than people fainter still."""
+    """Draws the ground in light gray, points above it colored by height, and points higher than people even fainter."""
     from matplotlib import colormaps
 
     if ground is not None:
@@ -180,7 +180,7 @@ def _draw_points(ax, points: np.ndarray, ground: Ground | None) -> None:
     else:
         height = points[:, 2] - (np.percentile(points[:, 2], 2) if len(points) else 0)
     is_colored = (height >= _BELOW) & (height <= _ABOVE)
-    # what stands on the ground last, so that nothing covers it
+    # objects on the ground are drawn last, so that nothing covers them
     order = np.argsort(is_colored, kind="stable")
     size = np.clip(20_000 / max(len(points), 1), 0.3, 4) * np.where(is_colored, 1.5, 1)
     cmap = colormaps["viridis_r"].with_extremes(under=_GROUND, over=_HIGH)
@@ -193,8 +193,8 @@ def _draw_points(ax, points: np.ndarray, ground: Ground | None) -> None:
 
 
 def label_offsets(centers: np.ndarray, arrow_tips: np.ndarray) -> np.ndarray:
-    """Where numbers are written, from the centers (B, 2) of their boxes, in points: away from arrows, to tips (A, 2),
-    other boxes and numbers that are there already, else to the upper right."""
+    """Offsets (B, 2) of the numbers from the centers (B, 2) of their boxes, all in pt: away from arrows with tips
+    (A, 2), other boxes and numbers placed before, else to the upper right."""
     angles = np.pi / 4 * (1 + np.arange(8))
     directions = np.stack([np.cos(angles), np.sin(angles)], -1)
     candidates = np.concatenate([radius * directions for radius in _LABEL_RADII])
@@ -208,12 +208,12 @@ def label_offsets(centers: np.ndarray, arrow_tips: np.ndarray) -> np.ndarray:
 
 
 def _arrow_tip(box: Box) -> np.ndarray:
-    """Where the arrow that shows the facing ends, (2,) m."""
+    """Tip (2,) m of the arrow that shows the heading."""
     return box.center[:2] + np.array([np.cos(box.yaw), np.sin(box.yaw)]) * (box.size[0] / 2 + 0.6)
 
 
 def _draw_box(ax, box: Box, offset: tuple[float, float]) -> None:
-    """Its outline, the way it faces, and its id, so many points from the center."""
+    """Draws a box's outline, its heading, and its id at `offset` pt from the center."""
     from matplotlib.collections import LineCollection
 
     ax.add_collection(LineCollection(list(box_edges(box)[..., :2]), colors=_BOX, lw=1.1, zorder=5))

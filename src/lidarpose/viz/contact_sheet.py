@@ -1,4 +1,4 @@
-"""People of a dataset on a contact sheet, or on a page to turn them in 3D."""
+"""Draws people of a dataset on a contact sheet, or on an HTML page with 3D views."""
 
 from math import isnan
 from pathlib import Path
@@ -17,20 +17,20 @@ from lidarpose.viz.html import write_report
 
 
 def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out: str | Path | None = None) -> Path:
-    """Draws people of a dataset that `synth` or `prepare` wrote; of streets the streets themselves, from above.
+    """Draws people of a dataset written by `synth` or `prepare`; for datasets of streets, the streets from above.
 
     Args:
-        folder: the dataset's.
-        count: how many people, or at most 12 streets, evenly spread over the shards that are there.
-        html: a page with 3D views instead of a picture; of streets the streets and then the people.
-        out: the file; by default the folder's name with .png or .html in the current folder.
+        folder: the dataset's folder.
+        count: number of people, or of streets (at most 12), evenly spread over the existing shards.
+        html: writes a page with 3D views instead of a picture; for streets, it shows the streets and then the people.
+        out: the output file; by default the folder's name with .png or .html in the current folder.
 
     Returns:
         The file's path.
 
     Raises:
-        InputError: fewer than one person or more than 60 (400 in a page), a folder that is no dataset or has no shard
-            yet, a file that cannot be written or is the dataset's.
+        InputError: for fewer than one person or more than 60 (400 on a page), a folder that is not a dataset or has no
+            shard yet, and an output file that cannot be written or belongs to the dataset.
     """
     limit = 400 if html else MAX_PEOPLE
     if not 1 <= count <= limit:
@@ -62,8 +62,8 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
 
 
 def _spread(dataset: DatasetReader, table: str, count: int) -> list[list[dict]]:
-    """Rows of `count` people, one each, or of streets, one a frame, evenly spread over the shards that are there; of a
-    smaller dataset all. Raises InputError where no shard is there."""
+    """Rows of `count` people (one each) or streets (one per frame), evenly spread over the existing shards; all if
+    there are fewer. Raises InputError if there is no shard."""
     written_shards = dataset.written(table)
     if not written_shards:
         remedy = f"wait for the first one, or run {dataset.card.writer} again"
@@ -78,7 +78,7 @@ def _spread(dataset: DatasetReader, table: str, count: int) -> list[list[dict]]:
         keys = {shard: range(dataset.rows_of(table, shard)) for shard in written_shards}
     total = sum(map(len, keys.values()))
     count = min(count, total)
-    # each in the middle of an equal share
+    # the middles of `count` equal intervals
     positions = ((2 * np.arange(count) + 1) * total // (2 * count)).tolist()
     groups: list[list[dict]] = []
     first_position = 0
@@ -97,7 +97,7 @@ def _spread(dataset: DatasetReader, table: str, count: int) -> list[list[dict]]:
 
 def _street_panel(rows: list[dict], dataset: DatasetReader) -> ScanPanel:
     first_row = rows[0]
-    # everybody is in every frame
+    # all people are in every frame
     boxes = np.stack([row["box"].reshape(-1, 7) for row in rows if len(row["box"]) == len(first_row["box"])])
     joints = first_row["joints"].reshape(len(first_row["track"]), -1, 3)
     people = content_count(len(joints), "people")
@@ -115,7 +115,7 @@ def _street_panel(rows: list[dict], dataset: DatasetReader) -> ScanPanel:
 
 
 def _panel(index: int, sample: LabeledSample, dataset: DatasetReader) -> Panel:
-    """Labeled as "#12 os1-128"; of clips and streets with the frame and the track."""
+    """A panel labeled as "#12 os1-128"; for clips and streets also with the frame, for streets also with the track."""
     words = [f"#{index}"]
     if dataset.card.settings.get("what") in ("clips", "streets"):
         words.append(f"frame {sample.frame}")

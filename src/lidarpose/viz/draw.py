@@ -1,7 +1,7 @@
-"""People drawn from the front and from the side, on one sheet: points, predicted and true skeletons.
+"""Draws people from the front and from the side on one sheet: points, predicted and true skeletons.
 
-Drawn with matplotlib's Agg canvas through its object interface, so that no global state (backend, current figure) is
-touched; matplotlib is imported only when something is drawn.
+Uses matplotlib's Agg canvas through its object interface, so that no global state (backend, current figure) is changed;
+matplotlib is imported only when something is drawn.
 """
 
 import io
@@ -32,15 +32,15 @@ from lidarpose.viz.person_view import (
     view_directions,
 )
 
-MAX_PEOPLE = 60  # more would make a sheet that no screen shows
-MAX_POINTS_DRAWN = 3000  # a person; more only cover each other at this size
+MAX_PEOPLE = 60  # more would make the sheet too large for a screen
+MAX_POINTS_DRAWN = 3000  # per person; more points would only cover each other at this size
 
-# blue and orange of Okabe and Ito's color-blind-safe palette (2008), the orange darker to stand out on white
+# blue and orange of Okabe and Ito's color-blind-safe palette (2008), the orange darker for contrast on white
 SIDE_COLORS = {"left": "#0072b2", "right": "#e07000", "center": "#2b2f36"}
-# by body side, two shades that alternate along a limb, so that neighboring parts differ
+# two shades per body side, which alternate along a limb so that neighboring parts differ
 _PART_SHADES = {"left": ("#7db8dd", "#3b8fc4"), "right": ("#f5bd86", "#e8954a"), "center": ("#a9b0ba", "#7f8792")}
 _NOT_BODY = "#dcb3cf"
-_NEAR, _FAR = (0.45, 0.51, 0.57), (0.85, 0.87, 0.90)  # points by depth: gray, to leave the colors to the skeleton
+_NEAR, _FAR = (0.45, 0.51, 0.57), (0.85, 0.87, 0.90)  # colors of points by depth: gray, as colors mark the skeleton
 _TRUTH, _INK, _FAINT, _HAIRLINE, _ALERT = "#4d545d", "#1f2328", "#7a828c", "#e3e6ea", "#b3261e"
 _DASHES = (0, (3, 1.6))
 
@@ -51,24 +51,24 @@ _CARD_WIDTH, _VIEW_HEIGHT, _CAPTION = 3.0, 2.4, 0.42
 _GAP, _MARGIN, _RULER = 0.12, 0.16, 0.34
 _TITLE, _LEGEND = 0.36, 0.3
 
-_REACH = 2.5  # m around the person that a view may show; what lies farther out is cut
-_TALLEST = 1.8  # m that a view's height shows at least, so that people on a sheet share one scale
-_DEPTH_SPAN = 0.35  # m in front of and behind the middle, over which the points' gray runs
+_REACH = 2.5  # m: maximum extent of a view around the person; the rest is clipped
+_TALLEST = 1.8  # m: minimum height of a view, so that most people on a sheet have the same scale
+_DEPTH_SPAN = 0.35  # m in front of and behind the middle that the points' gray levels cover
 
 
 def draw_people(
     panels: list[Panel], path: str | Path | None = None, *, title: str = "", per_row: int = _PER_ROW
 ) -> bytes:
-    """People from the front and from the side on one sheet.
+    """Draws people from the front and from the side on one sheet.
 
-    The front is where the predicted pose faces, else the true one, else +x. Left limbs are blue, right ones orange; a
-    bone is the fainter and thinner the less confident its ends are.
+    The front is the facing of the panel, else of the predicted pose, else of the true one, else +x. Left limbs are
+    blue, right ones orange; bones with less confident ends are fainter and thinner.
 
     Args:
-        panels: the people; at most the first 60 are drawn, and the sheet says so.
-        path: where to write the PNG, too.
-        title: above all.
-        per_row: people beside each other.
+        panels: the people; at most the first 60 are drawn, which the sheet then states.
+        path: the PNG is also written to this file.
+        title: printed at the top.
+        per_row: number of people per row.
 
     Returns:
         The PNG's bytes.
@@ -107,12 +107,12 @@ def draw_people(
 
 
 def png_of(figure, path: str | Path | None) -> bytes:
-    """A matplotlib figure as the bytes of a PNG, whatever the user's savefig settings; also written to `path`."""
+    """A matplotlib figure as the bytes of a PNG, independent of the user's savefig settings; also written to `path`."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     buffer = io.BytesIO()
     with warnings.catch_warnings():
-        # letters that the font lacks become boxes; no warning for the user
+        # characters that the font lacks become boxes, without a warning
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
     if path is not None:
@@ -121,7 +121,7 @@ def png_of(figure, path: str | Path | None) -> bytes:
 
 
 def stack_pictures(pictures: list[bytes], path: str | Path | None = None) -> bytes:
-    """PNGs below each other on one, white beside the narrower ones; also written to `path`."""
+    """Stacks PNGs vertically in one PNG, with white beside the narrower ones; also written to `path`."""
     from PIL import Image
 
     if path is not None:
@@ -144,19 +144,19 @@ def _text(artist, x: float, y: float, text: str, *, size: float, color: str = _I
 
 
 def shortened(words: str, limit: int) -> str:
-    # names of files may hold lone surrogates, and no font draws control letters
+    # file names may contain lone surrogates, and fonts have no control characters
     words = " ".join("".join(c if c.isprintable() else " " for c in str(words)).split())
-    # ids and paths tell most by their ends
+    # the ends of ids and paths are the most informative
     tail = (limit - 1) // 2
     return words if len(words) <= limit else f"{words[: limit - 1 - tail]}…{words[len(words) - tail :]}"
 
 
 def _draw_header(figure, panels: list[Panel], shown_panels: list[Panel], title: str) -> None:
-    """The title, how many people are left out, and a legend of what is drawn."""
+    """Draws the title, a note if people are omitted, and a legend."""
     width, height = figure.get_size_inches()
     left, top = _MARGIN / width, 1 - _MARGIN / height
     note = f"the first {len(shown_panels)} of {len(panels)} people" if len(shown_panels) < len(panels) else ""
-    # a hash fits
+    # wide enough for a hash
     room = int((width - 2 * _MARGIN) / 0.127) - len(note)
     _text(figure, left, top, shortened(title, max(room, 12)), size=13, weight="bold", va="top")
     _text(figure, 1 - left, top - 0.03 / height, note, size=9, color=_FAINT, va="top", ha="right")
@@ -199,14 +199,14 @@ def _legend_handles(panels: list[Panel]) -> list:
 
 
 def _draw_card(ax, panel: Panel, width: float, height: float) -> None:
-    """One person: caption, and the two views side by side in meters, on a common ground and scale. The card is `width`
-    x `height` inches."""
+    """Draws one person: caption, and the two views side by side in meters, with common ground and scale. The card is
+    `width` x `height` inches."""
     from matplotlib.patches import Rectangle
 
     def write(words: str, *, up: float, right: float = width / 2, **style) -> None:
         _text(ax, right / width, up / height, words, ha="center", transform=ax.transAxes, **style)
 
-    # a UUID fits on the narrowest card
+    # the narrowest card is wide enough for a UUID
     write(shortened(panel.label, int(width / 0.083)), up=0.25, size=8.5, weight="bold")
     write(describe(panel), up=0.09, size=7.5, color=_FAINT)
     anchor, note = middle(panel), missing_pose(panel)
@@ -222,7 +222,7 @@ def _draw_card(ax, panel: Panel, width: float, height: float) -> None:
     low, high = extents[0][:, 1]
     spans = [max(extent[1, 0] - extent[0, 0], 0.5) for extent in extents]
     room, view_height = width - _RULER - 0.2, height - _CAPTION - 0.4
-    scale = max(sum(spans) / room, (high - low) / view_height, _TALLEST / view_height)  # meters an inch
+    scale = max(sum(spans) / room, (high - low) / view_height, _TALLEST / view_height)  # meters per inch
     margin = (room * scale - sum(spans)) / 2
     ground = _CAPTION + 0.1
     ax.set(xlim=(0, width * scale), ylim=(low - ground * scale, low + (height - ground) * scale))
@@ -249,13 +249,13 @@ def _draw_card(ax, panel: Panel, width: float, height: float) -> None:
 
 
 def _extent(panel: Panel, anchor: np.ndarray, *, seen_from: np.ndarray) -> np.ndarray:
-    """(2, 2) m: the lowest and highest (right, up) that a view has to show."""
+    """(2, 2) m: minimum and maximum (right, up) that a view has to show."""
     clouds = [finite(pose.joints) for pose in (panel.pose, panel.truth) if pose is not None]
     if panel.box is not None:
         clouds.append(box_edges(panel.box).reshape(-1, 3))
     views = [project(cloud, seen_from=seen_from) for cloud in clouds]
     if len(points := finite(panel.points)):
-        # single far points must not shrink the person
+        # a few outlying points must not shrink the person
         views.append(np.percentile(project(points, seen_from=seen_from), (1, 99), axis=0))
     view = np.concatenate(views)[:, :2]
     center = project(anchor, seen_from=seen_from)[:2]
@@ -264,11 +264,11 @@ def _extent(panel: Panel, anchor: np.ndarray, *, seen_from: np.ndarray) -> np.nd
 
 
 def _draw_view(ax, panel: Panel, *, seen_from: np.ndarray, shift: float, window) -> None:
-    """One view, moved to the right by `shift` m; what lies outside the rectangle `window` is cut."""
+    """Draws one view, moved to the right by `shift` m and clipped to the rectangle `window`."""
     from matplotlib.collections import LineCollection
 
     def place(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where points lie on the card, and how near they are."""
+        """Positions of points on the card, and their nearness to the viewer."""
         view = project(points, seen_from=seen_from)
         return view[..., :2] + [shift, 0], view[..., 2]
 
@@ -306,7 +306,7 @@ def _draw_view(ax, panel: Panel, *, seen_from: np.ndarray, shift: float, window)
 
 
 def _draw_arrow(ax, x: float, y: float, length: float, *, towards_viewer: bool) -> None:
-    """Where the person looks: a dot in a ring comes towards the viewer, else it goes right."""
+    """Draws the facing: a dot in a ring towards the viewer, else an arrow to the right."""
     if towards_viewer:
         ax.plot(x, y, ls="", marker="o", ms=5, mfc="white", mec=_FAINT, mew=0.9, zorder=6)
         ax.plot(x, y, ls="", marker="o", ms=1.6, color=_FAINT, mew=0, zorder=7)
@@ -317,7 +317,7 @@ def _draw_arrow(ax, x: float, y: float, length: float, *, towards_viewer: bool) 
 
 
 def _bones(pose: Pose, positions: np.ndarray, depth: np.ndarray) -> tuple[list[np.ndarray], dict[str, list]]:
-    """Segments in the order of drawing, far ones first, each over a white one that parts it from what lies behind."""
+    """Segments in drawing order, far ones first, each on a white one that separates it from those behind."""
     from matplotlib.colors import to_rgba
 
     pairs, sides, weight = bone_pairs(pose.skeleton), bone_sides(pose.skeleton), confidences(pose)
@@ -332,13 +332,13 @@ def _bones(pose: Pose, positions: np.ndarray, depth: np.ndarray) -> tuple[list[n
 
 
 def _depth_colors(depth: np.ndarray) -> np.ndarray:
-    """(n, 3) in [0, 1]: near points dark, far ones light."""
+    """Colors (n, 3) in [0, 1]: near points dark, far ones light."""
     nearness = np.clip(0.5 + (depth - np.median(depth)) / (2 * _DEPTH_SPAN), 0, 1)[:, None]
     return nearness * np.array(_NEAR) + (1 - nearness) * np.array(_FAR)
 
 
 def _part_colors(part: np.ndarray) -> np.ndarray:
-    """part (n,), 0 = background, 1 + j = SMPL-24's joint j -> (n, 3) in [0, 1]: the body side's two shades in turn."""
+    """part (n,), 0 = background, 1 + j = SMPL-24's joint j -> colors (n, 3) in [0, 1]: the side's shades in turn."""
     from matplotlib.colors import to_rgb
 
     level = [0] * len(SMPL24)

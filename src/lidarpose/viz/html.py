@@ -1,4 +1,4 @@
-"""One HTML file that shows people in turnable 3D views, under a table of numbers. It loads nothing from a network."""
+"""One HTML file with a table of numbers and interactive 3D views of people. It loads nothing from the network."""
 
 import json
 import math
@@ -29,30 +29,30 @@ from lidarpose.viz.person_view import (
     side,
 )
 
-MAX_POINTS = 60_000  # of all people together: about 0.9 MB of text
-_FEWEST_POINTS = 150  # a person keeps these, however many people there are
-# people near whom points are kept, where there are many over time
+MAX_POINTS = 60_000  # of all people together; about 0.9 MB of text
+_FEWEST_POINTS = 150  # minimum limit per person, for any number of people
+# approximate number of boxes near which points are preferred, if only the frames over time have boxes
 _FEW_BOXES = 100
-# of all scans, and of each at least: points, half of them so many m about its people; and how far about all of them the
-# scan is shown, m
+# points of all scans together; minimum limit per scan, half of it for points within this distance of its people, m; and
+# extent of a scan around all its people, m
 _SCAN_POINTS, _FEWEST_SCAN_POINTS, _NEAR, _SCAN_REACH = 40_000, 15_000, 1.0, 15.0
 
 
 def write_report(
     path: str | Path, people: list[Panel], *, title: str, summary: list[dict], scans: Sequence[ScanPanel] = ()
 ) -> str:
-    """Writes the report to `path`, whole or not at all, and returns its text.
+    """Writes the report to `path` atomically and returns its text.
 
     Args:
         path: ends in .html or .htm.
-        people: a 3D view each; more than 60,000 points in all are thinned evenly.
-        title: above all.
-        summary: rows of the table on top: the columns are the rows' keys in order of appearance, a column of numbers is
-            aligned to the right.
-        scans: whole ones with everybody in them, shown first.
+        people: one 3D view each; more than 60,000 points in total are thinned evenly.
+        title: printed at the top.
+        summary: rows of the table at the top. Its columns are the rows' keys in order of appearance; columns of numbers
+            are right-aligned.
+        scans: whole scans with all their people, shown first.
 
     Raises:
-        InputError: a path of another suffix, or one that cannot be written.
+        InputError: for a path with another suffix, or one that cannot be written.
     """
     check_suffix(path, ".html", ".htm")
     text = render_report(people, title=title, summary=summary, scans=scans)
@@ -61,7 +61,7 @@ def write_report(
 
 
 def render_report(people: list[Panel], *, title: str, summary: list[dict], scans: Sequence[ScanPanel] = ()) -> str:
-    """The text of `write_report`'s file; the same input gives the same text."""
+    """The text of the file that `write_report` writes; deterministic."""
     people = list(people)
     skeletons = {pose.skeleton.name: pose.skeleton for p in people for pose in (p.pose, p.truth) if pose is not None}
     panels = [panel for scan in scans for panel in (scan, *scan.frames)]
@@ -73,7 +73,7 @@ def render_report(people: list[Panel], *, title: str, summary: list[dict], scans
         "people": people_data,
         "scans": [_scan_data(scan, max(_FEWEST_SCAN_POINTS, _SCAN_POINTS // len(scans))) for scan in scans],
     }
-    # inside a script element only "<" could end the element early
+    # inside a script element, only "<" could end the element early
     json_text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     cards = [_scan_card(f"scan{i}", scan) for i, scan in enumerate(scans)]
     cards += [_card(i, p, len(d["points"]) // 3) for i, (p, d) in enumerate(zip(people, people_data, strict=True))]
@@ -86,7 +86,7 @@ def render_report(people: list[Panel], *, title: str, summary: list[dict], scans
         "CARDS": "\n".join(cards) or '<p class="none">no people</p>',
         "DATA": json_text,
     }
-    # split once, so that a text of the caller's that looks like a field is left alone
+    # only the template is split, so that the caller's texts that look like a field are not replaced
     pieces = _asset("report.html").split("%%")
     return "".join(fields[piece] if i % 2 else piece for i, piece in enumerate(pieces))
 
@@ -96,13 +96,13 @@ def _asset(name: str) -> str:
 
 
 def _skeleton_data(skeleton: Skeleton) -> dict:
-    """Joints' names and sides, bones as [parent, child, side]."""
+    """Names and sides of the joints, and bones as [parent, child, side]."""
     bones = [[a, b, s[0]] for (a, b), s in zip(skeleton.bones, bone_sides(skeleton), strict=True)]
     return {"joints": skeleton.joints, "sides": "".join(side(j)[0] for j in skeleton.joints), "bones": bones}
 
 
 def _person_data(person: Panel, limit: int) -> dict:
-    """Millimeters as integers about the person's middle, so that a point costs some 14 letters."""
+    """A person's data; coordinates are integer millimeters relative to the middle, about 14 characters per point."""
     center = middle(person)
     center = np.zeros(3) if center is None else center
     rows = np.flatnonzero(within_reach(person.points))
@@ -120,7 +120,7 @@ def _person_data(person: Panel, limit: int) -> dict:
 
 
 def _scan_data(scan: ScanPanel, limit: int) -> dict:
-    """As of a person, but with everybody's pose, about the middle of all; of at most `limit` points."""
+    """Like `_person_data`, but with all people's poses, relative to their median, and with at most `limit` points."""
     points = scan.points[within_reach(scan.points)]
     boxes = [box for panel in (scan, *scan.frames) for box in panel.boxes]
     centers = np.array([box.center for box in boxes])
@@ -142,7 +142,7 @@ def _scan_data(scan: ScanPanel, limit: int) -> dict:
 
 
 def _frame_data(panel: ScanPanel, points: np.ndarray, center: np.ndarray) -> dict:
-    """Points and everybody's pose, about a center (3,) m."""
+    """Points and the poses of all people, relative to a center (3,) m."""
     entries = []
     if panel.poses is not None:
         for k, joints in enumerate(panel.poses.joints):
@@ -152,7 +152,7 @@ def _frame_data(panel: ScanPanel, points: np.ndarray, center: np.ndarray) -> dic
     return {"points": _millimeters(points, center), "poses": entries}
 
 
-# a letter a part: n = background, else the body side's
+# one letter per part: n = background, else that of the body side
 _PART_SIDES = np.array(["n"] + [side(joint)[0] for joint in SMPL24.joints])
 
 
@@ -171,7 +171,7 @@ def _millimeters(points: np.ndarray, center: np.ndarray) -> list[int]:
 
 
 def _card(i: int, person: Panel, num_drawn: int) -> str:
-    """num_drawn: how many of the person's points are drawn."""
+    """The HTML of a person; num_drawn: number of the person's points that are drawn."""
     notes = [missing_pose(person)]
     if num_drawn < len(person.points):
         notes.append(f"{num_drawn:,} of {len(person.points):,} points drawn")
@@ -209,7 +209,7 @@ def _is_missing(value: object) -> bool:
 
 
 def _decimals(values: list) -> int:
-    """So many that the column's largest number shows four digits, at most three, and none that only adds zeros."""
+    """Decimals of a column: four digits for its largest number, at most three decimals, no common trailing zeros."""
     values = [abs(float(v)) for v in values if not isinstance(v, Integral)]
     largest = max(values, default=0.0)
     limit = int(np.clip(3 - math.floor(math.log10(largest)), 0, 3)) if largest > 0 else 3
@@ -217,7 +217,7 @@ def _decimals(values: list) -> int:
 
 
 def _table(rows: list[dict]) -> str:
-    """An HTML table: columns of numbers to the right, `–` where a row has nothing, yes and no for truth values."""
+    """An HTML table: columns of numbers are right-aligned, `–` marks missing values, booleans are yes and no."""
     columns = list(dict.fromkeys(key for row in rows for key in row))
     if not columns:
         return ""

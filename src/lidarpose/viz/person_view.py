@@ -1,4 +1,4 @@
-"""A person to draw, and what the picture and the report need of it: facing, views, sides, words."""
+"""A person to draw, and helpers shared by pictures and reports: facing, views, sides, captions."""
 
 from dataclasses import dataclass
 from typing import TypeGuard
@@ -16,16 +16,16 @@ class Panel:
     """One person to draw. Raises InputError on a wrong shape.
 
     Args:
-        points: (n, 3) m, z up, n = 0 is legal.
-        pose, truth: predicted and true pose of one person in the points' frame, joints (J, 3) m; a joint that is not
-            finite is left out.
+        points: (n, 3) m, z up; n = 0 is allowed.
+        pose, truth: predicted and true pose of one person in the points' frame, joints (J, 3) m; non-finite joints are
+            not drawn.
         label: the name above the caption.
         part: (n,) int, 0 = background, 1 + j = the bone of SMPL-24's joint j: colors the points by side.
         box: drawn in pictures.
-        distance: m, printed; by default that of the person from the frame's origin, none for NaN.
+        distance: m, printed; by default from the frame's origin to the person; not printed if NaN.
         caption: the line under the person, by default the number of points, the distance and the mean confidence.
-        forward: (3,) where the person looks, see `facing`, which the views follow; by default as the pose has it, else
-            the truth.
+        forward: (3,) facing of the person, see `facing`; the views are aligned with it. By default that of the pose,
+            else of the truth.
     """
 
     points: np.ndarray
@@ -52,24 +52,24 @@ class Panel:
 
 
 def facing_of(person: Panel) -> np.ndarray | None:
-    """What the panel says, else `facing` of the predicted pose, else of the true one."""
+    """The panel's `forward`, else `facing` of the predicted pose, else of the true one."""
     forward = facing(person.pose) if person.forward is None else person.forward
     return facing(person.truth) if forward is None else forward
 
 
 def project(points: np.ndarray, *, seen_from: np.ndarray) -> np.ndarray:
-    """points (..., 3) m as somebody sees them who looks level at them: (..., 3) m = (right, up, towards the viewer).
+    """Projects points (..., 3) m to a horizontal view: (..., 3) m = (right, up, towards the viewer).
 
-    seen_from (3,) is the level unit direction from the points to the viewer. Seen from where a person faces, the
-    person's left side is on the picture's right.
+    seen_from (3,) is the horizontal unit direction from the points to the viewer. In a front view, the person's left
+    side is on the picture's right.
     """
     x, y, _ = seen_from
     return np.asarray(points, float) @ np.array([[-y, x, 0.0], [0, 0, 1], [x, y, 0]]).T
 
 
 def view_directions(forward: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """The two `seen_from` of a person who looks `forward`: the front, and the person's right (so that the person
-    faces the picture's right). Without a direction: from +x and from -y."""
+    """The two `seen_from` of a person who faces `forward`: from the front, and from the person's right, so that the
+    person faces the picture's right. Without a direction: from +x and from -y."""
     x, y, _ = (1.0, 0.0, 0.0) if forward is None else forward
     return np.array([x, y, 0.0]), np.array([y, -x, 0.0])
 
@@ -80,7 +80,7 @@ def side(joint: str) -> str:
 
 
 def bone_sides(skeleton: Skeleton) -> list[str]:
-    """The side of each of `skeleton.bones`: the child's, center for a bone from one side to the other."""
+    """The side of each of `skeleton.bones`: the child's; "center" for a bone from one side to the other."""
     sides = [side(name) for name in skeleton.joints]
     return ["center" if {sides[a], sides[b]} == {"left", "right"} else sides[b] for a, b in skeleton.bones]
 
@@ -98,7 +98,7 @@ def box_edges(box: Box) -> np.ndarray:
 
 
 def confidences(pose: Pose) -> np.ndarray:
-    """(J,) in [0, 1]; 1 where the pose knows none."""
+    """Confidences (J,) in [0, 1]; 1 if the pose has none."""
     if pose.confidence is None:
         return np.ones(len(pose.skeleton))
     return np.clip(np.nan_to_num(np.asarray(pose.confidence, float)), 0, 1)
@@ -126,7 +126,7 @@ def describe(person: Panel) -> str:
 
 
 def missing_pose(person: Panel) -> str:
-    """What to say where there is nothing predicted: empty if there is a pose, or nobody could expect one."""
+    """The note for a missing prediction; empty if there is a pose or none is expected."""
     # a labeled person of a dataset was never predicted
     if is_known(person.pose) or (person.pose is None and is_known(person.truth)):
         return ""
@@ -136,13 +136,13 @@ def missing_pose(person: Panel) -> str:
 
 
 def finite(points: np.ndarray) -> np.ndarray:
-    """Those of points (n, 3) that are finite."""
+    """The finite points of points (n, 3)."""
     return points[np.isfinite(points).all(-1)]
 
 
 def middle(person: Panel) -> np.ndarray | None:
-    """A point (3,) in the person: of a skeleton, else of the points, most of which may be of a wall; None where there
-    is nothing."""
+    """Median position (3,) of the true, else the predicted joints, else of the points, which may be mostly background;
+    None if there is no finite position."""
     clouds = [pose.joints for pose in (person.truth, person.pose) if pose is not None] + [person.points]
     for cloud in clouds:
         if len(cloud := finite(np.asarray(cloud, float))):

@@ -1,14 +1,14 @@
-"""Files of captured motion, whatever their format, as the body's rotations: `load_motion`.
+"""Reads captured motion of any supported format as rotations of the body: `load_motion`.
 
-    format           what it reads
+    format           files
     clips            .npz of this package's joint positions (see `body.mocap.motion`); retargeted
     amass            .npz of SMPL, SMPL+H or SMPL-X poses
-    bvh              .bvh of any skeleton whose joints have usual names; retargeted
+    bvh              .bvh of any skeleton with common joint names; retargeted
     amc              .amc beside its .asf; retargeted
     sloper4d         SLOPER4D's _labels.pkl
     corpus           .pkl of LIPD, FreeMotion or NoiseMotion
     lidarhuman26m    a folder of numbered pose .json files
-A folder is searched for all of these.
+Folders are searched recursively for all of these.
 """
 
 import hashlib
@@ -33,7 +33,7 @@ def load_npz(path: str | os.PathLike, *, up: str | None = None, fps: float | Non
     return (load_clip_positions if "joints" in names else load_amass)(path, up=up, fps=fps)
 
 
-# the suffix of a format's files, and how they are read
+# suffix of a format's files -> loader
 FORMATS: dict[str, Callable[..., Motion]] = {
     ".npz": load_npz,
     ".bvh": load_bvh,
@@ -41,28 +41,28 @@ FORMATS: dict[str, Callable[..., Motion]] = {
     ".pkl": load_pkl,
     ".json": load_lidarhuman26m,
 }
-# what lies beside the motion in AMASS's folders and holds none
+# files without motion in AMASS's folders
 _NO_MOTION = ("shape.npz", "stagei.npz")
 
 
 def load_motion(
     path: str | os.PathLike, *, up: str | None = None, fps: float | None = None, hz: float | None = None
 ) -> Motion:
-    """Reads the motion of a file, or of all files in a folder and its folders, as rotations of the shipped body.
+    """Reads the motion of a file, or of all files in a folder and its subfolders, as rotations of the shipped body.
 
-    Rotation formats (AMASS, LiDARHuman26M, SLOPER4D, corpora) keep every turn; the others are retargeted by positions.
-    Frames that are not finite are left out; `Motion.dropped` counts them.
+    Rotation formats (AMASS, LiDARHuman26M, SLOPER4D, corpora) keep all rotations, including twist; the others are
+    retargeted from positions. Frames with non-finite values are dropped; `Motion.dropped` counts them.
 
     Args:
-        path: A folder's clips are named by their paths in it, and get the lowest rate among its files unless `hz` is
-            given.
-        up: The axis of the recording that is up, "x", "y" or "z", with a minus where it points down, by default the
-            format's (BVH: the one people stand along).
-        fps: The recording's frames a second, by default the file's.
-        hz: Resample each file to so many frames a second.
+        path: A file or folder. A folder's clips are named by their paths in it, and are resampled to the lowest rate
+            among its files unless `hz` is given.
+        up: Up axis of the recording, "x", "y" or "z", with a minus if the axis points down; by default the format's
+            (BVH: the axis along which people stand).
+        fps: Frames per second of the recording, by default the file's.
+        hz: Resample each file to this number of frames per second.
 
     Raises:
-        InputError: Naming the file, for everything that cannot be read.
+        InputError: For anything that cannot be read; names the file.
     """
     if up is not None:
         check_name("up axis", up, UP_AXES)
@@ -89,14 +89,14 @@ def _loader(path: Path) -> Callable[..., Motion]:
     suffix = ".json" if path.is_dir() else path.suffix.lower()
     if suffix not in FORMATS:
         expected = f"a file of motion, one of {', '.join(FORMATS)}, or a folder of them"
-        # says whether there is such a file at all
+        # raises its own error if there is no such file
         read_bytes(path, expected=expected)
         raise file_error(path, f"expected {expected}: convert it, or give it the suffix of its format")
     return FORMATS[suffix]
 
 
 def _sources(folder: Path) -> list[Path]:
-    """Files of motion in a folder and its folders, and its folders of pose files, in the order of their names."""
+    """Motion files in a folder and its subfolders, and those of its folders that hold pose files, sorted by path."""
     sources = []
     for directory, _, names in os.walk(folder):
         files = [Path(directory, name) for name in names if not name.lower().endswith(_NO_MOTION)]
@@ -107,8 +107,8 @@ def _sources(folder: Path) -> list[Path]:
 
 
 def digest(path: str | os.PathLike) -> str:
-    """16 hexadecimal digits that tell one recording from another: of a file its content's, of a folder those of the
-    files of motion in it and its folders and of the skeletons beside them. Raises InputError."""
+    """Digest of a recording, 16 hexadecimal digits: of a file's content, or of all motion files and skeletons (.asf) in
+    a folder and its subfolders. Raises InputError."""
     path = Path(path)
     if not path.is_dir():
         return content_digest(path, expected="motion")[:16]
@@ -119,7 +119,7 @@ def digest(path: str | os.PathLike) -> str:
 
 
 def _name_in_folder(name: str, source: Path, folder: Path) -> str:
-    """A clip's name with the place of its file in the folder that is read: 02_01 of 02/02_01.bvh -> 02/02_01."""
+    """A clip's name with its file's path in the folder that is read: 02_01 of 02/02_01.bvh -> 02/02_01."""
     if source == folder:
         return name
     stem = source.name if source.is_dir() else source.stem

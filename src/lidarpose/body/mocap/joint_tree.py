@@ -1,8 +1,8 @@
-"""Any captured skeleton: forward kinematics of a file's tree of joints, and SMPL's 24 joints by their names.
+"""Any captured skeleton: forward kinematics of a file's joint tree, and SMPL's 24 joints matched by name.
 
-Joints are matched by the usual names of exporters; a spine that is cut differently is cut anew, at the shares of the
-line hips -> neck at which the shipped body has its spine's joints; and what only ends a limb (hand, foot, collar) is
-estimated where it is missing. The rest is needed.
+Joints are matched by the names that exporters commonly use. A spine without three distinct joints is resampled: its
+joints go to the shipped body's fractions of the line hips -> neck. Missing hands, feet, collars, neck and pelvis are
+estimated. All other joints are required.
 """
 
 import os
@@ -23,11 +23,11 @@ from lidarpose.skeleton import SMPL24
 
 _J = {name: i for i, name in enumerate(SMPL24.joints)}
 _SPINE = ("spine1", "spine2", "spine3")
-# a spine's joints nearer than this share of the line hips -> neck are one joint
+# spine joints closer than this fraction of the line hips -> neck count as one joint
 _SAME_JOINT = 0.02
 
-# names of joints, without side, the more telling first; the same word may mean two joints ("foot"): each joint is
-# used once, in this order. Left and right:
+# names of joints without the side, the most specific first. A word may mean two joints ("foot"): each joint of the file
+# is used once, in this order. Joints that exist left and right:
 _SIDED = {
     "hip": ("upleg", "thigh", "upperleg", "femur", "hip"),
     "knee": ("knee", "lowerleg", "lowleg", "shin", "calf", "leg", "tibia"),
@@ -48,10 +48,10 @@ _CENTRAL = {
     "head": ("head", "head1", "skull"),
 }
 _ESTIMATED = ("foot", "hand", "collar")
-_PREFIX = re.compile(r"mixamorig\d*|bip\d+|biped|character\d*|def|[mf]|avg|smpl")  # what exporters put in front
+_PREFIX = re.compile(r"mixamorig\d*|bip\d+|biped|character\d*|def|[mf]|avg|smpl")  # prefixes of exporters
 _WORDS = frozenset(word for words in _SIDED.values() for word in words)
 _SIDES = ("left_", "right_")
-# ends of limbs that have no name are called after their parent, with this behind
+# suffix of unnamed ends of limbs, which are named after their parent
 END = " (end)"
 
 
@@ -59,10 +59,10 @@ END = " (end)"
 class Joint:
     """A joint of a file, in the file's unit and axes.
 
-    parent: its place in the tree's list, -1 for the root; offset (3,): from the parent's place, in the parent's axes;
-    channels: what a frame's numbers are in order, "tx", "ty", "tz" for translations, "rx", "ry", "rz" for rotations;
-    bone (3,): added to the offset, in the joint's own axes; axes (3, 3): those that the channels turn about. With
-    axes, later rotations turn about axes that stay (ASF), without about turned ones (BVH).
+    parent: index in the tree's list, -1 for the root; offset (3,): from the parent's position, in the parent's axes;
+    channels: the channels of a frame in order, "tx", "ty", "tz" for translations, "rx", "ry", "rz" for rotations;
+    bone (3,): added to the offset, in the joint's own axes; axes (3, 3): axes of the channels' rotations. With axes,
+    successive rotations are about fixed axes (ASF), without, about rotated axes (BVH).
     """
 
     name: str
@@ -75,24 +75,24 @@ class Joint:
 
 @dataclass(frozen=True, kw_only=True)
 class JointTree:
-    """N joints, parents before children; degrees: unit of their rotations."""
+    """N joints, parents before children; degrees: whether rotations are in degrees, else in radians."""
 
     joints: Sequence[Joint]
     degrees: bool = True
 
     @property
     def names(self) -> list[str]:
-        """(N,), of the joints."""
+        """Names (N,) of the joints."""
         return [joint.name for joint in self.joints]
 
     @property
     def parents(self) -> list[int]:
-        """(N,), -1 for the root."""
+        """Parents (N,) of the joints, -1 for the root."""
         return [joint.parent for joint in self.joints]
 
     def positions(self, values: np.ndarray) -> np.ndarray:
-        """Joints (F, N, 3) of frames of channels (F, C), C those of all joints in order; NaN in frames with values
-        that are not finite."""
+        """Joint positions (F, N, 3) for frames of channels (F, C), all joints' channels in order; NaN in frames with
+        non-finite values."""
         is_finite = np.isfinite(values).all(1)
         columns = iter(values[is_finite].T)
         count = int(is_finite.sum())
@@ -133,16 +133,16 @@ def tree_motion(
     unit_m: float | None = None,
     matched: dict[str, int] | None = None,
 ) -> Motion:
-    """The motion of one clip of any skeleton, named as the file.
+    """The motion of one clip of any skeleton, named after the file.
 
     Args:
-        values: Frames of channels (F, C), in the file's unit and axes; those that are not finite are left out.
-        up: The axis that is up, by default the one along which people stand (y where they do not stand).
-        unit_m: Meters of a file's number, by default the unit that gives the person the most usual size.
-        matched: Joints of the tree by SMPL's names, where names are not to be guessed.
+        values: Frames of channels (F, C), in the file's unit and axes; non-finite frames are dropped.
+        up: The up axis, by default the axis along which people stand, or y if they do not stand.
+        unit_m: Meters per unit of the file, by default the unit that gives the most typical body size.
+        matched: SMPL joint name -> index in the tree; by default found by `match_joints`.
 
     Raises:
-        InputError: For a skeleton without the joints of a person, and what `motion_from_joints` refuses.
+        InputError: For a skeleton without the joints of a person, and as `motion_from_joints` does.
     """
     matched = match_joints(path, tree.names, tree.parents) if matched is None else matched
     positions = tree.positions(values)
@@ -155,7 +155,7 @@ def tree_motion(
 
 
 def match_joints(path: object, names: Sequence[str], parents: Sequence[int]) -> dict[str, int]:
-    """Indices of SMPL's joints, as far as there are any, without the spine. Raises InputError for missing ones."""
+    """SMPL joint name -> index of each joint found, without the spine. Raises InputError for missing required ones."""
     by_word: dict[tuple[str, str], int] = {}
     for i, name in enumerate(names):
         by_word.setdefault(_side_and_word(name), i)
@@ -184,7 +184,7 @@ def match_joints(path: object, names: Sequence[str], parents: Sequence[int]) -> 
 
 
 def smpl_joints(parents: Sequence[int], matched: dict[str, int], positions: np.ndarray) -> np.ndarray:
-    """SMPL's joints (F, 24, 3) of a tree's positions (F, N, 3), in the same unit and axes."""
+    """SMPL's joints (F, 24, 3) from a tree's positions (F, N, 3), in the same unit and axes."""
     joints = {joint: positions[:, i] for joint, i in matched.items()}
     hips = (joints["left_hip"] + joints["right_hip"]) / 2
     joints.setdefault("neck", (joints["left_shoulder"] + joints["right_shoulder"]) / 2)
@@ -208,8 +208,8 @@ def smpl_joints(parents: Sequence[int], matched: dict[str, int], positions: np.n
 def _spine(
     parents: Sequence[int], matched: dict[str, int], hips: np.ndarray, neck: np.ndarray, positions: np.ndarray
 ) -> list[np.ndarray]:
-    """Spine1-3 (F, 3): the three joints between pelvis and neck, or points on the line through the joints that are
-    there, at the shipped body's shares of its length."""
+    """Spine1-3 (F, 3): the three joints between pelvis and neck if they are distinct, else points at the shipped body's
+    fractions of the polyline through the existing joints."""
     spine_joints: list[int] = []
     i = matched.get("neck", matched["head"])
     while (i := parents[i]) >= 0 and i != matched.get("pelvis"):
@@ -231,18 +231,18 @@ def _spine(
 
 
 def _length_ratio(start: str, middle: str, end: str) -> float:
-    """Length of the bone middle -> end over that of start -> middle, on the shipped body."""
+    """Length of the bone middle -> end divided by that of start -> middle, on the shipped body."""
     a, b, c = (mean_adult_joints()[_J[f"left_{name}"]] for name in (start, middle, end))
     return float(np.linalg.norm(c - b) / np.linalg.norm(b - a))
 
 
 def _is_short(bone: np.ndarray, limb: np.ndarray) -> bool:
-    """Whether a limb's last bone is too short for its direction to be of use."""
+    """Whether a limb's last bone is too short for its direction to be usable."""
     return bool(np.median(np.linalg.norm(bone, axis=-1)) < _SAME_JOINT * np.median(np.linalg.norm(limb, axis=-1)))
 
 
 def _side_and_word(name: str) -> tuple[str, str]:
-    """Side and plain word of a joint's name: "mixamorig:LeftUpLeg" and "Bip01 L_up_leg" -> ("left_", "upleg")."""
+    """Side and normalized word of a joint's name: "mixamorig:LeftUpLeg" and "Bip01 L_up_leg" -> ("left_", "upleg")."""
     snake_case = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=^[LR])(?=[A-Z][a-z])", "_", name.rpartition(":")[2])
     parts = [part for part in re.split(r"[^a-z0-9]+", snake_case.lower()) if part]
     while len(parts) > 1 and _PREFIX.fullmatch(parts[0]):

@@ -1,7 +1,7 @@
-"""Captured motion: the joint positions a user has, and the bones' rotations that every source of motion becomes.
+"""Captured motion: clips files of joint positions, and `Motion`, the bone rotations that all formats are converted to.
 
-A file of clips is an npz with `joints` (F, 24, 3) m, z up, all clips one after the other, `clip` (C,) their names,
-`clip_start` and `clip_length` (C,), `fps` frames a second, and optionally `joint_names` (24,) to check the order.
+A clips file is an npz with `joints` (F, 24, 3) m, z up, all clips concatenated; `clip` (C,), their names; `clip_start`
+and `clip_length` (C,) frames; `fps`, frames per second; and optionally `joint_names` (24,) to check the order.
 `body.mocap` reads this and the usual formats of motion capture.
 """
 
@@ -20,21 +20,21 @@ from lidarpose.io.npz import read_npz
 from lidarpose.skeleton import SMPL24
 
 _KEYS = ("joints", "clip", "clip_start", "clip_length", "fps")
-# frames that are interpolated at once, to bound the memory
+# number of frames interpolated at once, to limit memory
 _BLOCK = 4096
-# a larger share of frames that cannot be used: the file is broken, not the odd frame
+# with a larger fraction of unusable frames, the whole clip counts as corrupted
 _MOST_DROPPED = 0.2
-# mean share of the trunk along an axis from which people are said to stand along it
+# people stand along an axis if the mean component of their trunks' directions along it exceeds this
 _UPRIGHT = 0.7
 
 
 @dataclass(frozen=True, kw_only=True)
 class Motion:
-    """Captured motion as the body plays it: F frames of several clips, one clip after the other.
+    """Captured motion as rotations of the body: F frames of several clips, which follow each other.
 
-    names and length (C,) of the clips; fps frames a second; rotations (F, 24, 3, 3) float32, local, in the rest frame
-    of `body.rig`, any heading; translation (F, 3) float32 m, the pelvis, z up; source: what it was read from; dropped:
-    frames that were left out because they could not be used.
+    names and length (C,) of the clips; fps frames per second; rotations (F, 24, 3, 3) float32, local, in the rest frame
+    of `body.rig`, any heading; translation (F, 3) float32 m, the pelvis, z up; source: format and path of its file;
+    dropped: number of unusable frames that were dropped.
     """
 
     names: tuple[str, ...]
@@ -62,16 +62,16 @@ class Motion:
 
     @property
     def start(self) -> np.ndarray:
-        """(C,): the clips' first frames."""
+        """First frame (C,) of each clip."""
         return np.cumsum(self.length) - self.length
 
     def frames(self, clip: int) -> slice:
-        """The frames of one clip, to cut the arrays with."""
+        """The frames of one clip, as a slice of the arrays."""
         return slice(int(self.start[clip]), int(self.start[clip] + self.length[clip]))
 
     def of(self, subjects: str | Iterable[str]) -> "Motion":
-        """The clips whose names start with one of `subjects`, such as "002", which "0021_03" does not. Raises
-        InputError for one without."""
+        """The clips whose names start with one of `subjects`; "002" does not match "0021_03". Raises InputError for a
+        subject without clips."""
         subjects = (subjects,) if isinstance(subjects, str) else tuple(subjects)
         for subject in subjects:
             if not any(_is_of(name, subject) for name in self.names):
@@ -84,13 +84,13 @@ class Motion:
         return replace(self, **arrays, names=names, length=self.length[clip_mask])
 
     def resampled(self, hz: float) -> "Motion":
-        """The same clips with `hz` frames a second: a clip keeps its first frame and loses less than a frame at its
-        end. Between frames, rotations are turned evenly (the short way) and the pelvis goes straight."""
+        """The same clips with `hz` frames per second. A clip keeps its first frame and loses less than one new frame at
+        its end. Rotations are interpolated along the shortest arc, the pelvis linearly."""
         if not 0 < hz < np.inf:
             raise InputError(f"hz must be frames a second, above 0, got {hz}")
         if hz == self.fps:
             return self
-        # the small number keeps the last frame where rounding would lose it, as from 30 to 10 frames a second
+        # the 1e-6 keeps the last frame despite rounding errors, as from 30 to 10 frames per second
         length = np.array([int((n - 1) / self.fps * hz + 1e-6) + 1 if n else 0 for n in self.length.tolist()], int)
         fractional_frames = [s + np.arange(n) * (self.fps / hz) for s, n in zip(self.start, length, strict=True)]
         last_frame = np.repeat(self.start + self.length - 1, length)
@@ -98,24 +98,24 @@ class Motion:
         return replace(self, rotations=rotations, translation=translation, length=length, fps=float(hz))
 
     def windows(self, frames: int) -> np.ndarray:
-        """Which frames make clips of `frames`: (n, frames) int, none across the end of a clip.
+        """Frame indices of all windows of `frames` frames: (n, frames) int. No window crosses the end of a clip.
 
-        `motion.rotations[motion.resampled(10).windows(16)]` would mix rates: cut the motion that was resampled.
+        Index the same motion: `motion.rotations[motion.resampled(10).windows(16)]` would mix frame rates.
         """
         frame, last_frame = self._last_frames()
         return frame[frame + frames - 1 <= last_frame, None] + np.arange(frames)
 
     def cut(self, frames: np.ndarray) -> "Motion":
-        """One clip of the frames (n,), as of a row of `windows`."""
+        """One clip of the frames (n,), such as a row of `windows`."""
         arrays = {"rotations": self.rotations[frames], "translation": self.translation[frames]}
         return replace(self, **arrays, names=("",), length=np.array([len(frames)]))
 
     def pairs(self, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """All poses that have one `dt` >= 0 seconds later in their clip, with that one.
+        """All pairs of poses of the same clip that are `dt` >= 0 seconds apart.
 
         Returns:
-            The poses (n, 24, 3, 3), facing +x; those `dt` later (n, 24, 3, 3) and the way of the pelvis until then
-            (n, 3) m, both in the axes of the first; float32.
+            The first poses (n, 24, 3, 3), facing +x; the poses `dt` later (n, 24, 3, 3) and the displacement of the
+            pelvis between them (n, 3) m, both in the axes of the first pose; float32.
         """
         frame, last_frame = self._with_later(dt)
         later_rotations, translation = self._between(frame + dt * self.fps, last_frame)
@@ -126,22 +126,22 @@ class Motion:
         return without_yaw(first_rotations), later_rotations, step.astype(np.float32)
 
     def places(self, dt: float) -> np.ndarray:
-        """Where the poses of `pairs` were recorded: (n, 3) float32, the pelvis's x and y m and the heading rad."""
+        """Recorded places (n, 3) float32 of the first poses of `pairs`: the pelvis's x and y m, and the heading rad."""
         frame, _ = self._with_later(dt)
         return np.column_stack([self.translation[frame, :2], heading(self.rotations[frame])]).astype(np.float32)
 
     def _with_later(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """The frames (n,) that have one `dt` s later in their clip, and the last one (n,) of that clip."""
+        """Frames (n,) whose clip lasts at least `dt` s longer, and the last frame (n,) of each one's clip."""
         frame, last_frame = self._last_frames()
         has_later = frame + dt * self.fps <= last_frame + 1e-6
         return frame[has_later], last_frame[has_later]
 
     def _last_frames(self) -> tuple[np.ndarray, np.ndarray]:
-        """All frames (F,), and the last one (F,) of the clip that each is in."""
+        """All frames (F,), and the last frame (F,) of each one's clip."""
         return np.arange(len(self.rotations)), np.repeat(self.start + self.length - 1, self.length)
 
     def _between(self, fractional_frame: np.ndarray, last_frame: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rotations (n, 24, 3, 3) and translation (n, 3) at frames `fractional_frame` (n,), up to their clip's last."""
+        """Rotations (n, 24, 3, 3) and translation (n, 3) at `fractional_frame` (n,), at most at `last_frame` (n,)."""
         frame = np.minimum((fractional_frame + 1e-6).astype(int), last_frame)
         next_frame = np.minimum(frame + 1, last_frame)
         weight = np.clip(fractional_frame - frame, 0, 1)[:, None]
@@ -171,8 +171,8 @@ def join(motions: Sequence[Motion], *, source: str) -> Motion:
 
 
 def facing_x(rotations: np.ndarray, translation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Clips (n, F, 24, 3, 3) and (n, F, 3) turned about z and moved, so that each begins over the origin (its z is
-    kept) and faces +x. Cut them with `Motion.windows`."""
+    """Clips (n, F, 24, 3, 3) and (n, F, 3), such as those of `Motion.windows`, turned about z and moved so that each
+    begins above the origin, at its own z, and faces +x."""
     inverse_yaw = rotation_about("z", -heading(rotations[:, 0]))[:, None]
     rotations = np.array(rotations)
     rotations[:, :, 0] = inverse_yaw @ rotations[:, :, 0]
@@ -181,8 +181,8 @@ def facing_x(rotations: np.ndarray, translation: np.ndarray) -> tuple[np.ndarray
 
 
 def load_clips(path: str | PathLike) -> tuple[np.ndarray, tuple[str, ...], np.ndarray, float]:
-    """The joints (F, 24, 3) float32 m, names and lengths (C,) of the clips, and frames a second, of a clips file (its
-    layout is at the top of this module). Raises InputError where it is another."""
+    """Reads a clips file: joints (F, 24, 3) float32 m, names and lengths (C,) of the clips, and frames per second. The
+    layout is at the top of this module. Raises InputError for any other layout."""
     arrays, _ = read_npz(path, (*_KEYS, "joint_names"), expected="an npz file of clips")
     missing_keys = [key for key in _KEYS if key not in arrays]
     if missing_keys:
@@ -200,7 +200,7 @@ def load_clips(path: str | PathLike) -> tuple[np.ndarray, tuple[str, ...], np.nd
             raise file_error(
                 path, f"{key} needs one whole number a clip, ({clip.size}), got {value.dtype} {value.shape}"
             )
-    # in narrow or unsigned numbers an end could overflow
+    # start + length could overflow in narrow or unsigned types
     start, length = start.astype(np.int64), length.astype(np.int64)
     if ((start < 0) | (length < 0) | (start > len(joints) - length)).any():
         expected = f"inside the {len(joints)} frames, got up to frame {(start + length).max()}"
@@ -217,8 +217,8 @@ def load_clips(path: str | PathLike) -> tuple[np.ndarray, tuple[str, ...], np.nd
 
 
 def standing_axis(trunk: np.ndarray) -> str | None:
-    """The axis, "-y" say, that people stand along whose trunks have these directions (F, 3) of length 1; None where
-    they do not stand."""
+    """The axis along which people stand, such as "-y", from the unit vectors (F, 3) of their trunks; None if they do
+    not stand."""
     mean = trunk.mean(0)
     axis = int(np.abs(mean).argmax())
     return None if abs(mean[axis]) <= _UPRIGHT else ("-" if mean[axis] < 0 else "") + "xyz"[axis]
@@ -232,20 +232,20 @@ def usable_clips(
     fps: float,
     number: np.ndarray | None = None,
 ) -> dict[str, Any]:
-    """Cuts clips at frames that cannot be used, so that no motion jumps over a gap.
+    """Cuts clips at unusable frames, so that no motion jumps over a gap.
 
     Args:
-        names, length: Of the clips, one after the other.
-        good: (F,) bool, frames that can be used.
-        fps: Frames a second of the recording.
-        number: (F,) the frames' numbers in the recording, by default without gaps.
+        names, length: Names and lengths of the clips, which follow each other.
+        good: (F,) bool, usable frames.
+        fps: Frames per second of the recording.
+        number: (F,) frame numbers in the recording, by default without gaps.
 
     Returns:
-        names, length, fps and dropped of the `Motion` of the good frames; a clip's pieces after the first are called
-        NAME#2 and so on.
+        names, length, fps and dropped of the `Motion` of the usable frames; the pieces of a clip after the first are
+        named NAME#2 and so on.
 
     Raises:
-        InputError: For no rate, without frames, or where too large a share of a clip cannot be used.
+        InputError: For an invalid frame rate, no frames, or a clip with too many unusable frames.
     """
     if not 0 < fps < np.inf:
         raise file_error(path, f"the frame rate must be above 0, got {fps}; give load_motion fps=")
@@ -270,6 +270,6 @@ def usable_clips(
 
 
 def _is_of(name: str, subject: str) -> bool:
-    """Whether a clip's name starts with a subject's. A number that goes on is another one: 102_03 is not of 10, nor
+    """Whether a clip's name starts with `subject`. A prefix of a longer number does not match: 102_03 is not of 10, nor
     10_01 of 1."""
     return name.startswith(subject) and not (subject[-1:].isdigit() and name[len(subject) :][:1].isdigit())

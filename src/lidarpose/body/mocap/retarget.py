@@ -1,7 +1,7 @@
 """Joint positions of any captured skeleton, in any unit -> motion of the body: rotations of its 24 bones.
 
-A body part's frame is built from positions alone, the same way in the source and in our rest pose: F (3, 3), columns
-its axes. The bone's global rotation is then G = F_source F_rest^-1, and its local one R = G_parent^-1 G.
+A body part's frame F (3, 3), columns its axes, is built from positions alone, in the same way for the source and the
+rest pose. The bone's global rotation is then G = F_source F_rest^-1, and its local one R = G_parent^-1 G.
 
 The rest pose of `rig`: T-pose, x forward, y left, z up; G_root = R_root, G_j = G_parent R_j,
 position_j = position_parent + G_parent (rest_j - rest_parent).
@@ -18,28 +18,28 @@ from lidarpose.geometry import axis_angle_to_matrix, rotation_between, rotation_
 from lidarpose.io.files import file_error
 from lidarpose.skeleton import SMPL24
 
-# bend (sine of the angle between the bones) under which a hinge's normal counts for nothing, and over which for all
+# bend (sine of the angle between the bones) below which a hinge's normal is ignored, and above which it has full weight
 _BEND_FADE = (0.10, 0.35)
-# how much more bend the other way round is taken for a joint stretched too far: a hip turns less than a shoulder
+# extra bend (sine) in the wrong direction that still counts as hyperextension; a hip rotates less than a shoulder
 _KNEE_OVERSTRETCH, _ELBOW_OVERSTRETCH = 0.25, 0.07
-# collars nearer to each other than this share of the shoulders' distance are taken for a single point
+# collars closer together than this fraction of the shoulder distance are treated as one point
 _LEAST_COLLAR_WIDTH = 0.15
-# bones under this have no direction, m
+# shorter bones have no usable direction, m
 _SHORTEST_BONE = 1e-4
 
-# how many meters a file's number is: meters, centimeters, millimeters, inches, and CMU's unit (inches / 0.45)
+# meters per unit of a file: meters, centimeters, millimeters, inches, and CMU's unit (inches / 0.45)
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "inch/0.45": 0.0254 / 0.45}
-# people are this much smaller or larger than the mean adult
+# limits of a person's size relative to the mean adult
 _SMALLEST, _LARGEST = 0.4, 1.45
-_TYPICAL = 0.85  # between children and tall adults: inches and centimeters must be told apart for both
-_UNEVEN = 2.0  # legs whose lengths are further apart than this were not measured in one unit
+_TYPICAL = 0.85  # between children and tall adults, to distinguish inches from centimeters for both
+_UNEVEN = 2.0  # a larger ratio of the leg lengths means that the legs are not in one unit
 _FASTEST = 50.0  # m/s
 _FARTHEST = 1e5  # m
 
 _ARM, _LEG = ("shoulder", "elbow", "wrist", "hand"), ("hip", "knee", "ankle", "foot")
 _J = {name: i for i, name in enumerate(SMPL24.joints)}
 _HIPS = [_J["left_hip"], _J["right_hip"]]
-# the lines whose directions the frames are made of
+# pairs of joints whose directions define the frames
 _LINES = [("spine3", "neck"), ("right_hip", "left_hip"), ("right_shoulder", "left_shoulder")]
 for _side in ("left", "right"):
     for _chain in (("collar", *_ARM), _LEG):
@@ -64,18 +64,18 @@ def motion_from_joints(
     kind: str,
     unit_m: float | None = None,
 ) -> Motion:
-    """The body's motion after joint positions. Its hips go where theirs are: where the pelvis lies above the hips
-    differs from skeleton to skeleton.
+    """The body's motion from joint positions. The middle of the hips is matched, not the pelvis: the pelvis's position
+    relative to the hips differs between skeletons.
 
     Args:
-        joints: (F, 24, 3) SMPL's joints in the file's unit and axes, NaN in frames without: these are left out, and
-            those with a bone of no length.
-        names, length: Of the clips, one after the other.
-        up: The axis that is up, by default the one along which people stand, y where they do not stand.
-        unit_m: Meters of a file's number, by default the unit that gives the person the most usual size.
+        joints: (F, 24, 3) SMPL's joints in the file's unit and axes, NaN in frames without joints. Such frames and
+            frames with a bone of zero length are dropped.
+        names, length: Names and lengths of the clips, which follow each other in `joints`.
+        up: The up axis, by default the axis along which people stand, or y if they do not stand.
+        unit_m: Meters per unit of the file, by default the unit that gives the most typical body size.
 
     Raises:
-        InputError: For sizes or speeds that people do not have, upside down, or with too many frames to leave out.
+        InputError: For implausible sizes or speeds, upside-down people, or too many unusable frames.
     """
     is_usable = np.isfinite(joints).all((1, 2))
     if not is_usable.any():
@@ -101,8 +101,8 @@ def motion_from_joints(
 
 
 def meters_per_unit(path: object, joints: np.ndarray, unit_m: float | None = None) -> float:
-    """Meters of a number of SMPL's joints (F, 24, 3): the unit that gives the person the most usual size, or `unit_m`.
-    Raises InputError where that is not a person's size, and for legs of different lengths."""
+    """Meters per unit of SMPL's joints (F, 24, 3): `unit_m`, or the unit that gives the most typical body size.
+    Raises InputError for implausible body sizes and for legs of different lengths."""
     left, right, trunk = (_median_length(joints, part) for part in ("left_", "right_", "trunk"))
     if not (np.isfinite([left, right, trunk]).all() and min(left, right, trunk) > 0):
         raise file_error(path, "the legs or the trunk have no length; expected the offsets of a person's bones")
@@ -137,9 +137,9 @@ def _up_axis(path: object, joints: np.ndarray) -> str:
 
 
 def _check_speed(path: object, joints: np.ndarray, length: np.ndarray, fps: float) -> None:
-    """Raises InputError where people, joints (F, 24, 3) m of clips of `length` (C,) frames, are faster than any."""
+    """Raises InputError for an implausible median speed of joints (F, 24, 3) m in clips of `length` (C,) frames."""
     steps = np.linalg.norm(np.diff(joints[:, _J["pelvis"]], axis=0), axis=-1) * fps
-    # from the end of a clip to the next is no step
+    # drop the steps between clips
     steps = np.delete(steps, np.cumsum(length)[:-1] - 1)
     if len(steps) and np.median(steps) > _FASTEST:
         raise file_error(
@@ -150,11 +150,11 @@ def _check_speed(path: object, joints: np.ndarray, length: np.ndarray, fps: floa
 def retarget_positions(joints: np.ndarray) -> np.ndarray:
     """Local rotations that give the mean adult the pose of captured joints.
 
-    The heading of the source stays in the root (`without_yaw` removes it). The twist of the head about the neck and of
-    a straight limb cannot be seen in positions: they follow the parent (a straight leg follows its foot).
+    The source's heading stays in the root (`without_yaw` removes it). Positions do not determine the twist of the head
+    about the neck or of a straight limb: these follow the parent, except that a straight leg follows its foot.
 
     Args:
-        joints: (n, 24, 3) m, SMPL's joints in SMPL's order, z up, any facing and any bone lengths above 0, finite.
+        joints: (n, 24, 3) m, SMPL's joints in SMPL's order, z up, finite, any heading, any bone lengths above 0.
 
     Returns:
         (n, 24, 3, 3) float32, in the rest frame of `body.rig`.
@@ -168,7 +168,7 @@ def retarget_positions(joints: np.ndarray) -> np.ndarray:
         global_rotations[:, _J[name]] = rotation
     pelvis, torso = trunk[0], trunk[3]
 
-    shoulders = np.zeros((len(joints), 3))  # ours, their middle seen from spine3
+    shoulders = np.zeros((len(joints), 3))  # middle of the body's own shoulders, relative to spine3
     for side, sign in (("left", 1.0), ("right", -1.0)):
         collar = _swing(torso, f"{side}_collar", f"{side}_shoulder", joints, rest_joints)
         # elbows bend about -z (left) or +z (right) at rest, knees about +y
@@ -188,7 +188,7 @@ def retarget_positions(joints: np.ndarray) -> np.ndarray:
 
 
 def _shortest_bone(joints: np.ndarray) -> np.ndarray:
-    """Of joints (n, 24, 3): the length (n,) m of the shortest line that retargeting needs."""
+    """Length (n,) m of the shortest bone that retargeting needs, for joints (n, 24, 3)."""
     return np.min([np.linalg.norm(_bone(joints, a, b), axis=-1) for a, b in _LINES], axis=0)
 
 
@@ -197,7 +197,7 @@ def _bone(joints: np.ndarray, start: str, end: str) -> np.ndarray:
 
 
 def _frame(axis: np.ndarray, hint: np.ndarray) -> np.ndarray:
-    """Axes (n, 3, 3), columns: `axis`, the part of `hint` across it, their cross product."""
+    """Frames (n, 3, 3), columns: `axis`, the component of `hint` perpendicular to it, and their cross product."""
     first_axis = unit(axis)
     second_axis = unit(hint - (hint * first_axis).sum(-1, keepdims=True) * first_axis)
     return np.stack([first_axis, second_axis, np.cross(first_axis, second_axis)], -1)
@@ -217,11 +217,11 @@ def _carried(rotation: np.ndarray, offset: np.ndarray) -> np.ndarray:
 
 
 def _trunk(joints: np.ndarray, rest_joints: np.ndarray) -> list[np.ndarray]:
-    """Global rotations of pelvis and spine1-3: the bend is shared evenly, the line hips -> neck is the source's."""
+    """Global rotations of pelvis and spine1-3: the bend is distributed evenly, hips -> neck points as in the source."""
     pelvis, torso = (frame(joints) @ np.swapaxes(frame(rest_joints), -1, -2) for frame in (_pelvis_frame, _torso_frame))
     bend = rotation_vector(np.swapaxes(pelvis, -1, -2) @ torso)
     rotations = [pelvis, *(pelvis @ axis_angle_to_matrix(share * bend) for share in (1 / 3, 2 / 3)), torso]
-    # spines are curved and cut differently in every skeleton, the line from the hips to the neck is not
+    # skeletons differ in the curvature and joints of the spine, but not in the line from the hips to the neck
     hips_to_neck = _carried(pelvis, rest_joints[:, _J["spine1"]] - _middle(rest_joints, "hip"))
     for rotation, start, end in zip(
         rotations[1:], ("spine1", "spine2", "spine3"), ("spine2", "spine3", "neck"), strict=True
@@ -232,9 +232,9 @@ def _trunk(joints: np.ndarray, rest_joints: np.ndarray) -> list[np.ndarray]:
 
 
 def _head(torso: np.ndarray, shoulders: np.ndarray, joints: np.ndarray, rest_joints: np.ndarray) -> np.ndarray:
-    """The neck's global rotation: the head in the source's direction from the middle of the shoulders.
+    """Global rotation of the neck that puts the head in the source's direction from the middle of the shoulders.
 
-    The bone neck -> head is too short and too differently cut for its own direction to be of use.
+    The bone neck -> head is too short, and its ends differ too much between skeletons, for its direction to be usable.
     """
     head_distance = np.linalg.norm(rest_joints[:, _J["head"]] - _middle(rest_joints, "shoulder"))
     head = shoulders + head_distance * unit(joints[:, _J["head"]] - _middle(joints, "shoulder"))
@@ -249,32 +249,32 @@ def _pelvis_frame(joints: np.ndarray) -> np.ndarray:
 def _torso_frame(joints: np.ndarray) -> np.ndarray:
     shoulders, collars = (_bone(joints, f"right_{name}", f"left_{name}") for name in ("shoulder", "collar"))
     width_ratio = np.linalg.norm(collars, axis=-1, keepdims=True) / np.linalg.norm(shoulders, axis=-1, keepdims=True)
-    # the collars are rigid with the chest and the shoulders are not, but some skeletons put both collars in one point
+    # the collars are rigid with the chest, the shoulders are not; but some skeletons have both collars at one point
     lateral_axis = np.where(width_ratio > _LEAST_COLLAR_WIDTH, collars, shoulders)
     up = _bone(joints, "spine3", "neck")
     return _frame(up, lateral_axis)
 
 
 def _swing(parent: np.ndarray, start: str, end: str, joints: np.ndarray, rest_joints: np.ndarray) -> np.ndarray:
-    """The parent's rotation (n, 3, 3) plus the smallest turn that gives the bone start -> end its direction."""
+    """The parent's rotation (n, 3, 3) and then the smallest one that gives the bone start -> end its direction."""
     return rotation_between(_carried(parent, _bone(rest_joints, start, end)), _bone(joints, start, end)) @ parent
 
 
 def _hinge(upper: np.ndarray, lower: np.ndarray, straight_axis: np.ndarray, overstretch: float) -> np.ndarray:
-    """The axis (n, 3) about which `lower` is bent from `upper`, `straight_axis` where the joint is straight.
+    """The axis (n, 3) about which `lower` is bent from `upper`; `straight_axis` if the joint is straight.
 
-    A small bend the other way round than `straight_axis` is a joint stretched too far; a larger one, over
-    `overstretch` (a sine) more, is a limb that is rotated that far. In between the axis changes without a jump.
+    A small bend against the direction of `straight_axis` is hyperextension. If it is larger by more than `overstretch`
+    (a sine), the limb is really rotated that far. In between, the axis changes continuously.
     """
     upper, lower, straight_axis = unit(upper), unit(lower), unit(straight_axis)
     normal = np.cross(upper, lower)
-    # the sine falls again beyond a right angle, where the bend is as plain as can be
+    # beyond a right angle the sine decreases although the bend is unambiguous: use 1
     bend_sine = np.where((upper * lower).sum(-1) > 0, np.linalg.norm(normal, axis=-1), 1.0)[:, None]
     normal = unit(normal)
     opposition = np.clip(-(normal * straight_axis).sum(-1, keepdims=True), 0, 1)
     low, high = _BEND_FADE
     weight = np.clip((bend_sine - low - overstretch * opposition) / (high - low), 0, 1)
-    # evenly from one to the other; where they are opposite, about the limb
+    # interpolate evenly between the two axes; if they are opposite, rotate about the upper bone
     rotation_axis = np.cross(straight_axis, normal)
     sine = np.linalg.norm(rotation_axis, axis=-1, keepdims=True)
     angle = np.arctan2(sine, (straight_axis * normal).sum(-1, keepdims=True))
@@ -290,14 +290,14 @@ def _limb(
     joints: np.ndarray,
     rest_joints: np.ndarray,
 ) -> tuple[np.ndarray, ...]:
-    """Global rotations of a limb's four joints, named; the last goes with the one before. parent (n, 3, 3): of what it
-    hangs on; hinge (3,): the axis that its second joint bends about at rest; overstretch: see `_hinge`."""
+    """Global rotations of a limb's four joints `names`; the last equals the third. parent (n, 3, 3): rotation of the
+    limb's parent; hinge (3,): bend axis of the second joint at rest; overstretch: see `_hinge`."""
     bones, rest_bones = (
         [_bone(j, a, b) for a, b in zip(names[:-1], names[1:], strict=True)] for j in (joints, rest_joints)
     )
     straight_axis = _swing(parent, names[0], names[1], joints, rest_joints) @ hinge
     if names[0].endswith("hip"):
-        # where the leg is straight its foot says about what; short where the foot is stretched along the shank
+        # the foot gives the axis of a straight leg; the product is short if the foot points along the shank
         straight_axis = straight_axis + 2 * np.cross(unit(bones[2]), unit(bones[1]))
     axis = _hinge(bones[0], bones[1], straight_axis, overstretch)
     upper, lower = (_turn(bones[k], axis, rest_bones[k], hinge[None]) for k in (0, 1))

@@ -1,13 +1,14 @@
-"""Text files of captured skeletons: BVH, and Acclaim's ASF (the skeleton) with AMC (its motion), as CMU's database has.
+"""Text files of captured skeletons: BVH, and Acclaim's ASF (skeleton) with AMC (motion), as in CMU's database.
 
-BVH is a tree of joints with offsets and channels, then a line of numbers a frame. A joint's rotation is the product of
-its rotation channels in the order they are listed, in degrees; channels of position stand in for its offset. Units, the
-up axis and the rest pose are not in the file: see `joint_tree`.
+A BVH file has a tree of joints with offsets and channels, then one line of numbers per frame. A joint's rotation is the
+product of its rotation channels in the listed order, in degrees; position channels replace its offset. The file does
+not give the unit, the up axis or the rest pose: see `joint_tree`.
 Source: the format as published with Biovision's motion data (Meredith and Maddock 2001).
 
-A bone of ASF turns about its own axes: with A the rotation of its `axis` and M that of its numbers, both R_z R_y R_x
-where the order is XYZ, its local rotation is A M A^-1; it goes from its parent's end, along its `direction` as turned
-by its global rotation, for its `length`. Lengths are inches / 0.45 where `length` is 0.45, y is up.
+An ASF bone rotates about its own axes: with A the rotation of its `axis` and M that of its channels, both R_z R_y R_x
+for the order XYZ, its local rotation is A M A^-1. The bone starts at its parent's end and extends by its `length` along
+its `direction`, rotated by its global rotation. A unit is 1 / L inches, where L is `length` of :units (0.45 in CMU's
+files); y is up.
 Source: the format's description and CMU's database (mocap.cs.cmu.edu), its page on units.
 """
 
@@ -26,10 +27,10 @@ _BVH_CHANNELS = {
     f"{axis}{kind}": kind[0].replace("p", "t") + axis for axis in "xyz" for kind in ("position", "rotation")
 }
 _ASF_CHANNELS = ("tx", "ty", "tz", "rx", "ry", "rz")
-# frames a second of CMU's database; an AMC file does not say its own
+# frames per second of CMU's database; an AMC file does not give its rate
 CMU_FPS = 120.0
 _INCH = 0.0254
-# SMPL's joints are at the ends of these bones; sides are filled in
+# SMPL's joints and the bones at whose ends they are
 _BONES = {"pelvis": "root", "neck": "thorax", "head": "upperneck"} | {
     f"{side}_{joint}": side[0] + bone
     for side in ("left", "right")
@@ -42,7 +43,7 @@ _OPTIONAL = ("left_foot", "right_foot", "left_hand", "right_hand", "neck")
 
 
 def load_bvh(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
-    """The motion of a BVH file as one clip, named as the file. up: by default the axis people stand along."""
+    """The motion of a BVH file as one clip, named after the file. up: by default the axis along which people stand."""
     tree, values, rate = read_bvh(path)
     rate = fps or rate
     if rate is None:
@@ -51,10 +52,10 @@ def load_bvh(path: str | os.PathLike, *, up: str | None = None, fps: float | Non
 
 
 def load_amc(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
-    """The motion of an AMC file as one clip, named as the file.
+    """The motion of an AMC file as one clip, named after the file.
 
-    Its skeleton is the ASF file of the same name, of the name up to the last `_` (02.asf for 02_01.amc), or the only
-    one in the folder. fps: by default CMU's 120; up: by default y.
+    Its skeleton is the ASF file with the same name or with the name up to its last or first `_` (02.asf for 02_01.amc),
+    else the only ASF file in the folder. fps: by default CMU's 120; up: by default y.
     """
     tree, values, unit_m = read_amc(path)
     indices = {joint: tree.names.index(bone) for joint, bone in _BONES.items() if bone in tree.names}
@@ -62,7 +63,7 @@ def load_amc(path: str | os.PathLike, *, up: str | None = None, fps: float | Non
 
 
 def _numbers(path: object, what: str, words: Sequence[str], count: int | None = None) -> np.ndarray:
-    """Words of a text file as floats, finite ones where a count is given. Raises InputError naming `what`."""
+    """Words of a text file as floats; with `count`, that many finite ones. Raises an InputError that names `what`."""
     try:
         numbers = np.array(words, float)
     except ValueError:
@@ -81,7 +82,7 @@ def _read_text(path: str | os.PathLike, expected: str) -> str:
 
 
 def read_bvh(path: str | os.PathLike) -> tuple[JointTree, np.ndarray, float | None]:
-    """The joints of a BVH file, its frames of channels (F, C), and frames a second where it says. Raises InputError."""
+    """Joints of a BVH file, frames of channels (F, C), and frames per second, None if not given. Raises InputError."""
     text = _read_text(path, "a BVH file").replace("{", "\n{\n").replace("}", "\n}\n")
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     if not lines or lines[0].upper() != "HIERARCHY":
@@ -141,7 +142,7 @@ def _bvh_channels(path: object, name: str, words: list[str]) -> list[str]:
 
 
 def _bvh_frames(path: object, lines: list[str], channel_count: int) -> tuple[np.ndarray, float | None]:
-    """The values (F, channel_count), and frames a second or None."""
+    """Values (F, channel_count), and frames per second or None."""
     header = {key.strip().lower(): value for key, _, value in (line.partition(":") for line in lines[:2])}
     if list(header) != ["frames", "frame time"]:
         raise file_error(path, "MOTION must begin with Frames: and Frame Time:; was it copied completely?")
@@ -155,7 +156,7 @@ def _bvh_frames(path: object, lines: list[str], channel_count: int) -> tuple[np.
     if len(values) != int(header["frames"]) * channel_count:
         expected = f"{header['frames'].strip()[:20]} frames of {channel_count} numbers"
         raise file_error(path, f"expected {expected}, got {len(values)} numbers; was it copied completely?")
-    # a frame time of almost nothing would be an infinite rate
+    # a frame time near 0 would give an infinite rate
     return values.reshape(-1, channel_count), 1 / seconds if 1e-6 < seconds < np.inf else None
 
 
@@ -163,8 +164,8 @@ def _bvh_frames(path: object, lines: list[str], channel_count: int) -> tuple[np.
 
 
 def read_amc(path: str | os.PathLike) -> tuple[JointTree, np.ndarray, float]:
-    """The bones' ends as joints, of an AMC file and its ASF file, the frames of channels (F, C) of those that move,
-    and meters of a number. Raises InputError."""
+    """Reads an AMC file and its ASF file: the bones' ends as joints, frames of channels (F, C) of the bones that move,
+    and meters per unit. Raises InputError."""
     path = Path(path)
     values = _amc_frames(path)
     skeleton = _skeleton_of(path)
@@ -204,7 +205,7 @@ def _words_of_lines(path: Path, expected: str) -> list[list[str]]:
 
 
 def read_asf(path: Path) -> tuple[JointTree, float]:
-    """The bones of an ASF file, the root first, as joints at their ends, and meters of a number. Raises InputError."""
+    """Bones of an ASF file as joints at their ends, the root first, and meters per unit. Raises InputError."""
     sections: dict[str, list[list[str]]] = {}
     section: list[list[str]] = []
     for words in _words_of_lines(path, "an ASF file"):
@@ -245,7 +246,7 @@ def _root(path: Path, properties: dict[str, list[str]], degrees: bool) -> Joint:
 
 
 def _bone_data(path: Path, lines: list[list[str]]) -> list[tuple[str, dict[str, list[str]]]]:
-    """The bones' names and what is stored of each, the first of every keyword."""
+    """Names and properties of the bones; the first occurrence of a keyword counts."""
     bones: list[tuple[str, dict[str, list[str]]]] = []
     properties: dict[str, list[str]] | None = None
     for key, *words in lines:
@@ -284,7 +285,7 @@ def _bone(path: Path, name: str, properties: dict[str, list[str]], degrees: bool
 
 
 def _rotation(path: Path, name: str, words: list[str], degrees: bool) -> np.ndarray:
-    """(3, 3) of three angles and their order, by default XYZ: about x first."""
+    """Rotation matrix (3, 3) from three angles and their order, by default XYZ (about x first)."""
     order = words[3].lower() if len(words) > 3 else "xyz"
     if sorted(order) != ["x", "y", "z"]:
         raise file_error(path, f"axis of {name} must have an order such as XYZ, got {order[:40]!r}")
@@ -296,7 +297,7 @@ def _rotation(path: Path, name: str, words: list[str], degrees: bool) -> np.ndar
 
 
 def _in_tree_order(path: Path, lines: list[list[str]], bones: dict[str, Joint]) -> list[Joint]:
-    """The bones with their parents, which come before their children."""
+    """The bones with their parents set, parents before children."""
     parent_of: dict[str, str] = {}
     for parent, *children in lines:
         if parent.lower() in ("begin", "end") and not children:
@@ -321,7 +322,7 @@ def _in_tree_order(path: Path, lines: list[list[str]], bones: dict[str, Joint]) 
 
 
 def _amc_frames(path: Path) -> dict[str, np.ndarray]:
-    """Of each bone that moves: its numbers (F, n)."""
+    """Channel values (F, n) of each bone that moves."""
     frames: list[dict[str, list[str]]] = []
     for words in _words_of_lines(path, "an AMC file"):
         if words[0].startswith(":"):

@@ -1,26 +1,26 @@
 """SMPL's axis-angle poses on the shipped body, without SMPL: AMASS, SLOPER4D, LiDARHuman26M.
 
-Both bodies have the same 24 joints and rest in a T-pose; SMPL's faces +z with y up and its left along +x. With C the
-change of axes from SMPL's rest pose to the level frame's, and W from the recording's world to the level frame,
+Both bodies have the same 24 joints and a T-pose at rest; SMPL's faces +z with y up and its left along +x. With C the
+rotation from SMPL's rest frame to the level frame, and W from the recording's world to the level frame,
 
     R_level[j] = C R_smpl[j] C^-1        R_level[root] = W R_smpl[root] C^-1
 
-SMPL's pelvis is at `trans` plus its rest position, which only SMPL's own file knows: a constant of the person, about
-0.24 m along the recording's y axis, is missing from `Motion.translation`. Shapes, fingers and faces are not used.
+SMPL's pelvis is at `trans` plus its rest position, which only SMPL's own model file defines. `Motion.translation` lacks
+this offset, a constant per person of about 0.24 m along the recording's y axis. Shapes, fingers and faces are not used.
 
 AMASS: npz of `poses` (N, 156 or 165; 66 and 72 are read too) or `root_orient` (N, 3) and `pose_body` (N, 63), rad;
-`trans` (N, 3) m; `mocap_framerate` or `mocap_frame_rate`; z up. Source: Mahmood et al. 2019, the README on the layout.
+`trans` (N, 3) m; `mocap_framerate` or `mocap_frame_rate`; z up. Source: Mahmood et al. 2019, README for the layout.
 
-SLOPER4D: <sequence>_labels.pkl of `framerate`, and for `first_person` and `second_person` `pose` (n, 72) rad and
-`trans` (n, 3) m, world, z up; the refined `opt_pose` and `opt_trans` where there are any. Source: Dai et al. 2023,
-the published loader.
+SLOPER4D: <sequence>_labels.pkl with `framerate`, and for `first_person` and `second_person` `pose` (n, 72) rad and
+`trans` (n, 3) m, world, z up; the refined `opt_pose` and `opt_trans` are preferred. Source: Dai et al. 2023, the
+published loader.
 
-LiDARHuman26M: a folder of one JSON file a frame, labels/3d/pose/<sequence>/<frame>.json, with `pose` (72) rad and
+LiDARHuman26M: a folder with one JSON file per frame, labels/3d/pose/<sequence>/<frame>.json, with `pose` (72) rad and
 `trans` (3) m in the sensor's frame. Source: LiDARCap, Li et al. 2022, the data set's page and published loaders.
 
-LIPD, FreeMotion, NoiseMotion: pickles of a list of dicts as in `data.readers.corpora`, of which `gt` (72 or (3, 72)
-rad, the middle one) and `T_1` or `trans` (3) m are taken, or LIPD's `gt_joint` (24, 3) m where there are no poses.
-All entries of one `motion_id` or `seq_path`, in their order, are a clip.
+LIPD, FreeMotion, NoiseMotion: pickles of a list of dicts as in `data.readers.corpora`, with `gt` (72 or (3, 72) rad,
+the middle one is used) and `T_1` or `trans` (3) m, or LIPD's `gt_joint` (24, 3) m if there are no poses. All entries
+with the same `seq_path` or `motion_id`, in order, form a clip.
 """
 
 import os
@@ -38,18 +38,18 @@ from lidarpose.io.npz import read_npz
 from lidarpose.io.pickles import load_pickle
 
 _R_LEVEL_SMPL = UP_AXES["y"]
-# rotations beyond this are degrees, rad
+# larger rotations mean that the unit is degrees, rad
 _MOST_TURN = 4 * np.pi
-# farthest position from the origin of a recording, m
+# largest distance of a position from the recording's origin, m
 _FARTHEST = 1e5
 
 _RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
-_BODY = 66  # the root and SMPL's 21 joints of the body, 3 numbers each; SMPL has two hands more, the others fingers
+_BODY = 66  # the root and 21 body joints, 3 numbers each; then SMPL has two hands, the others fingers
 _SMPL = 72
 _PEOPLE = ("first_person", "second_person")
-# shape coefficients of the files
+# number of shape coefficients that are read
 _BETAS = 10
-# frames a second of the LiDAR that LiDARHuman26M's labels belong to
+# frames per second of the LiDAR of LiDARHuman26M's labels
 LIDARHUMAN26M_FPS = 10.0
 _POSE_FILE = "a JSON file with pose and trans"
 
@@ -69,12 +69,12 @@ def motion_from_smpl(
 
     Args:
         pose: (F, 72) axis-angles, rad, the root first.
-        trans: (F, 3) m, in a world whose axis `up` is upwards, by default z.
-        number: (F,) the frames' numbers in the recording, by default without gaps.
+        trans: (F, 3) m, in a world with the up axis `up`, by default z.
+        number: (F,) frame numbers in the recording, by default without gaps.
 
     Raises:
-        InputError: For other shapes, degrees, far-off positions and, unless `up` is given, where people do not stand
-            along z: those whose `up` is given may lie.
+        InputError: For other shapes, angles in degrees, positions too far from the origin and, unless `up` is given,
+            people upright along another axis than z. Give `up` for recordings of lying people.
     """
     R_level_world = rotation_from_up(up or "z")
     try:
@@ -111,7 +111,7 @@ def motion_from_smpl(
 
 
 def load_amass(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
-    """The motion of an AMASS file as one clip, named as the file."""
+    """The motion of an AMASS file as one clip, named after the file."""
     arrays, names = read_npz(
         path, ("poses", "root_orient", "pose_body", "trans", *_RATES), expected="an npz file of motion"
     )
@@ -140,7 +140,7 @@ def load_amass(path: str | os.PathLike, *, up: str | None = None, fps: float | N
 
 
 def _load_sloper4d(path: str | os.PathLike, labels: Any, up: str | None, fps: float | None) -> Motion:
-    """The motion of SLOPER4D's labels: a clip for each person that has poses, NAME_first and NAME_second."""
+    """The motion of SLOPER4D's labels: one clip for each person with poses, NAME_first and NAME_second."""
     if not isinstance(labels, dict):
         raise file_error(path, f"expected SLOPER4D's labels, a dict, got {type(labels).__name__}")
     motions = []
@@ -164,8 +164,8 @@ def load_pkl(path: str | os.PathLike, *, up: str | None = None, fps: float | Non
 
 
 def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: float | None) -> Motion:
-    """A clip for each sequence of a corpus's entries; those of another form are left out where some are left, and
-    joints where some are poses."""
+    """One clip for each sequence of a corpus's entries. Malformed entries are skipped, and entries with only joints if
+    any entry has a pose. Raises InputError if no entry remains."""
     clips: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     entries = [entry for entry in entries if isinstance(entry, dict)]
     key = "gt" if any(entry.get("gt") is not None for entry in entries) else "gt_joint"
@@ -175,7 +175,7 @@ def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: fl
             pose = np.asarray(entry[key], float)
             position = next((entry[name] for name in ("T_1", "trans") if entry.get(name) is not None), np.zeros(3))
             trans = np.asarray(position, float).reshape(3)
-            # of NoiseMotion's three the middle one, as its reader
+            # the middle one of NoiseMotion's three poses, as in its reader
             pose = pose.reshape(-1, _SMPL)[pose.size // _SMPL // 2]
         except (KeyError, TypeError, ValueError, OverflowError, IndexError):
             continue
@@ -187,7 +187,7 @@ def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: fl
     if key == "gt_joint":
         joints = poses.reshape(-1, 24, 3) + positions[:, None]
         return motion_from_joints(path, joints, list(clips), length, fps=rate, up=up, kind="LIPD", unit_m=1.0)
-    # their loaders do not say which axis is up
+    # the published loaders do not define the up axis
     up = up or standing_axis(axis_angle_to_matrix(poses[:, :3])[..., 1]) or "z"
     ends = np.cumsum(length)
     motions = [
@@ -198,8 +198,8 @@ def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: fl
 
 
 def load_betas(path: str | os.PathLike) -> np.ndarray:
-    """The shapes (n, 10) of the people of motion, each once: `beta` of LiDARHuman26M's files and SLOPER4D's labels,
-    `betas` of AMASS's. Of a folder all that are in it and its folders; none of motion without shapes."""
+    """The distinct body shapes (n, 10) in a motion file, or in all files of a folder and its subfolders: `beta` of
+    LiDARHuman26M's files and SLOPER4D's labels, `betas` of AMASS files. n is 0 if there are no shapes."""
     path = Path(path)
     files = sorted(path.rglob("*")) if path.is_dir() else [path]
     rows: list[np.ndarray] = []
@@ -216,7 +216,7 @@ def load_betas(path: str | os.PathLike) -> np.ndarray:
 
 
 def _first_betas(value: object) -> np.ndarray:
-    """(1, 10) of anything with ten numbers or more, (0, 10) of anything else."""
+    """The first ten numbers of `value` (1, 10); (0, 10) if it does not have ten finite numbers."""
     try:
         betas = np.asarray(value, float).ravel()[:_BETAS]
     except (TypeError, ValueError):
@@ -232,13 +232,13 @@ def _frame_rate(path: object, rate: object, key: str) -> float:
 
 
 def pose_files(folder: Path) -> list[Path]:
-    """The JSON files of a folder that are numbered as frames are, in the order of their numbers."""
+    """The JSON files of a folder whose names are frame numbers, in the order of the numbers."""
     return sorted((p for p in folder.glob("*.json") if FRAME_NUMBER.fullmatch(p.stem)), key=lambda p: int(p.stem))
 
 
 def load_lidarhuman26m(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
-    """The motion of a folder of numbered pose files, or of a single file; z is up unless `up` says otherwise. A number
-    that is missing ends a clip."""
+    """The motion of a folder of numbered pose files, or of a single file; z is up unless `up` says otherwise. A missing
+    number ends a clip."""
     path = Path(path)
     files = pose_files(path) if path.is_dir() else [path]
     poses, trans = zip(*(_read_pose_file(file) for file in files), strict=True)

@@ -1,5 +1,5 @@
-"""The pose prior's tables as arrays, from assets/pose_prior.toml, which documents them; and the 27 angles of a pose
-(`ANGLES`) as rotations of the body's 24 bones.
+"""The pose prior's tables as arrays, from assets/pose_prior.toml, which documents them; and the conversion of a pose's
+27 angles (`ANGLES`) to rotations of the body's 24 bones.
 
 K kinds of activity, A kinds of arm. All angles are degrees.
 """
@@ -22,7 +22,7 @@ ANGLES = (*_TRUNK, *(f"{side}_{name}" for part in (_LEG, ARM_ANGLES) for side in
 ANGLE_INDEX = {name: i for i, name in enumerate(ANGLES)}
 # the same names without sides
 _PLAIN = [name.removeprefix("left_").removeprefix("right_") for name in ANGLES]
-# least and most, (2, 27)
+# minimum and maximum, (2, 27)
 LIMITS = np.array([TABLES["angles"][name]["limits"] for name in _PLAIN], float).T
 
 KINDS = tuple(TABLES["activities"])
@@ -44,29 +44,29 @@ def _arm_odds(activity: dict) -> list[float]:
 # shares of the default mix (K,)
 SHARES = np.array([activity.get("share", 0.0) for activity in _ACTIVITIES])
 SHARES = SHARES / sum(activity.get("share", 0.0) for activity in _ACTIVITIES)
-# weights of the unusual kinds among themselves (K,)
+# relative weights of the unusual kinds (K,)
 UNUSUAL = np.array([activity.get("unusual", 0.0) for activity in _ACTIVITIES])
 # start, end and spread of each kind's angles, (3, K, 27)
 KIND_RANGES = np.array([[_angle(a, *names) for names in zip(ANGLES, _PLAIN, strict=True)] for a in _ACTIVITIES], float)
 KIND_RANGES = np.ascontiguousarray(np.moveaxis(KIND_RANGES, -1, 0))
-# feet follow the floor, thighs are from the vertical: shares, (K,)
+# to what degree feet are relative to the floor, and thighs relative to the vertical, in [0, 1], (K,)
 FLAT_FOOT = np.array([activity.get("flat_foot", 1.0) for activity in _ACTIVITIES])
 UPRIGHT = np.array([activity.get("upright", 1.0) for activity in _ACTIVITIES])
-# how often a kind's poses pass through themselves, or do not rest on what they should (K,)
+# fraction of a kind's poses that intersect themselves or do not rest on their supporting parts (K,)
 SELF_COLLISION = np.array([activity.get("self_collision", 0.01) for activity in _ACTIVITIES])
-# chances of the kinds of arm in each kind of activity, (K, A)
+# probabilities of the kinds of arm in each kind of activity, (K, A)
 ARM_ODDS = np.array([_arm_odds(activity) for activity in _ACTIVITIES])
 ARM_ODDS /= ARM_ODDS.sum(1, keepdims=True)
 # start, end and spread of ARM_ANGLES of each kind of arm, (3, A, 4)
 ARM_RANGES = np.array([[arm[name] for arm in _ARMS] for name in ("start", "end", "spread")], float)
-# how fast people go to and fro between the ends of their range, rad/s, (K,) and (A,)
+# angular frequency of the swing between the two ends of the range, rad/s, (K,) and (A,)
 KIND_PACE = np.array([activity.get("pace", 0.0) for activity in _ACTIVITIES])
 ARM_PACE = np.array([arm.get("pace", 0.0) for arm in _ARMS])
 
 _J = {name: i for i, name in enumerate(SMPL24.joints)}
 _SIDES = (("left", 1.0), ("right", -1.0))
 
-# scapulohumeral rhythm: over 45 degrees of elevation the collar takes part of the arm's angle
+# scapulohumeral rhythm: above 45 degrees of elevation the collar takes part of the arm's angle
 _COLLAR_FROM, _COLLAR_SHARE = 45.0, 0.15
 _SHOULDERS = np.array([_J["left_shoulder"], _J["right_shoulder"]])
 _COLLAR_LIFTS = 3 * np.array([_J["left_collar"], _J["right_collar"]]) + 1
@@ -76,13 +76,13 @@ _INWARD = np.array([ANGLE_INDEX[f"{side}_in"] for side, _ in _SIDES])
 
 
 def unusual_mix(share: float) -> dict[str, float] | None:
-    """The default mix but for a `share` in [0, 1] of people in unusual poses; None where there are none."""
+    """The default mix with a `share` in [0, 1] of people in unusual poses; None if the share is 0."""
     weights = (1 - share) * SHARES + share * UNUSUAL / UNUSUAL.sum()
     return dict(zip(KINDS, weights.tolist(), strict=True)) if share else None
 
 
 def rotations_from_angles(angles: np.ndarray) -> np.ndarray:
-    """angles (n, 27) degrees in the order of `ANGLES` -> local rotations (n, 24, 3, 3) float32."""
+    """angles (n, 27) degrees, in the order of `ANGLES` -> local rotations (n, 24, 3, 3) float32."""
     angles = np.asarray(angles, np.float32)
     euler = angles @ EULER_FROM_ANGLES + _AT_ZERO
     euler[:, _COLLAR_LIFTS] += _LIFT_SIGNS * collar_lift(angles[:, _RAISED_OUT])
@@ -113,7 +113,7 @@ def shoulder_matrix(arm: np.ndarray, sign: float) -> np.ndarray:
 
 
 def collar_lift(arm: np.ndarray) -> np.ndarray:
-    """The collar's turn (...) degrees upwards, for an arm's raise and out (..., 2) degrees."""
+    """Upward rotation (...) degrees of the collar, for an arm's raise and out (..., 2) degrees."""
     elevation = np.degrees(np.arccos(np.clip(np.cos(np.radians(arm)).prod(-1), -1, 1)))
     return _COLLAR_SHARE * np.clip(elevation - _COLLAR_FROM, 0, None)
 
@@ -139,7 +139,7 @@ def _euler_map() -> tuple[np.ndarray, np.ndarray]:
     """The linear map from `ANGLES` to 24 x (y, x, z) Euler angles, (27, 72), and its value at zero (72,), degrees."""
     matrix, zero = np.zeros((len(ANGLES), 24, 3), np.float32), np.zeros((24, 3), np.float32)
     y, x, z = 0, 1, 2
-    # the joints that share angles about y, x and z, evenly
+    # angles about y, x and z, and the joints over which they are distributed evenly
     joints_by_angles = {
         ("tilt", "roll", "yaw"): ("pelvis",),
         ("bend", "side", "twist"): ("spine1", "spine2", "spine3"),
@@ -174,5 +174,5 @@ _MIRROR_INDEX, _MIRROR_SIGN = _mirror()
 
 
 def mirror_angles(angles: np.ndarray) -> np.ndarray:
-    """Left and right exchanged. angles (n, 27) -> (n, 27)."""
+    """Swaps left and right: angles (n, 27) -> (n, 27)."""
     return angles[:, _MIRROR_INDEX] * _MIRROR_SIGN

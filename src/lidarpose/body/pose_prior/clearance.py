@@ -1,7 +1,8 @@
-"""Limbs outside the body that they belong to: motion of other people knows nothing of a body's girth.
+"""Moves limbs out of their own body: motion recorded from other people does not account for a body's girth.
 
-The body is capsules, as in `constraints`: trunk, head and thighs measured on each person's mesh and clothes, forearms,
-hands and shanks about their bones. Arms turn at shoulder and elbow, legs at the hip, as little as it takes.
+The body is modeled by capsules, as in `constraints`: trunk, head and thighs are measured on each person's mesh and
+clothes; forearms, hands and shanks are placed about their bones. Arms turn at shoulder and elbow, legs at the hip, by
+the smallest necessary angle.
 
 n people, F frames, C capsules. Meters; local rotations as in `rig`.
 """
@@ -18,15 +19,15 @@ from lidarpose.skeleton import SMPL24
 _J = {name: i for i, name in enumerate(SMPL24.joints)}
 _PARENTS = np.maximum(SMPL24.parents, 0)
 _SIDES = ("left", "right")
-# what limbs may not be in: the joint that carries a capsule, the axis along it (the trunk is cut across), and between
-# which heights it is measured, m above the joint of the mean person
+# obstacles of the limbs: the joint that carries a capsule, the capsule's axis (1: y, across the trunk; 2: z), and the
+# range of heights in which it is measured, m above the joint on the mean person
 _SOLID = [
     ("pelvis", 1, -0.125, -0.055), ("pelvis", 1, -0.055, 0.015), ("spine1", 1, -0.075, -0.005),
     ("spine1", 1, 0.005, 0.075), ("spine2", 1, -0.045, 0.025), ("spine3", 1, -0.005, 0.065),
     ("spine3", 1, 0.055, 0.125), ("head", 2, 0.02, 0.12),
     *((f"{side}_hip", 2, *heights) for heights in ((-0.16, -0.04), (-0.34, -0.16)) for side in _SIDES),
 ]  # fmt: skip
-# limbs: the joints at the ends of the bone, the left one first, and the radius as a share of its length
+# limbs, left before right: the joints at the ends of the bone, and the radius as a fraction of its length
 _BONES = [
     (f"{side}_{a}", f"{side}_{b}", share)
     for a, b, share in (("elbow", "wrist", 0.09), ("wrist", "hand", 0.2), ("knee", "ankle", 0.09)) for side in _SIDES
@@ -36,27 +37,27 @@ _IS_TRUNK = np.array([axis == 1 for _, axis, *_ in _SOLID])
 _CARRIER = np.array([_J[name] for name, *_ in _SOLID])
 _BONE_ENDS = np.array([[_J[a], _J[b]] for a, b, _ in _BONES])
 _BONE_RADIUS = np.array([share for *_, share in _BONES], np.float32)
-# of left arm, right arm, left leg, right leg: where it turns, and how readily
+# left arm, right arm, left leg, right leg: the two joints at which it turns, and their relative compliance
 _TURNS = np.array(
     [[_J[f"{side}_{name}"] for name in names] for names in (("shoulder", "elbow"), ("hip", "knee")) for side in _SIDES]
 )
 _READY = np.array([[1.0, 0.5], [1.0, 0.5], [1.0, 0.0], [1.0, 0.0]], np.float32)[..., None]
-# each one's pairs (limb, what it may not be in), and where they begin and end
+# pairs (limb, obstacle) of each of the four, and the limits of its slice of `_PAIRS`
 _ARM_PAIRS = [[(a[side], b) for a in (_FOREARMS, _HANDS) for b in range(len(_SOLID))] for side in (0, 1)]
 _PAIRS = np.array([*_ARM_PAIRS[0], *_ARM_PAIRS[1], _SHANKS, _SHANKS[::-1]])
 _SLICES = np.cumsum([0, len(_ARM_PAIRS[0]), len(_ARM_PAIRS[1]), 1, 1])
-# flesh and cloth give way by so much, and less than this is no contact, m
+# depth by which flesh and cloth yield, and minimum depth of a contact, m
 _GIVES, _CONTACT = 0.01, 0.004
-# most steps, what keeps them small, m^2, and the longest, rad
+# maximum number of steps, damping, m^2, and maximum step, rad
 _STEPS, _DAMPING, _LONGEST = 6, 1e-3, 0.35
-# how often a step of a clip is averaged with those of the frames beside it
+# number of times that a clip's step is averaged with those of the neighboring frames
 _EVEN = 4
 
 
 @cache
 def _extremes(rig: Rig) -> np.ndarray:
-    """The vertices with the least and the greatest x, y and z of each region of `_SOLID`, (2, 3, regions), on the mean
-    person."""
+    """Indices (2, 3, regions) of the vertices with the minimum and the maximum x, y and z in each region of `_SOLID`,
+    on the mean person."""
     weight, extremes = rig.dense_weight, []
     in_arm = weight[:, [_J[f"{side}_{name}"] for side in _SIDES for name in ("shoulder", "elbow", "wrist", "hand")]]
     for name, axis, low, high in _SOLID:
@@ -68,12 +69,12 @@ def _extremes(rig: Rig) -> np.ndarray:
 
 
 def fitted_capsules(rig: Rig, people: RestBody, clothes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ends (n, S, 2, 3) m of the capsules of `_SOLID`, seen from the joints that carry them, and radii (n, C) m of all,
-    of people at rest whose clothes stand off (n, V) m."""
+    """Ends (n, S, 2, 3) m of the capsules of `_SOLID`, relative to the joints that carry them, and radii (n, C) m of
+    all capsules, for people at rest with clothing offsets (n, V) m."""
     rows = _extremes(rig)
     low, high = (people.vertices[:, row.T, np.arange(3)] for row in rows)
     center, half = (low + high) / 2, (high - low) / 2
-    # the trunk is as deep as it is, thighs and head nearly round
+    # a trunk capsule takes its radius from the trunk's depth alone; thighs and head are nearly round
     radius = np.where(_IS_TRUNK, half[..., 0], (half[..., 0] + half[..., 1]) / 2)
     reach = np.zeros_like(half)
     reach[:, _IS_TRUNK, 1] = np.maximum(half[..., 1] - radius, 0.01)[:, _IS_TRUNK]
@@ -88,13 +89,13 @@ def fitted_capsules(rig: Rig, people: RestBody, clothes: np.ndarray) -> tuple[np
 def cleared(
     rig: Rig, people: RestBody, clothes: np.ndarray, rotations: np.ndarray, rows: np.ndarray, *, is_clip: bool
 ) -> np.ndarray:
-    """Poses with forearms and hands outside trunk, head and thighs, and shanks outside each other.
+    """Moves forearms and hands out of trunk, head and thighs, and shanks out of each other.
 
     Args:
-        rig, people, clothes: n people at rest, whose clothes stand off (n, V) m.
+        rig, people, clothes: n people at rest, with clothing offsets (n, V) m.
         rotations: (n, F, 24, 3, 3), local.
-        rows: of whom this is to be so; the others stay as they are.
-        is_clip: each frame is corrected, and evenly in time; else all by what the first one needs.
+        rows: Indices of the people to correct; the others are unchanged.
+        is_clip: If true, each frame is corrected, smoothly in time; else all frames get the first one's correction.
 
     Returns:
         (n, F, 24, 3, 3) float32.
@@ -121,8 +122,8 @@ def cleared(
 
 
 def _step(rotations: np.ndarray, bones: np.ndarray, ends: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Turns (m, 4, 2, 3) rad at `_TURNS`, in the frame of the bone above, that bring what is deepest of each limb out
-    of what it is in; rotations (m, 24, 3, 3)."""
+    """Rotation vectors (m, 4, 2, 3) rad at `_TURNS`, in the parent bone's frame, that move the deepest capsule of each
+    limb out of its obstacle; rotations (m, 24, 3, 3)."""
     global_rotations, joints = body_frames(rotations, bones)
     ends = np.concatenate([capsule_ends(global_rotations, joints, _CARRIER, ends), joints[:, _BONE_ENDS]], 1)
     depth = self_collision(ends, radius, _PAIRS) - _GIVES

@@ -1,8 +1,8 @@
-"""What bodies can do: no part passes through another, feet stand on the ground, and those who stand keep their balance.
+"""Physical constraints on poses: no self-intersection, feet on the ground, and balance of standing people.
 
-The body is capsules and the points of its soles. n poses on the mean adult, C capsules, Q pairs. Frame: x forward,
-y left, z up, the pelvis at the origin. Meters; angles (n, 27) in degrees, in the order of `activities.ANGLES`.
-Balance: corrections are continuous in the pose, so they may be made moment by moment.
+The body is modeled by capsules and points of its soles. n poses of the mean adult, C capsules, Q pairs. Frame: x
+forward, y left, z up, the pelvis at the origin. Meters; angles (n, 27) in degrees, in the order of `activities.ANGLES`.
+Balance corrections are continuous in the pose, so they can be applied to each frame of a clip independently.
 """
 
 from functools import cache
@@ -15,17 +15,17 @@ from lidarpose.skeleton import SMPL24
 
 _J = {name: i for i, name in enumerate(SMPL24.joints)}
 
-# the sole seen from the ankle joint, m: heel, inner and outer ball, toes; the left foot's, measured on the shipped mesh
+# points of the left sole relative to the ankle joint, m: heel, inner and outer ball, toes; measured on the shipped mesh
 _SOLE = np.array([[-0.05, 0.0, -0.077], [0.10, -0.045, -0.077], [0.10, 0.045, -0.077], [0.19, -0.01, -0.074]])
 # joints of the left and the right leg
 _HIPS, _KNEES, _ANKLES = (np.array([_J[f"{s}_{name}"] for s in ("left", "right")]) for name in ("hip", "knee", "ankle"))
-# a point bears weight within about this height of the lowest one, m
+# points within about this height above the lowest one bear weight, m
 _BEARING = 0.008
 
 
 def _capsules() -> tuple[np.ndarray, ...]:
-    """Joint (C,), ends (C, 2, 3) and radius (C,) m of the capsules; pairs (Q, 2) that could collide; what a kind of
-    activity rests on and what else is on the floor, (2, K, C) bool."""
+    """Joint (C,), ends (C, 2, 3) and radius (C,) m of the capsules; pairs (Q, 2) that may collide; masks
+    (2, K, C) of the capsules that each kind of activity rests on, and of others that touch the floor."""
     trunk, collisions = TABLES["capsules"]["trunk"], TABLES["collisions"]
     rows = {name: (_J[c["joint"]], c["start"], c["end"], c["radius"]) for name, c in trunk.items()}
     for side, mirror in (("left", [1, 1, 1]), ("right", [1, -1, 1])):
@@ -47,7 +47,7 @@ def _capsules() -> tuple[np.ndarray, ...]:
 
 
 def _mass_of_joints() -> np.ndarray:
-    """(24,): shares of the mass, each segment's at its ends so that its center is right."""
+    """Fractions (24,) of the body's mass: each segment's is split between its ends to preserve its center of mass."""
     mass = np.zeros(24, np.float32)
     segments = [("", segment) for segment in TABLES["mass"]["trunk"]]
     segments += [(side, segment) for side in ("left_", "right_") for segment in TABLES["mass"]["limbs"]]
@@ -58,7 +58,7 @@ def _mass_of_joints() -> np.ndarray:
 
 
 def _levels() -> list[tuple[np.ndarray, np.ndarray]]:
-    """The joints of each depth of the tree below the root, and their parents."""
+    """The joints at each depth of the tree below the root, and their parents."""
     parents, depth = np.array(SMPL24.parents), [0]
     for parent in SMPL24.parents[1:]:
         depth.append(depth[parent] + 1)
@@ -74,7 +74,7 @@ _LEVELS = _levels()
 
 @cache
 def _bones() -> np.ndarray:
-    """(24, 3, 1) float32 m: from each joint's parent to it at rest."""
+    """(24, 3, 1) float32 m: offset of each joint from its parent at rest."""
     rest_joints = mean_adult_joints()
     parents = np.array(SMPL24.parents)
     parents[0] = 0  # the root is at the origin
@@ -85,9 +85,9 @@ def body_frames(rotations: np.ndarray, bones: np.ndarray | None = None) -> tuple
     """rotations (n, 24, 3, 3) local -> global rotations (n, 24, 3, 3) and joints (n, 24, 3) m of the mean adult, or of
     bodies with bones (n, 24, 3, 1) m, see `_bones`.
 
-    `rig.forward_kinematics` a level of the tree at a time, float32.
+    Like `rig.forward_kinematics`, but one level of the tree at a time and in float32.
     """
-    # rotation and bone in one 3 x 4 matrix: half the products
+    # rotation and bone in one 3 x 4 matrix halve the number of products
     local_frames = np.empty((len(rotations), 24, 3, 4), np.float32)
     local_frames[..., :3], local_frames[..., 3:] = rotations, _bones() if bones is None else bones
     frames = local_frames.copy()
@@ -102,8 +102,8 @@ def body_frames(rotations: np.ndarray, bones: np.ndarray | None = None) -> tuple
 def capsule_ends(
     rotations: np.ndarray, joints: np.ndarray, joint: np.ndarray = _JOINT, ends: np.ndarray = _ENDS
 ) -> np.ndarray:
-    """The capsules' ends (n, C, 2, 3) m of posed bodies, from `body_frames`; joint (C,) carries a capsule, whose ends
-    (n or 1, C, 2, 3) m are seen from it at rest."""
+    """The capsules' ends (n, C, 2, 3) m on posed bodies, given the results of `body_frames`. `joint` (C,) carries each
+    capsule; `ends` (n or 1, C, 2, 3) m are relative to it at rest."""
     return joints[:, joint, None] + ends @ np.swapaxes(rotations[:, joint], -1, -2)
 
 
@@ -114,15 +114,14 @@ def undersides(ends: np.ndarray) -> np.ndarray:
 
 
 def self_collision(ends: np.ndarray, radius: np.ndarray = _RADIUS, pairs: np.ndarray = _PAIRS) -> np.ndarray:
-    """How deep parts that should not touch are in each other, (n, Q) m, negative where they are apart; radius (C,) or
-    (n, C) m, pairs (Q, 2) of capsules."""
+    """Penetration depths (n, Q) m of pairs (Q, 2) of capsules, negative if they are apart; radius (C,) or (n, C) m."""
     a, b = ends[:, pairs[:, 0]], ends[:, pairs[:, 1]]
     return radius[..., pairs].sum(-1) - _segment_distance(a, b)
 
 
 def hovering(ends: np.ndarray, kind: np.ndarray) -> np.ndarray:
-    """How far (n,) m what a pose of a kind (n,) should rest on is above the body's lowest point; 0 for kinds on their
-    feet."""
+    """Maximum height (n,) m of the supporting parts of each kind (n,) above the body's lowest point; 0 for kinds that
+    stand on their feet."""
     gap = np.zeros(len(kind), np.float32)
     rows = np.flatnonzero(_ON_FLOOR[kind])
     bottom_height = (ends[rows, ..., 2] - _RADIUS[:, None]).min(2)
@@ -131,19 +130,19 @@ def hovering(ends: np.ndarray, kind: np.ndarray) -> np.ndarray:
 
 
 def mass_center(joints: np.ndarray) -> np.ndarray:
-    """joints (n, 24, 3) -> (n, 3) m, by the segments of de Leva 1996."""
+    """Center of mass: joints (n, 24, 3) -> (n, 3) m. Source: de Leva 1996 (body segments)."""
     return np.einsum("j,njk->nk", _MASS_OF_JOINTS, joints)
 
 
 def _segment_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Least distance (...) of segments a and b (..., 2, 3)."""
+    """Distance (...) between segments a and b (..., 2, 3)."""
     difference = between_segments(a, b)[0]
     return np.sqrt((difference * difference) @ np.ones(3, np.float32))
 
 
 def between_segments(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The way (..., 3) from segment b to a, both (..., 2, 3), where they are nearest, and the share (...) of a there:
-    nearest points of the lines, clamped (Ericson, Real-Time Collision Detection, 5.1.9)."""
+    """Vector (..., 3) from the nearest point on segment b to that on a, both (..., 2, 3), and the latter's position
+    (...) along a, in [0, 1]: nearest points of the lines, clamped (Ericson, Real-Time Collision Detection, 5.1.9)."""
     start, other_start = a[..., 0, :], b[..., 0, :]
     u, v, w = a[..., 1, :] - start, b[..., 1, :] - other_start, start - other_start
     ones = np.ones(3, np.float32)
@@ -156,8 +155,8 @@ def between_segments(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 @cache
 def _leg_offsets() -> tuple[np.ndarray, ...]:
-    """Of the left and the right leg, float32 m: from the pelvis to the hip, from the hip to the knee, from the knee to
-    the ankle, each (2, 3), and from the ankle to the sole's points (2, 4, 3)."""
+    """Offsets in the left and the right leg, float32 m: pelvis to hip, hip to knee and knee to ankle, each (2, 3), and
+    ankle to the sole's points (2, 4, 3)."""
     rest_joints = mean_adult_joints()
     hip, knee, ankle = rest_joints[_HIPS], rest_joints[_KNEES], rest_joints[_ANKLES]
     sole = np.stack([_SOLE, _SOLE * [1, -1, 1]])
@@ -166,7 +165,7 @@ def _leg_offsets() -> tuple[np.ndarray, ...]:
 
 def sole_points(rotations: np.ndarray) -> np.ndarray:
     """rotations (n, 24, 3, 3) -> (n, 2, 4, 3) float32 m: heel, inner and outer ball and toes of the left and the right
-    foot, seen from the pelvis; the foot is stiff."""
+    foot, relative to the pelvis; the foot is rigid."""
     to_hip, to_knee, to_ankle, sole = _leg_offsets()
     root = rotations[:, None, 0]
     thigh = root @ rotations[:, _HIPS]
@@ -177,12 +176,13 @@ def sole_points(rotations: np.ndarray) -> np.ndarray:
 
 
 def planted_displacement(points: np.ndarray) -> np.ndarray:
-    """The way (n, T, 3) m of the body if the points that bear it do not slide; z is 0.
+    """Displacement (n, T, 3) m of the body if the points that bear it do not slide; z is 0.
 
-    points (n, T, P, 3) m seen from the pelvis in axes that do not turn, T close moments; the way starts at 0.
+    points (n, T, P, 3) m are relative to the pelvis in axes of fixed orientation, at T closely spaced moments. The
+    displacement starts at 0.
     """
     height = points[..., 2]
-    # each point's share of the weight
+    # each point's fraction of the body weight
     share = np.exp((height.min(-1, keepdims=True) - height) / np.float32(_BEARING))
     share = share / share.sum(-1, keepdims=True)
     share = (share[:, 1:] + share[:, :-1]) / 2
@@ -192,8 +192,8 @@ def planted_displacement(points: np.ndarray) -> np.ndarray:
 
 
 def walked_displacement(pace: np.ndarray, strides: np.ndarray, course: np.ndarray) -> np.ndarray:
-    """The way (n, T, 2) m over the ground of people who make `pace` (n, T) m a stride, have made `strides` (n, T) and
-    head for `course` (n, T) rad."""
+    """Displacement (n, T, 2) m over the ground from `pace` (n, T) m per stride, the number of `strides` (n, T) made
+    so far and the heading `course` (n, T) rad."""
     displacement = np.zeros((*pace.shape, 2))
     mean_course = (course[:, 1:] + course[:, :-1]) / 2
     step_length = (pace[:, 1:] + pace[:, :-1]) / 2 * np.diff(strides, axis=1)
@@ -203,7 +203,7 @@ def walked_displacement(pace: np.ndarray, strides: np.ndarray, course: np.ndarra
     return displacement
 
 
-# kinds that keep their balance: on both feet or on a foot and a knee, and on one foot
+# kinds that are balanced: on both feet or on a foot and a knee, and on one foot
 STATIC = ("idle", "crouch", "bend", "kneel", "squat", "stoop", "reach_down", "get_down", "box")
 ON_ONE_FOOT = ("kick", "knee_raise")
 _STATIC, _ONE_FOOT = (np.array([name in names for name in KINDS]) for names in (STATIC, ON_ONE_FOOT))
@@ -212,24 +212,24 @@ _KNEEL = KINDS.index("kneel")
 _HIP, _KNEE, _ANKLE, _ABD = (
     np.array([ANGLE_INDEX[f"{side}_{name}"] for side in ("left", "right")]) for name in ("hip", "knee", "ankle", "abd")
 )
-_KNEE_RADIUS = 0.055  # m, of the shipped body in front of the joint
-_MARGIN = 0.03  # m: the center of mass stays so far inside the feet's outline
-# a point bears nothing once it is so high above the lowest one, m, and counts for less this steeply
+_KNEE_RADIUS = 0.055  # m, from the joint to the front of the knee on the shipped body
+_MARGIN = 0.03  # m: the center of mass stays this far inside the outline of the feet
+# a point bears weight up to this height above the lowest one, m; above it, its penalty rises with this slope
 _TOUCHING, _FADE = 0.03, 4.0
-# directions in which the outline of the feet is taken
+# directions in which the outline of the feet is measured
 _AROUND = np.stack([f(np.arange(16) * np.pi / 8) for f in (np.cos, np.sin)]).astype(np.float32)
-# a folded leg's least length from hip to ankle, m, of the unusual kinds and of others
+# minimum distance from hip to ankle of a folded leg, m: of the unusual kinds, and of others
 _SHORTEST = np.array([0.18, 0.3], np.float32)
-# how far the center of mass goes when a kneeling body's trunk leans, m a radian: 2/3 of the mass, 0.4 m up
+# shift of the center of mass when a kneeling body's trunk leans, m per radian: 2/3 of the mass, 0.4 m above the hips
 _TRUNK_LEAN = 0.27
 
 
 def balanced(angles: np.ndarray, kind: np.ndarray) -> np.ndarray:
-    """The poses (n, 27) with those of the static kinds on both feet (or a foot and a knee), and all in balance.
+    """The poses (n, 27) with static kinds on both feet (or a foot and a knee), and static and one-foot kinds balanced.
 
-    The body leans about its ankles (kneeling: its trunk about the hips) until its center of mass is over the outline
-    of what it stands on; the leg that reaches lower bends more, or the front leg of a kneeling body reaches to the
-    ground. One linear step, whose error is millimeters; several for the unusual kinds, whose legs are bent far.
+    The body leans about its ankles (kneeling: the trunk about the hips) until its center of mass is above the outline
+    of its support. The leg that reaches lower is bent more; in kneeling, the front leg is extended to the ground. This
+    is one linear step with an error of millimeters; unusual kinds, whose legs are strongly bent, get several.
     """
     for kind_mask in (_STATIC | _ONE_FOOT, *[_ITERATED_KINDS] * 2):
         angles = _balance_once(angles, kind, np.flatnonzero(kind_mask[kind]))
@@ -237,7 +237,7 @@ def balanced(angles: np.ndarray, kind: np.ndarray) -> np.ndarray:
 
 
 def _balance_once(angles: np.ndarray, kind: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """A step of `balanced` for some rows."""
+    """One step of `balanced` for the given rows."""
     if not len(rows):
         return angles
     row_angles, is_kneeling = angles[rows], kind[rows] == _KNEEL
@@ -248,7 +248,7 @@ def _balance_once(angles: np.ndarray, kind: np.ndarray, rows: np.ndarray) -> np.
     lean = _lean(
         row_angles, overhang(center, _bearing_points(row_angles, points, is_kneeling)), center, joints, is_kneeling
     )
-    # the lean changes the feet's heights too: the soles stay level to the front
+    # the lean changes the feet's heights, too; the soles keep their pitch
     points[:, :8, 2] -= np.repeat(joints[:, _ANKLES, 0], 4, 1) * lean[:, :1]
     points[:, :8, 2] -= (points[:, :8, 1] - np.repeat(joints[:, _HIPS, 1], 4, 1)) * lean[:, 1:]
     is_on_both_feet = _STATIC[kind[rows]]
@@ -266,8 +266,8 @@ def _balance_once(angles: np.ndarray, kind: np.ndarray, rows: np.ndarray) -> np.
 
 
 def overhang(center: np.ndarray, points: np.ndarray, margin: float = _MARGIN) -> np.ndarray:
-    """center (n, 3) of mass, points (n, P, 3) that may bear it -> (n, 2) m: the way the center must go for it to lie
-    `margin` inside the outline of the lowest points; 0 where it does."""
+    """center (n, 3) of mass, points (n, P, 3) that may bear it -> (n, 2) m: the displacement that moves the center to
+    `margin` inside the outline of the lowest points; 0 if it is there already."""
     height = points[..., 2] - points[..., 2].min(1, keepdims=True)
     penalty = _FADE * np.maximum(height - _TOUCHING, 0)
     points_xy = points[..., :2]
@@ -286,7 +286,7 @@ def _ground_points(rotations: np.ndarray, joints: np.ndarray) -> np.ndarray:
 
 
 def _bearing_points(angles: np.ndarray, points: np.ndarray, is_kneeling: np.ndarray) -> np.ndarray:
-    """The points that will bear the body when it is level: of one that kneels both soles and the knee behind."""
+    """The points that will bear the body once it is level: for kneeling bodies, both soles and the rear knee."""
     rows = np.flatnonzero(is_kneeling)
     points = points.copy()
     points[rows, :, 2] = 0
@@ -297,8 +297,8 @@ def _bearing_points(angles: np.ndarray, points: np.ndarray, is_kneeling: np.ndar
 def _level_feet(
     angles: np.ndarray, joints: np.ndarray, points: np.ndarray, is_kneeling: np.ndarray, least_reach: np.ndarray
 ) -> np.ndarray:
-    """The poses (n, 27) with legs bent so that both feet, or the front foot and the other knee, are equally low, in
-    place too; least_reach (n, 1) m from hip to ankle."""
+    """The poses (n, 27), also modified in place, with legs bent so that both feet, or the front foot and the rear knee,
+    are at the same height; least_reach (n, 1) m is the minimum distance from hip to ankle."""
     rest_joints = mean_adult_joints()[[_HIPS[0], _KNEES[0], _ANKLES[0]]]
     thigh, shank = np.linalg.norm(np.diff(rest_joints, axis=0), axis=1).tolist()
     sole_height = np.stack([points[:, :4, 2].min(1), points[:, 4:8, 2].min(1)], 1)
@@ -310,7 +310,7 @@ def _level_feet(
         floor_height = points[kneeling_rows, 8 + rear_leg, 2]
         lift[kneeling_rows] = 0
         lift[kneeling_rows, front_leg] = floor_height - sole_height[kneeling_rows, front_leg]
-        # the toes behind touch the floor beside the knee
+        # the rear toes touch the floor like the rear knee
         angles[kneeling_rows, _KNEE[rear_leg]] += np.degrees(
             (floor_height - sole_height[kneeling_rows, rear_leg]) / shank
         )
@@ -329,7 +329,7 @@ def _level_feet(
 
 
 def _triangle(reach: np.ndarray, thigh: float, shank: float) -> tuple[np.ndarray, np.ndarray]:
-    """Bend of the knee and angle between thigh and the line from hip to ankle, degrees, at a reach m."""
+    """Knee flexion and angle between thigh and the line hip -> ankle, degrees, at a hip-ankle distance `reach` m."""
     bend = np.arccos(np.clip((reach**2 - thigh**2 - shank**2) / (2 * thigh * shank), -1, 1))
     return np.degrees(bend), np.degrees(np.arctan2(shank * np.sin(bend), thigh + shank * np.cos(bend)))
 
@@ -337,40 +337,40 @@ def _triangle(reach: np.ndarray, thigh: float, shank: float) -> tuple[np.ndarray
 def _lean(
     angles: np.ndarray, displacement: np.ndarray, center: np.ndarray, joints: np.ndarray, is_kneeling: np.ndarray
 ) -> np.ndarray:
-    """Leans bodies, in place, so that their centers of mass go `displacement` (n, 2) m. Returns how far legs turn,
-    (n, 2) rad, forwards with the body and to the left under it."""
+    """Leans bodies, in place, so that their centers of mass move by `displacement` (n, 2) m. Returns the angles by
+    which the legs turn, (n, 2) rad: forward with the body, and to the left under it."""
     height = np.maximum(center[:, 2] - joints[:, _ANKLES, 2].min(1), 0.3)
     forward_angle = displacement[:, 0] / np.where(is_kneeling, _TRUNK_LEAN, height)
     left_angle = displacement[:, 1] / height
     forward_degrees = np.degrees(forward_angle)
     angles[:, ANGLE_INDEX["tilt"]] += forward_degrees
-    # the body turns about its ankles, or the trunk about the hips
+    # the body rotates about its ankles, or the trunk about the hips
     angles[:, _ANKLE] += np.where(is_kneeling, 0, forward_degrees)[:, None]
     angles[:, _HIP] += np.where(is_kneeling, forward_degrees, 0)[:, None]
     angles[:, _ABD] += np.degrees(left_angle)[:, None] * np.array([-1, 1])
     return np.stack([np.where(is_kneeling, 0, forward_angle), left_angle], 1)
 
 
-# the limbs: their capsules and the angles that move them, from the trunk outwards
+# the four limbs: their capsules, and the angles that move them, from the trunk outward
 _LIMBS = len(TABLES["capsules"]["trunk"]) + np.arange(4 * 3).reshape(4, 3)
 _LIMB_ANGLES = np.array(
     [[ANGLE_INDEX[f"{side}_{name}"] for name in names]
      for side in ("left", "right") for names in (("raise", "out", "elbow"), ("hip", "knee", "ankle"))]
 )  # fmt: skip
-# steps to the floor, what keeps them small, m^2 a degree^2, and the longest, degrees
+# number of steps to fit the floor, damping, m^2 per degree^2, and maximum step, degrees
 _STEPS, _DAMPING, _LONGEST = 4, 1e-5, 20.0
 
 
 def fitted_to_floor(angles: np.ndarray, kind: np.ndarray) -> np.ndarray:
-    """The poses (n, 27) with those of kinds that rest on the floor fitted to it: no arm or leg is below what bears the
-    body, and what touches the floor is as low as that. Damped least squares, limb by limb."""
+    """The poses (n, 27), those of kinds that rest on the floor fitted to it: no arm or leg is below the parts that bear
+    the body, and parts that touch the floor are at that height. Damped least squares, limb by limb."""
     rows = np.flatnonzero(_ON_FLOOR[kind])
     if not len(rows):
         return angles
     row_angles, rest_mask, touch_mask = angles[rows], _RESTS[kind[rows]], _TOUCHES[kind[rows]][:, _LIMBS]
     repeated_rest_mask = np.tile(rest_mask, (4, 1))
     for _ in range(_STEPS):
-        # as it is, and with each of a limb's three angles a degree larger
+        # the pose itself, and with each of a limb's three angles one degree larger
         perturbed_angles = np.tile(row_angles, (4, 1, 1))
         for k in range(3):
             perturbed_angles[1 + k, :, _LIMB_ANGLES[:, k]] += 1.0
@@ -389,7 +389,7 @@ def fitted_to_floor(angles: np.ndarray, kind: np.ndarray) -> np.ndarray:
 
 
 def _limb_heights(angles: np.ndarray, rest_mask: np.ndarray) -> np.ndarray:
-    """(n, 4, 3) m: how high the limbs' capsules are above the lowest part that the body rests on."""
+    """Heights (n, 4, 3) m of the limbs' capsules above the lowest part that the body rests on."""
     ends = capsule_ends(*body_frames(rotations_from_angles(angles)))
     bottom_height = (ends[..., 2] - _RADIUS[:, None]).min(2)
     return bottom_height[:, _LIMBS] - np.where(rest_mask, bottom_height, np.inf).min(1)[:, None, None]

@@ -1,10 +1,10 @@
-"""Walking and running: angles of a stride as functions of its phase, with feet that stay where they stand.
+"""Walking and running: joint angles as functions of the stride's phase, with feet that do not slide.
 
-The angles of hip, knee and ankle follow published curves of the stride. A curve scaled to a person's step and noise
-does not quite keep its foot on the ground, so each leg's ankle is then moved, within its own plane, onto the path of a
-foot that rolls over a fixed place while the hips go ahead at one speed and rise and fall a little.
+The angles of hip, knee and ankle follow published curves of the stride. Once scaled to a person's stride and noise, the
+curves do not quite keep the foot on the ground. Therefore each leg's ankle is moved, within the leg's plane, onto the
+path of a foot that rolls over a fixed place while the hips advance at constant speed and rise and fall a little.
 
-Phase 0 is the heel strike of the leg. Meters are those of the mean adult.
+Phase 0 is the heel strike of the leg. Lengths in meters are those of the mean adult.
 """
 
 from dataclasses import dataclass
@@ -17,21 +17,21 @@ from lidarpose.body.pose_prior.activities import ANGLE_INDEX, TABLES
 _GAITS = TABLES["gaits"]
 GAITS = tuple(_GAITS)
 _RUN = GAITS.index("run")
-_HARMONICS = 3  # seven events and seven coefficients: the curve runs through them all
-_ARM_LAG = 0.03  # of a stride: the arms trail the legs a little
-# share of the stride over which a foot leaves its place and comes to the next
+_HARMONICS = 3  # seven events and seven coefficients: the curve passes through all events
+_ARM_LAG = 0.03  # fraction of a stride by which the arms trail the legs
+# fraction of the stride in which a foot leaves its place, and in which it reaches the next one
 _LEAVE, _LAND = 0.14, 0.12
-_TRAIL = 0.08  # of a stride: so long a foot that leaves stays where it was
-_FIRST = 1.7  # it is over its place before it comes down, and goes on only once it is lifted: by this factor
+_TRAIL = 0.08  # fraction of a stride after the stance in which a leaving foot's target stays in place
+_FIRST = 1.7  # gain of horizontal contact: a foot is above its place before it lands, and advances only once lifted
 
-# the mean adult's leg in its plane: lengths of thigh and shank m, and how far their bones stand out of the vertical at
-# rest, rad (`rig.mean_adult_joints`); half the distance of the hips; heel and toes from the ankle (x, z)
+# the mean adult's leg in its plane: lengths of thigh and shank, m; half the distance between the hips, m; angles of
+# thigh and shank from the vertical at rest, rad (`rig.mean_adult_joints`); heel and toes from the ankle (x, z), m
 _THIGH, _SHANK, _HALF_HIPS = 0.390, 0.410, 0.075
 _THIGH_REST, _SHANK_REST = 0.023, -0.076
 _HEEL, _TOES = (-0.05, -0.077), (0.19, -0.075)
-# a leg never stretches further, and no further than that where it bears the body
+# maximum hip-ankle distance of any leg, and of a leg that bears the body, m
 _STRAIGHT, _STRETCHED = 0.9985 * (_THIGH + _SHANK), 0.995 * (_THIGH + _SHANK)
-_TOE_CLEAR = 0.022  # a swinging foot's least height, m
+_TOE_CLEAR = 0.022  # minimum height of a swinging foot, m
 _SIDES = np.array([1.0, -1.0])  # left, right
 
 
@@ -49,7 +49,7 @@ _COEFFICIENTS = np.stack([np.linalg.solve(_basis(curve[:, 0]), curve[:, 1:]) for
 _STANCE, _BEHIND, _LOWEST, _RISE, _PITCH = map(_table, ("stance", "behind", "lowest", "rise", "pitch"))
 _RANGES = {name: _table(name) for name in ("length", "lift", "swing", "elbow", "elbow_swing")}
 _CROUCH = _table("crouch")
-# phases of a stance at which a stride's speed and height are measured, (3, 7), and the curves there, (3, 7, 3)
+# phases of the stance at which a stride's pace and height are measured, (3, 7), and the curves there, (3, 7, 3)
 _GRID = _STANCE[:, None] * np.linspace(0, 1, 7)
 _GRID_CURVES = _basis(_GRID) @ _COEFFICIENTS
 _LEG_COLUMNS, _ABD, _ROT, _RAISE, _ELBOW = (
@@ -60,8 +60,8 @@ _LEG_COLUMNS, _ABD, _ROT, _RAISE, _ELBOW = (
 
 @dataclass(frozen=True, kw_only=True)
 class Stride:
-    """angles (n, 27) degrees; pace (n,) m a stride along the way the body goes, 0 for who stays; height (n,) m of the
-    hips' middle above the ground, 0 for who does not walk."""
+    """angles (n, 27) degrees; pace (n,) m per stride in the direction of travel, 0 for people who stay in place; height
+    (n,) m of the middle of the hips above the ground, 0 for people without a gait."""
 
     angles: ndarray
     pace: ndarray
@@ -69,17 +69,17 @@ class Stride:
 
 
 def add_stride(gait: ndarray, phase: ndarray, style: ndarray, base: ndarray) -> Stride:
-    """People who walk, run or push: the angles of their activities' tables with a stride on top.
+    """Adds a stride to the activity's angles of people who walk, run or push.
 
     Args:
         gait: (n,) into `GAITS`.
         phase: (n,) in strides, 0 at the left heel's strike.
-        style: (n, 8) in [0, 1]: length of the stride, lift of the knee, swing of the arms, bend of the elbow, its
-            swing, crouch, turn of the hips, asymmetry of the arms.
-        base: (n, 27) degrees, thighs from the vertical.
+        style: (n, 8) in [0, 1]: stride length, knee lift, arm swing, elbow flexion, elbow swing, crouch, turn of the
+            hips, asymmetry of the arms.
+        base: (n, 27) degrees, thighs relative to the vertical.
     """
     length, lift, swing, elbow, elbow_swing, crouch, turn, asymmetry = style.T
-    # walkers with long steps swing their arms far and most bend their elbows little
+    # walkers with long strides swing their arms far; most walkers bend their elbows little
     is_running = gait == _RUN
     swing = np.where(is_running, swing, swing * (0.4 + 0.6 * (0.35 + length)))
     elbow = np.where(is_running, elbow, elbow**1.5)
@@ -89,10 +89,10 @@ def add_stride(gait: ndarray, phase: ndarray, style: ndarray, base: ndarray) -> 
     )
     crouch = _CROUCH[gait] * crouch**1.3
     turn_phase, roll_phase = 2 * np.pi * phase, 2 * np.pi * (phase + 0.05)
-    # the hips turn with the leading leg and drop over the swinging one, the chest turns against them
+    # the hips turn with the leading leg and drop on the swing side; the chest turns the opposite way
     yaw = -(2 + 5 * turn) * length * np.cos(turn_phase)
     roll = (1 + 3 * turn) * np.sin(roll_phase)
-    sway = 1.5 * np.sin(roll_phase - 0.2 * np.pi)  # the hips go over the standing leg
+    sway = 1.5 * np.sin(roll_phase - 0.2 * np.pi)  # the hips shift over the stance leg
     hip_shift = _HALF_HIPS * np.radians(np.stack([yaw, roll]))[..., None] * _SIDES
 
     leg_phase = phase[:, None] + np.array([0.0, 0.5])
@@ -106,7 +106,7 @@ def add_stride(gait: ndarray, phase: ndarray, style: ndarray, base: ndarray) -> 
 
     angles = base.copy()
     angles[:, _LEG_COLUMNS] = np.stack([hip, knee, ankle], 1)
-    # legs stay in their planes whatever the hips do
+    # compensate for the motion of the hips, so that the legs stay in their planes
     angles[:, _ABD] -= _SIDES * ((roll + sway)[:, None] + yaw[:, None] * np.sin(np.radians(hip)))
     angles[:, _ROT] -= _SIDES * yaw[:, None]
     arm_swing = -np.cos(2 * np.pi * (leg_phase - _ARM_LAG))  # against the leg of the same side
@@ -118,15 +118,15 @@ def add_stride(gait: ndarray, phase: ndarray, style: ndarray, base: ndarray) -> 
 
 
 def _stance(gait: ndarray, phase: ndarray) -> tuple[ndarray, ndarray]:
-    """phase (n, 2) in [0, 1) of the legs -> phase since the heel strike, below 0 for a foot about to land, and how much
-    the place on the ground holds the foot, its contact, in [0, 1]."""
+    """phase (n, 2) in [0, 1) of the legs -> phase since the heel strike, below 0 for a foot about to land, and contact
+    of the foot with its place on the ground, in [0, 1]."""
     stance_end = _STANCE[gait, None]
     since_strike = np.where(phase > (1 + stance_end) / 2, phase - 1, phase)
     return since_strike, _smooth(1 - (since_strike - stance_end) / _LEAVE) * _smooth(1 + since_strike / _LAND)
 
 
 def _standing_pitch(gait: ndarray, stance_phase: ndarray, length: ndarray) -> ndarray:
-    """The pitch (n, ...), degrees, of a foot on the ground: lands on its heel, lies flat, rises on its toes."""
+    """Pitch (n, ...), degrees, of a foot on the ground: it lands on its heel, lies flat, then rises on its toes."""
     shape = (-1,) + (1,) * (stance_phase.ndim - 1)
     landing_pitch, flat_phase, rise_phase, leaving_pitch, exponent = (value.reshape(shape) for value in _PITCH[gait].T)
     landing = landing_pitch * np.clip(1 - stance_phase / flat_phase, 0, 1)
@@ -137,15 +137,15 @@ def _standing_pitch(gait: ndarray, stance_phase: ndarray, length: ndarray) -> nd
 def _legs(
     gait: ndarray, phase: ndarray, stance: tuple, length: ndarray, lift: ndarray, crouch: ndarray, base: ndarray
 ) -> tuple[ndarray, ndarray, ndarray]:
-    """Hip, knee and the foot's pitch (toes up), each (n, 2, 1 + 7) rad: of both legs, now, at phase (n, 2), and at the
-    phases of their stance in `_GRID`. stance: `_stance`."""
+    """Hip and knee angles and the foot's pitch (positive with toes up), each (n, 2, 1 + 7) rad, of both legs: first at
+    phase (n, 2), then at the stance phases of `_GRID`. stance: result of `_stance`."""
     stance_phase, contact = stance
     length, lift, crouch = (value[:, None, None] for value in (length, lift, crouch))
     grid = np.broadcast_to(_GRID_CURVES[gait, None], (len(phase), 2, 7, 3))
     curves = np.concatenate([(_basis(phase) @ _COEFFICIENTS[gait])[:, :, None], grid], 2)
     base_hip, base_knee, base_ankle = np.moveaxis(base[:, _LEG_COLUMNS], 1, 0)[..., None]
     hip = length * (curves[..., 0] - 4) + 4 + 0.45 * crouch + base_hip
-    # slow steps bend the knee less
+    # the knee bends less in short strides
     knee = curves[..., 1] * lift * np.clip(0.45 + 0.55 * length, 0, 1.4) + crouch + base_knee
     ankle = curves[..., 2] * np.clip(length, 0.5, 1.2) + 0.5 * crouch + base_ankle
     grid = np.broadcast_to(_GRID[gait, None], (len(phase), 2, 7))
@@ -156,13 +156,13 @@ def _legs(
 
 
 def _ankle(hip: ndarray, knee: ndarray) -> tuple[ndarray, ndarray]:
-    """x and z m of the ankle seen from its hip joint, for angles in rad."""
+    """x and z m of the ankle relative to its hip joint, for angles in rad."""
     thigh, shank = hip + _THIGH_REST, hip - knee + _SHANK_REST
     return _THIGH * np.sin(thigh) + _SHANK * np.sin(shank), -_THIGH * np.cos(thigh) - _SHANK * np.cos(shank)
 
 
 def _roll_off(pitch: ndarray) -> tuple[ndarray, ndarray]:
-    """x and z m of the ankle above the place its foot stands on, the foot rolling over its heel and its toes."""
+    """x and z m of the ankle relative to the place on which its foot stands and rolls over heel and toes."""
     c, s = np.cos(pitch), np.sin(pitch)
     heel = _HEEL[0] * c - _HEEL[1] * s, _HEEL[0] * s + _HEEL[1] * c
     toes = _TOES[0] * c - _TOES[1] * s, _TOES[0] * s + _TOES[1] * c
@@ -170,10 +170,10 @@ def _roll_off(pitch: ndarray) -> tuple[ndarray, ndarray]:
 
 
 def _pace_and_height(gait: ndarray, legs: tuple, rise: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-    """Pace (n,) m a stride and mean height (n,) m of the hips, as the legs' curves at the phases of `_GRID` say, and
-    where each foot stands, (n, 2) m ahead of its hip in the middle of its stance.
+    """Pace (n,) m per stride and mean height (n,) m of the hips, from the legs' curves at the phases of `_GRID`, and
+    the position (n, 2) m of each foot ahead of its hip at mid-stance.
 
-    The hips, which are `rise` (n, 7) m above their mean at these phases, are no higher than both legs reach.
+    The hips are `rise` (n, 7) m above their mean at these phases. They are no higher than both legs reach.
     """
     hip, knee, pitch = (value[..., 1:] for value in legs)
     grid = (_GRID - _GRID.mean(1, keepdims=True))[gait]
@@ -191,9 +191,9 @@ def _pace_and_height(gait: ndarray, legs: tuple, rise: ndarray) -> tuple[ndarray
 def _place_feet(
     gait: ndarray, stance: tuple, legs: tuple, center: ndarray, pace: ndarray, height: ndarray, shift: ndarray
 ) -> tuple[ndarray, ndarray, ndarray]:
-    """Hip, knee and ankle angles (n, 2), degrees, of the legs with the feet where they belong; stance: `_stance`.
+    """Hip, knee and ankle angles (n, 2), degrees, that put the feet in their places; stance: result of `_stance`.
 
-    shift (2, n, 2) m: how far the pelvis's own turns bring a leg's hip joint back and up.
+    shift (2, n, 2) m: displacement of a leg's hip joint, backward and upward, by the rotation of the pelvis.
     """
     stance_phase, contact = stance
     hip, knee, pitch = (value[..., 0] for value in legs)

@@ -1,13 +1,16 @@
-"""The pose prior: what people's bodies do, drawn at random from a table of activities.
+"""The pose prior: human poses drawn at random from a table of activities.
 
-A pose is 27 angles (`ANGLES`, degrees, the same sign on both sides of the body), made from a few latents: a kind of
-activity, a kind of arm for each side, where between the two ends of its range the activity stands, noise, and for
-gaits a phase; `latents` says how they go on in time. The angles are kept inside the joints' ranges, left and right are
-exchanged in half of the poses, arms are pushed out of the trunk, standing people are set on both feet and balanced
-(`constraints.balanced`), those who are on the floor fitted to it (`constraints.fitted_to_floor`), one matrix product
-turns the angles into Euler angles of the 24 bones, and bodies that pass through themselves
-(`constraints.self_collision`) or do not rest on the ground with what they should (`constraints.hovering`) are replaced
-by spare ones.
+A pose is 27 angles (`ANGLES`, degrees, the same sign on both sides of the body), computed from a few latents: a kind of
+activity, a kind of arm pose for each side, the position between the two ends of the activity's range, noise, and for
+gaits a phase. `latents` defines how they change over time. The angles are then processed as follows:
+
+1. They are clipped to the joints' ranges; left and right are swapped in half of the poses.
+2. Arms are moved out of the trunk.
+3. Standing people are set on both feet and balanced (`constraints.balanced`).
+4. People on the floor are fitted to it (`constraints.fitted_to_floor`).
+5. One matrix product converts the angles to Euler angles of the 24 bones.
+6. Bodies that intersect themselves (`constraints.self_collision`), or whose supporting parts do not rest on the ground
+   (`constraints.hovering`), are replaced by spare ones.
 
 Frame of the result: x forward, y left, z up, facing +x, in the rest pose of `rig` (T-pose, every bone's axes along
 the body's).
@@ -40,33 +43,33 @@ _CAPTURED, _RUN, _CYCLE, _FALL = (KINDS.index(name) for name in ("captured", "ru
 _NO_LEG = np.array([not name.endswith(("hip", "knee", "ankle")) for name in ANGLES])
 _GAIT = np.array([GAITS.index(name) if name in GAITS else -1 for name in KINDS])
 _TRAVELS = tuple(KINDS.index(name) for name in (*GAITS, "cycle"))
-_EARLY_FALL = 0.15  # clips of falls begin early in them
-# the way of a turn of a bicycle's cranks, m: least, and how much more (city gears)
+_EARLY_FALL = 0.15  # clips of falls begin in this first fraction of the fall
+# distance traveled per turn of a bicycle's cranks, m: minimum and range (city gears)
 _GEAR = (3.2, 1.8)
 _HIPS_DOWN = 0.095  # m from the pelvis down to the hips' middle
-_MOMENT = 0.05  # s: bodies roll over the ground in steps of at most this
-# bodies whose parts are deeper in each other than this, m, or whose support is farther from the ground, are refused;
-# clips are checked every so many seconds
+_MOMENT = 0.05  # s: maximum time step for integrating a body's displacement over the ground
+# a body is rejected if its parts overlap by more than this depth, m, or if its support is more than this gap above the
+# ground, m; clips are checked at this interval, s
 _MOST_DEPTH, _MOST_GAP, _CHECK_EVERY = 0.02, 0.06, 0.2
-# clips are refused as often as so many poses
+# a clip is rejected as often as any of this many independent poses
 _CLIP_POSES = 2.5
-# people drawn to stand in for the refused: shares of all, of poses and of clips, and at least so many
+# spare samples that replace rejected ones: fraction of n for poses and for clips, plus a constant number
 _SPARES, _CLIP_SPARES, _LEAST_SPARES = 0.3, 0.8, 3
 
-# the trunk as an arm sees it from its shoulder, m, mean adult: an upright ellipse around the spine, half its depth and
-# width with the arm's own radius added; the arm's bones
+# collision model of arm and trunk, m, mean adult: an upright elliptic cylinder around the spine with half the trunk's
+# depth and width plus the arm's radius; distance of the shoulder from the spine; lengths of the arm's bones
 _TRUNK_DEPTH, _TRUNK_WIDTH, _SHOULDER = 0.15, 0.17, 0.18
 _UPPER_ARM, _FOREARM = 0.27, 0.25
-_FOREARM_POINTS = np.array([0.5, 1.0, 1.25])[:, None]  # shares of the forearm: its middle, the wrist, the hand
-# shoulder angles (ARM_ANGLES) added at each of the tries to free an arm
+_FOREARM_POINTS = np.array([0.5, 1.0, 1.25])[:, None]  # as fractions of the forearm: its middle, the wrist, the hand
+# angles (ARM_ANGLES) added in each try to move an arm out of the trunk, and the number of tries
 _FREE_ARM, _TRIES = np.array([16.0, 6.0, -16.0, 0.0]), 3
 
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnPoses:
     """Drawn poses. rotations (n, 24, 3, 3) float32, local, facing +x; kind (n,) indices into `KINDS`; moved
-    (n, 24, 3, 3) float32 the local rotations dt seconds later, step (n, 3) float32 m the way of the root until then,
-    both in the axes of `rotations`. With dt = 0 nothing has moved."""
+    (n, 24, 3, 3) float32, the local rotations dt seconds later, and step (n, 3) float32 m, the displacement of the root
+    until then, both in the axes of `rotations`. With dt = 0, moved equals rotations and step is 0."""
 
     rotations: np.ndarray
     kind: np.ndarray
@@ -77,9 +80,8 @@ class DrawnPoses:
 @dataclass(frozen=True, kw_only=True)
 class DrawnClips:
     """People in motion. rotations (n, F, 24, 3, 3) float32, local, the first frame facing +x; translation (n, F, 3)
-    float32 m, the way of the pelvis since the first frame on flat ground (z: on the mean adult); clearance (n, F)
-    float32 m, how far the lowest point is above the ground; kind (n,) indices into
-    `KINDS`."""
+    float32 m, displacement of the pelvis since the first frame on flat ground (z for the mean adult); clearance (n, F)
+    float32 m, height of the lowest point above the ground; kind (n,) indices into `KINDS`."""
 
     rotations: np.ndarray
     translation: np.ndarray
@@ -90,17 +92,17 @@ class DrawnClips:
 def sample_rotations(
     rng: np.random.Generator, n: int, *, mix: dict[str, float] | None = None, dt: float = 0.0
 ) -> DrawnPoses:
-    """Draws n poses from the prior, and with dt > 0 what they are dt seconds later; the poses do not depend on dt.
+    """Draws n poses from the prior and, if dt > 0, those dt seconds later. The first poses do not depend on dt.
 
     Args:
-        mix: Shares of the kinds (names of `KINDS`, any positive weights), by default people as a sensor beside a road
-            or at work sees them.
+        mix: Weights of the kinds by name (`KINDS`), not necessarily normalized; by default the mix of people at a road
+            or a workplace.
 
     Returns:
-        Poses whose root leans and tilts but has no yaw (`rig.heading` is 0).
+        Poses whose root may tilt and roll but has no yaw (`rig.heading` is 0).
 
     Raises:
-        InputError: For a negative n or dt, and a mix with unknown names or without weight.
+        InputError: For a negative n or dt, and for a mix with unknown names or no positive weight.
     """
     n = check_int("n", n, least=0)
     if not 0 <= dt < np.inf:
@@ -121,10 +123,10 @@ def sample_rotations(
 def sample_clips(
     rng: np.random.Generator, n: int, *, frames: int, hz: float = 10.0, mix: dict[str, float] | None = None
 ) -> DrawnClips:
-    """Draws n people who go on with what they do, `frames` moments at `hz` a second; mix as in `sample_rotations`.
+    """Draws n people in motion, `frames` frames at `hz` frames per second; mix as in `sample_rotations`.
 
     Raises:
-        InputError: For a negative n or frames, hz <= 0, or a wrong mix.
+        InputError: For a negative n or frames, hz <= 0, or an invalid mix.
     """
     n, frames = check_int("n", n, least=0), check_int("frames", frames, least=0)
     if not 0 < hz < np.inf:
@@ -163,17 +165,17 @@ def _kind_shares(mix: dict[str, float] | None) -> np.ndarray:
     shares = np.array([float(mix.get(name, 0)) for name in KINDS])
     if (shares < 0).any() or not shares.any():
         raise InputError(f"a mix needs weights of 0 or more and one above 0, got {mix}")
-    # a sum of large ones may be infinite
+    # the sum of large weights may overflow
     shares /= shares.max()
     return shares / shares.sum()
 
 
 def _draw_people(rng: np.random.Generator, n: int, shares: np.ndarray, times: np.ndarray) -> tuple[Latents, np.ndarray]:
-    """n people who do not pass through themselves, and rest on the ground, at times (T,) s, the kinds in the shares
-    (K,); and their rotations (n, T, 24, 3, 3) with the yaw they have.
+    """Draws n people, the kinds with probabilities `shares` (K,), who do not intersect themselves and rest on the
+    ground at times (T,) s. Returns their latents and rotations (n, T, 24, 3, 3) including yaw.
 
-    Spares are drawn along, of the kinds that are often refused; each stands in for somebody who is. Where there are
-    too few of them, the last stay as they are.
+    Spare people are drawn as well, mostly of kinds that are often rejected, and replace the rejected people. If there
+    are too few spares, the last rejected people are kept.
     """
     is_clip = len(times) > 1
     refused_share = 1 - (1 - activities.SELF_COLLISION) ** (_CLIP_POSES if is_clip else 1)
@@ -192,8 +194,8 @@ def _draw_people(rng: np.random.Generator, n: int, shares: np.ndarray, times: np
 
 
 def _violates_constraints(rotations: np.ndarray, kind: np.ndarray) -> np.ndarray:
-    """rotations (n, T, 24, 3, 3) of the kinds (n,) -> (n,) bool: at some moment parts are too deep in each other, or
-    what the body rests on is in the air."""
+    """rotations (n, T, 24, 3, 3) of the kinds (n,) -> (n,) bool: at some time, body parts overlap too much or a
+    supporting part is above the ground."""
     ends = constraints.capsule_ends(*constraints.body_frames(rotations.reshape(-1, 24, 3, 3)))
     is_invalid = constraints.self_collision(ends).max(1) > _MOST_DEPTH
     is_invalid |= constraints.hovering(ends, np.repeat(kind, rotations.shape[1])) > _MOST_GAP
@@ -201,7 +203,7 @@ def _violates_constraints(rotations: np.ndarray, kind: np.ndarray) -> np.ndarray
 
 
 def _poses(latents: Latents, times: np.ndarray) -> tuple[np.ndarray, Stride]:
-    """Rotations (n, T, 24, 3, 3) at times (T,) s with the yaw they have, and the strides (n T)."""
+    """Rotations (n, T, 24, 3, 3) at times (T,) s including yaw, and the strides (n T)."""
     n, moments = len(latents), len(times)
     if moments > 1 or times[0] != 0:
         latents = latents.take(np.repeat(np.arange(n), moments)).at(np.tile(times, n))
@@ -212,7 +214,7 @@ def _poses(latents: Latents, times: np.ndarray) -> tuple[np.ndarray, Stride]:
 
 
 def _motion(latents: Latents, times: np.ndarray) -> DrawnClips:
-    """The people at times (T,) s, facing +x at the first, which is 0."""
+    """The people at times (T,) s, facing +x at the first time, which is 0."""
     n, moments = len(latents), len(times)
     rotations, stride = _poses(latents, times)
     inverse_yaw = rotation_about("z", -heading(rotations[:, 0])).astype(np.float32)
@@ -232,7 +234,7 @@ def _motion(latents: Latents, times: np.ndarray) -> DrawnClips:
         displacement[is_traveling, :, :2] = path @ np.swapaxes(inverse_yaw[is_traveling, :2, :2], -1, -2)
         rotations[is_traveling, :, 0] = rotation_about("z", course).astype(np.float32) @ rotations[is_traveling, :, 0]
     lowest_height = points[..., 2].min(2)
-    # a runner's hips go on between two steps, a cyclist's stay where they are
+    # a runner's hips follow the gait's height in the flight phase, too; a cyclist's keep their height
     hip_height = stride.height.reshape(n, moments) + _HIPS_DOWN * flat_rotations[:, 0, 2, 2].reshape(n, moments)
     is_running, is_cycling = latents.kind == _RUN, latents.kind == _CYCLE
     clearance = np.where(is_running[:, None], np.maximum(hip_height + lowest_height, 0), 0)
@@ -244,10 +246,10 @@ def _motion(latents: Latents, times: np.ndarray) -> DrawnClips:
 
 
 def _angles(latents: Latents) -> Stride:
-    """The poses' angles (n, 27), degrees, inside the joints' ranges; arms may be in the trunk."""
+    """The poses' angles (n, 27), degrees, clipped to the joints' ranges; arms may still be in the trunk."""
     kind, captured_angles = latents.kind, latents.captured[:, 0]
     start, end, spread = activities.KIND_RANGES[:, kind]
-    # the cranks of a bicycle move the legs alone
+    # the cranks of a bicycle move only the legs
     range_fraction = np.where((kind == _CYCLE)[:, None] & _NO_LEG, latents.style[:, 1:2], latents.where[:, :1])
     angles = start + range_fraction * (end - start) + spread * latents.noise
     pace, height = np.zeros((2, len(kind)))
@@ -259,7 +261,7 @@ def _angles(latents: Latents) -> Stride:
     pace[is_cycling] = _GEAR[0] + _GEAR[1] * latents.style[is_cycling, 0]
     angles[kind == _CAPTURED] = captured_angles[kind == _CAPTURED]
 
-    # the table gives thighs from the vertical and feet from the floor: turn both into angles of the joints
+    # the table gives thighs relative to the vertical and feet relative to the floor: convert both to joint angles
     for side in ("left", "right"):
         hip, knee, ankle = (ANGLE_INDEX[f"{side}_{name}"] for name in ("hip", "knee", "ankle"))
         angles[:, ankle] += activities.FLAT_FOOT[kind] * (angles[:, knee] - angles[:, hip])
@@ -279,14 +281,14 @@ def _angles(latents: Latents) -> Stride:
 
 
 def _free_arms(angles: np.ndarray, moments: int) -> np.ndarray:
-    """angles (n * moments, 27) with arms moved forwards, outwards and out of their inward turn until the forearms of
-    each person's first moment leave the trunk; all moments by as much."""
+    """angles (n * moments, 27) with the arms moved forward and outward, and with less inward turn, until the forearms
+    at each person's first moment are outside the trunk. All moments of a person get the same correction."""
     arm_angles = angles[::moments, _BOTH_ARMS].reshape(-1, 4)
     rows = np.arange(len(arm_angles))
     correction = np.zeros_like(arm_angles)
     for _ in range(_TRIES):
         rows = rows[_in_trunk(np.clip(arm_angles[rows] + correction[rows], *_ARM_LIMITS))]
-        is_behind = arm_angles[rows, :1] < -20  # hands on the back go further back
+        is_behind = arm_angles[rows, :1] < -20  # hands behind the back are moved further back
         correction[rows] += np.where(is_behind, _FREE_ARM * [-0.5, 1.5, -1, 0], _FREE_ARM)
     angles[:, _BOTH_ARMS] = np.clip(
         angles[:, _BOTH_ARMS] + np.repeat(correction.reshape(-1, 8), moments, 0), *np.tile(_ARM_LIMITS, 2)
@@ -295,14 +297,14 @@ def _free_arms(angles: np.ndarray, moments: int) -> np.ndarray:
 
 
 def _in_trunk(arm_angles: np.ndarray) -> np.ndarray:
-    """Whether the forearm's middle or the hand is inside the trunk, (n,) bool; arm_angles (n, 4) degrees, in left-arm
-    signs."""
+    """Whether the forearm's middle, the wrist or the hand is inside the trunk, (n,) bool; arm_angles (n, 4) degrees,
+    with the signs of a left arm."""
     rad = np.radians(arm_angles)
     (cr, co, ci, ce), (sr, so, si, se) = np.cos(rad).T, np.sin(rad).T
-    # columns of R_y(-raised) R_x(out - 90) R_y(inward): the arm's y runs along it, its x is the way the elbow bends
+    # columns of R_y(-raised) R_x(out - 90) R_y(inward): y is along the arm, the elbow bends toward x
     crso, srso = cr * so, sr * so
     x = _UPPER_ARM * sr * co + _FOREARM * _FOREARM_POINTS * (se * (cr * ci + srso * si) + ce * sr * co)
     y = _UPPER_ARM * so + _FOREARM * _FOREARM_POINTS * (ce * so - se * co * si)
     z = -_UPPER_ARM * cr * co + _FOREARM * _FOREARM_POINTS * (se * (sr * ci - crso * si) - ce * cr * co)
-    # over the shoulders there is no trunk; the arm starts at its side
+    # there is no trunk above the shoulders; the arm starts at the trunk's side
     return (((x / _TRUNK_DEPTH) ** 2 + ((y + _SHOULDER) / _TRUNK_WIDTH) ** 2 < 1) & (z < 0.02)).any(0)
