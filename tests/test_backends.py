@@ -112,7 +112,7 @@ def test_compiling_is_asked_for_and_a_failure_is_one_line(models, monkeypatch):
     assert asked == [{"dynamic": True}]
     failing = mock.Mock(side_effect=torch._dynamo.exc.TorchDynamoException("no\ncompiler"))
     monkeypatch.setattr(torch, "compile", lambda module, **settings: failing)
-    with pytest.raises(InputError, match="torch.compile failed .no compiler.: leave compile away"):
+    with pytest.raises(InputError, match="torch.compile failed .no compiler.: omit compile"):
         load(compile=True).predict(blob(30))
 
 
@@ -235,7 +235,7 @@ def test_joints_at_the_end_of_the_range_are_named():
     assert set(pose.out_of_range) == {"neck", "head", "left_wrist", "left_hand"}
     np.testing.assert_array_equal(pose.in_range, [joint not in pose.out_of_range for joint in pose.skeleton.joints])
     (warning,) = pose.warnings
-    assert warning.startswith("at the end of the heatmap's range") and warning.endswith(" and 1 more")
+    assert warning.startswith("at the edge of the heatmap's range") and warning.endswith(" and 1 more")
     entry = json.loads(pose.to_json())["people"][0]
     assert entry["out_of_range"] == pose.out_of_range and len(entry["visible"]) == 24
     assert all(0 <= value <= 1 for value in entry["visible"])
@@ -297,7 +297,7 @@ BAD = {
     "weights": ({"weights": "tyni"}, "did you mean tiny"),
     "threads": ({"threads": 0}, "threads must be a whole number"),
     "threads of torch": ({"backend": "torch", "threads": -3}, "threads must be a whole number"),
-    "threads and torch": ({"backend": "torch", "threads": 3}, "threads are of the backend onnx"),
+    "threads and torch": ({"backend": "torch", "threads": 3}, "threads is an option of the backend onnx"),
     "onnx elsewhere": ({"backend": "onnx", "device": "cuda"}, "device 'cuda' needs the backend torch"),
     "onnx compiled": ({"backend": "onnx", "compile": True}, "torch.compile needs the backend torch"),
     "onnx file elsewhere": ({"weights": bundled_path(suffix=".onnx"), "device": "cuda"}, "needs the backend torch"),
@@ -455,7 +455,7 @@ def test_a_network_that_only_regresses(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "settings, words", [({"backend": "onnx"}, "not run as ONNX"), ({"compile": True}, "not offered")]
+    "settings, words", [({"backend": "onnx"}, "not run as ONNX"), ({"compile": True}, "not supported")]
 )
 def test_what_a_released_network_cannot_do_is_one_line(released, settings, words):
     with pytest.raises(InputError, match=words):

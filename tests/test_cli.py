@@ -435,7 +435,10 @@ BAD_COMMANDS = {
     "import into another kind": ("import DAPT DIR/x.onnx", "give a name that ends in .safetensors"),
     "import without an out": ("import DAPT", "OUT"),
     "a calibration of no boxes": ("predict CROP --calib DIR/c.txt", "calib is for boxes"),
-    "weights that pose nobody": (f"predict CROP --weights {weights_file('verifier.onnx')}", "poses nobody"),
+    "weights that pose nobody": (
+        f"predict CROP --weights {weights_file('verifier.onnx')}",
+        "contains a detection network",
+    ),
     "a checkpoint for a detector": (
         f"evaluate detector heldout --detector {weights_file('detector.safetensors')} --out DIR/x",
         "expected an ONNX file, got a checkpoint",

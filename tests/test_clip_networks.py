@@ -429,10 +429,10 @@ def test_frames_that_show_nothing_have_no_pose_and_harm_no_other(predictor, clip
 @pytest.mark.parametrize(
     "clips, told",
     [
-        (Clips.of_run(20), "each of the 4 clouds in one of them"),
-        (Clips.of_run(3), "each of the 4 clouds in one of them"),
+        (Clips.of_run(20), "each of the 4 clouds in one window"),
+        (Clips.of_run(3), "each of the 4 clouds in one window"),
         (Clips(windows=np.arange(4)[None]), "windows of 16 rows"),
-        (Clips(windows=np.repeat([[0, 1, 2, 3], [0, 1, 2, 3]], 4, axis=1)), "in one of them"),
+        (Clips(windows=np.repeat([[0, 1, 2, 3], [0, 1, 2, 3]], 4, axis=1)), "in one window"),
         (Clips.of_run(4, background=[np.zeros((5, 3))] * 3), "clouds of background as clouds, 4, got 3"),
         (Clips.of_run(4, neighbors=[np.zeros((5, 2))] * 4), r"neighbors\[0\] must be \(n, 3\)"),
     ],
@@ -444,7 +444,7 @@ def test_clips_that_do_not_fit_the_clouds_are_refused(predictor, clips, told):
 
 @pytest.mark.parametrize("given", [{"boxes": []}, {"find": True}])
 def test_clips_are_of_clouds_without_boxes(predictor, given):
-    with refused("leave it away with boxes and find"):
+    with refused("omit clips with boxes or find"):
         predictor.predict(np.zeros((20, 3)), clips=Clips.of_run(1), **given)
 
 

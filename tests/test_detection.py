@@ -204,7 +204,7 @@ def test_boxes_of_a_tilted_scan_say_what_is_up(model, scene, tmp_path, axis):
     np.testing.assert_array_equal(model.predict(points, boxes=boxes).to_numpy(), again.to_numpy())
     # but what is said counts, unless it is another axis
     assert lidarpose.predict(path, boxes=boxes, up=axis, model=model).up == axis
-    with pytest.raises(InputError, match="the boxes say that up is"):
+    with pytest.raises(InputError, match="the up axis of the boxes is"):
         lidarpose.predict(path, boxes=boxes, up="x", model=model)
 
 
@@ -259,7 +259,7 @@ def test_axes_are_told(scene):
     # nobody is in them with any axis up
     empty = scene[0][alone(scene[0])]
     (warning,) = lidarpose.detect(empty @ UP_AXES["y"]).warnings
-    assert "hardly the input's up axis: try up y" in warning
+    assert "probably not the input's up axis: try up y" in warning
     (warning,) = lidarpose.detect(empty * [1, -1, -1], sensor_origin="unknown").warnings
     assert "no ground was found" in warning and "up axis" in warning
 
@@ -273,7 +273,7 @@ def test_a_warning_names_the_axis_with_which_people_are_detected(scene, file, up
         (warning,) = boxes.warnings
         number = len(lidarpose.detect(points @ UP_AXES[up], up=up))
         assert not boxes and number >= 3
-        assert warning == f"nobody is found with up z, but {number} people with up {up}: try up {up}"
+        assert warning == f"no people found with up z, but {number} people with up {up}: try up {up}"
     np.save(file, near @ UP_AXES[up])
     assert lidarpose.predict(file).warnings == (warning,)
 
@@ -291,7 +291,7 @@ def test_the_sensor_stands_at_zero_unless_it_cannot(scene, fake):
     height = np.array([0, 0, 1.8])
     for moved, problem in ((np.array([5e5, 5e6, 0]), "nearest point"), (height, "no ground below it")):
         boxes = lidarpose.detect(points + moved)
-        assert any(problem in warning and "taken as unknown" in warning for warning in boxes.warnings), problem
+        assert any(problem in warning and "treated as unknown" in warning for warning in boxes.warnings), problem
         assert fake.calls[-1]["origin"] is None
         assert sum(found_at([found.center - moved for found in boxes], joints)) >= 4
         assert lidarpose.detect(points + moved, sensor_origin=moved).warnings == ()
@@ -416,7 +416,7 @@ def test_a_background_is_not_searched(scene, tmp_path, fake):
     poses = lidarpose.predict(tmp_path / "recording" / "0.npy", background=tmp_path / "static.npy", model="tiny")
     assert len(poses) == 0
     other = lidarpose.detect(points, background=static + [0, 0, 9.0])
-    assert any("of this sensor" in warning for warning in other.warnings) and len(other) == len(PLACES)
+    assert any("from this sensor" in warning for warning in other.warnings) and len(other) == len(PLACES)
     itself = lidarpose.detect(points, background=points)
     assert len(itself) == 0 and "learned from this scan alone?" in itself.warnings[0]
 
@@ -450,9 +450,9 @@ def test_wrong_options_are_told(scene, options, words):
 def test_boxes_and_crops_are_not_searched(model, file, fake, scene):
     for given in ({"boxes": []}, {"crop": True}):
         for option in ({"find": True}, {"min_score": 0.5}, {"max_people": 1}, {"background": file}, {"max_range": 9.0}):
-            with pytest.raises(InputError, match="searched for: leave them away with boxes or a crop"):
+            with pytest.raises(InputError, match="options of the detection: omit them with boxes or a crop"):
                 lidarpose.predict(file, **given, **option, model=model)
-    with pytest.raises(InputError, match="leave it away with boxes"):
+    with pytest.raises(InputError, match="find is an option of the detection: omit it with boxes"):
         model.predict(scene[0], boxes=[], find=True)
     # a small file is one person unless it is to be searched
     near = scene[0][np.linalg.norm(scene[0][:, :2] - PLACES[0], axis=1) < 1.5]
@@ -461,7 +461,7 @@ def test_boxes_and_crops_are_not_searched(model, file, fake, scene):
     # and options of a search that is not made are told
     for option in ({"min_score": 0.5}, {"background": file}):
         (person,) = lidarpose.predict("small.npy", **option, model=model)
-        assert person.box is None and any("find looks for people" in warning for warning in person.warnings)
+        assert person.box is None and any("use find to detect people" in warning for warning in person.warnings)
     assert lidarpose.predict("small.npy", find=True, sensor_origin="unknown", model=model)[0].box is not None
 
 

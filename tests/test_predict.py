@@ -184,7 +184,7 @@ def test_too_few_points_are_no_pose(model, cloud, words):
 def test_no_returns_are_no_points(model, points, tmp_path):
     empty = np.zeros((300, 3))
     pose = model.predict(np.concatenate([empty, points]))
-    assert pose.warnings == (f"dropped 300 of {len(points) + 300} points at 0,0,0, which are no returns",)
+    assert pose.warnings == (f"dropped 300 of {len(points) + 300} points at 0,0,0, which are not returns",)
     np.testing.assert_array_equal(pose.points, points)
     assert model.predict(empty).joints is None
     np.save(tmp_path / "empty.npy", empty)
@@ -469,7 +469,7 @@ def test_a_sensor_that_cannot_have_seen_the_people_is_unknown(model, sweep, tmp_
     np.save(tmp_path / "utm.npy", np.concatenate(clouds).astype(float) + offset)
     moved = [{**box, "center": (offset + box["center"]).tolist()} for box in boxes]
     people = lidarpose.predict(tmp_path / "utm.npy", boxes=moved, model=model)
-    assert any("taken as unknown" in warning for warning in people.warnings)
+    assert any("treated as unknown" in warning for warning in people.warnings)
     blind = lidarpose.predict(path, boxes=boxes, sensor_origin="unknown", model=model)
     assert np.abs(people[0].joints - offset - blind[0].joints).max() < 1e-5
     given = lidarpose.predict(tmp_path / "utm.npy", boxes=moved, sensor_origin=offset, model=model)
@@ -585,7 +585,7 @@ def test_two_people_in_a_crop_are_flagged_and_the_flag_says_who_is_meant(model, 
     boxed = model.predict(both, boxes=[box], sensor_origin=(0, 0, 0))[0]
     for person, who in (
         (boxed, "of the one nearer to the center of the box"),
-        (model.predict(both, sensor_origin=(0, 0, 0)), "of one of them: a box about somebody says who is meant"),
+        (model.predict(both, sensor_origin=(0, 0, 0)), "of one of them: give a box to choose one"),
     ):
         assert person.second_person > 0.5 and person.person > 0.5
         assert any("two people" in line and line.endswith(who) for line in person.warnings)
@@ -708,13 +708,13 @@ def test_bundled_networks_are_kept_and_files_are_loaded_anew(tmp_path):
 
 @pytest.mark.parametrize("wrong", [torch.nn.Linear(3, 3), lambda points: points, lambda: None, object()])
 def test_a_model_that_is_no_predictor_is_refused(points, wrong):
-    with pytest.raises(InputError, match="^model: expected a predictor, weights .*: make one by lidarpose.load$"):
+    with pytest.raises(InputError, match="^model: expected a predictor, weights .*: make one with lidarpose.load$"):
         lidarpose.predict(points, crop=True, model=wrong)
 
 
 def test_boxes_of_another_up_axis_are_refused(model, points):
     boxes = lidarpose.read_boxes({"schema": "lidarpose.boxes/1", "up": "y", "people": [box_around(points)]})
-    with pytest.raises(InputError, match="the boxes say that up is y, not z: give up y"):
+    with pytest.raises(InputError, match="the up axis of the boxes is y, not z: give up y"):
         lidarpose.predict(points, boxes=boxes, up="z", model=model)
     assert lidarpose.predict(points, boxes=boxes, up=[0, 1, 1e-3], model=model).up == "0.0,1.0,0.001"
 
@@ -803,7 +803,7 @@ def test_people_by_id_and_slices(poses):
     named = replace(poses, people=tuple(replace(p, id=i) for p, i in zip(poses, ("a", "b", 7), strict=True)))
     assert named["b"] is named[1] and named["7"] is named[2]
     assert isinstance(named[1:], type(poses)) and [p.id for p in named[1:]] == ["b", 7]
-    with pytest.raises(KeyError, match="nobody has the id 'c'"):
+    with pytest.raises(KeyError, match="no person has the id 'c'"):
         named["c"]
 
 

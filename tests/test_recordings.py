@@ -273,7 +273,7 @@ def test_boxes_with_another_axis_up_are_not_taken_for_these_frames(drive, tmp_pa
     (tmp_path / "b.json").write_text(json.dumps([{"frame": k} | entry for k in range(2)]))
     words = ["predict", str(drive), "--end", "0.1", "--boxes", str(tmp_path / "b.json"), "--out"]
     assert main([*words, str(tmp_path / "o.jsonl")]) == 2
-    assert "the boxes say that up is y, not z: give up y" in capsys.readouterr().err
+    assert "the up axis of the boxes is y, not z: give up y" in capsys.readouterr().err
     assert main([*words, str(tmp_path / "o.jsonl"), "--up", "y"]) == 0
 
 
@@ -373,7 +373,7 @@ def test_the_first_frame_names_the_axis_with_which_people_are_detected(clouds, m
         np.save(tmp_path / f"{k}.npy", points @ UP_AXES["-y"])
     first, *others = lidarpose.predict_recording(tmp_path, model=model)
     assert not len(first.poses) and any(line.endswith("try up -y") for line in first.poses.warnings)
-    assert not any("nobody is found" in line for frame in others for line in frame.poses.warnings)
+    assert not any("no people found" in line for frame in others for line in frame.poses.warnings)
     frames = list(lidarpose.predict_recording(tmp_path, model=model, up="-y"))
     assert [len(frame.poses) for frame in frames] == [2, 2, 2]
 
@@ -529,7 +529,9 @@ def test_warnings_that_differ_in_numbers_and_their_signs_are_one():
     """As of a tilted sensor, whose direction jitters about an axis."""
     summary = output.Summary()
     for up in ("-0.342,0.003,0.94", "-0.341,-0.002,0.94", "-0.342,0,0.94", "0.342,0.003,-0.94"):
-        summary.add({"people": [], "error": None, "warnings": [f"the ground leans by 20 degrees: say it by up={up}"]})
+        summary.add(
+            {"people": [], "error": None, "warnings": [f"the ground leans by 20 degrees: confirm it with up={up}"]}
+        )
     (line,) = summary.warning_lines(8)
     assert line.startswith("4 frames: ") and line.endswith("up=-0.342,0.003,0.94")
     summary.add({"people": [], "error": None, "warnings": ["under 5 points"]})

@@ -359,7 +359,7 @@ def test_a_background_is_learned_without_what_is_damaged(tmp_path, monkeypatch):
     monkeypatch.undo()
     for k in range(5):
         (tmp_path / f"{k}.npy").write_bytes(b"damaged")
-    with pytest.raises(InputError, match="background: of 5 scans none can be read, the first: .*0.npy: "):
+    with pytest.raises(InputError, match="background: none of 5 scans can be read, the first: .*0.npy: "):
         read_background(tmp_path)
 
 

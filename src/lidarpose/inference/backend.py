@@ -151,7 +151,7 @@ def exported_beside(path: str | os.PathLike, *, threads: int | None = None) -> O
     path = Path(path)
     header = read_header(path)
     if header.network != "pose":
-        raise file_error(path, f"the network {header.network} does not run as ONNX: leave backend away, or say torch")
+        raise file_error(path, f"the network {header.network} does not run as ONNX: omit backend, or use torch")
     onnx_path = path.with_suffix(".onnx")
     hint = f"make it with `lidarpose export {path} --out {onnx_path}`, or use backend torch"
     if not onnx_path.is_file():
@@ -174,7 +174,7 @@ def estimates(raw: Raw, decoder: Decoder, skeleton: Skeleton) -> Pose:
         # the joint may lie beyond the heatmap on any axis
         in_range = ~np.any([out_of_range(heatmap) for heatmap in raw.heatmaps], axis=0)
     if joints.size and not np.isfinite(joints).any():
-        raise InputError("the network answers with no numbers: its weights are damaged, get the file again")
+        raise InputError("the network predicts no finite joints: its weights are damaged, get the file again")
     confidence = None if raw.confidence is None else sigmoid(raw.confidence)
     spread = None if raw.log_spread is None else np.exp(np.minimum(raw.log_spread.astype(float), _LARGEST_LOG_SPREAD))
     if confidence is None and raw.heatmaps is not None:

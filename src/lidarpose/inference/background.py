@@ -82,7 +82,7 @@ def learn_background(
             else np.intersect1d(static_voxels, frequent_voxels, assume_unique=True)
         )
     if grid is None or static_voxels is None:
-        raise InputError(f"background: of {counted(len(sources), 'scan')} none can be read, the first: {problems[0]}")
+        raise InputError(f"background: none of {counted(len(sources), 'scan')} can be read, the first: {problems[0]}")
     if problems:
         left_out = f"{len(problems)} of {counted(len(sources), 'scan')} left out"
         warnings.warn(f"background: {left_out}, the first: {problems[0]}", stacklevel=2)

@@ -90,7 +90,7 @@ def oversize_warning(points: np.ndarray, pose: Pose) -> str | None:
     width = float(np.ptp(points[:, :2], axis=0).max())
     if width > _WIDEST_CROP:
         return (
-            f"the points reach over {width:,.0f} m, and one person was looked for near their middle: expected a crop "
+            f"the points extend over {width:,.0f} m, and one pose was estimated near their middle: expected a crop "
             "of one person: give the people's boxes, or crop closer"
         )
     low, high = np.percentile(points[:, 2], _TRIMMED)
@@ -99,7 +99,7 @@ def oversize_warning(points: np.ndarray, pose: Pose) -> str | None:
         return None
     return (
         f"the points are {high - low:.1f} m tall, taller than a person: expected meters, perhaps they are in feet or "
-        "another unit, or the crop holds more than a person"
+        "another unit, or the crop contains more than one person"
     )
 
 
@@ -110,11 +110,11 @@ def person_count_warning(pose: Pose, *, in_box: bool = False, is_scored: bool = 
     the existence of the person is not questioned.
     """
     if not is_scored and pose.person is not None and pose.person < _NOBODY:
-        return f"the points look unlike a person (person {float(pose.person):.2f}): perhaps nobody is there"
+        return f"the points look unlike a person (person {float(pose.person):.2f}): perhaps there is no person"
     if pose.second_person is not None and pose.second_person > _TWO:
         if in_box:
             return "the points look like two people: the pose is of the one nearer to the center of the box"
-        return "the points look like two people, and the pose is of one of them: a box about somebody says who is meant"
+        return "the points look like two people, and the pose is of one of them: give a box to choose one"
     return None
 
 
@@ -129,7 +129,7 @@ def upside_down_warning(pose: Pose, turned: Pose | None) -> str | None:
         return None
     if turned.spread.mean() > _CLEARLY_SURER * pose.spread.mean():
         return None
-    return "upside down the person is found with more certainty: does the up axis point down? try up -z"
+    return "the pose is more certain upside down: does the up axis point down? try up -z"
 
 
 def is_lying(pose: Pose, points: np.ndarray) -> bool:
@@ -197,7 +197,7 @@ def boxes_at_feet(scan: Scan, people: Poses) -> str | None:
     trunk_count, sky_count = (raised_heights < _CHEST).sum(), (raised_heights > _TOP).sum()
     if trunk_count < max(_FEWEST, len(heights) / 4) or sky_count > _ELSEWHERE * len(raised_heights):
         return None
-    return "people stand in the upper half of their boxes and above: is center at the feet? add half the height"
+    return "people are in the upper half of their boxes and above: is center at the feet? add half the height"
 
 
 SCAN_CHECKS: tuple[Callable[[Scan, Poses], str | None], ...] = (box_units, empty_boxes, wide_boxes, boxes_at_feet)
@@ -229,7 +229,7 @@ def origin_warning(scan: Scan) -> str | None:
         return None
     position = ",".join(f"{value:g}" for value in scan.origin)
     return (
-        f"the sensor at {position} is {distance:,.0f} m from the people, so its place is taken as unknown: "
+        f"the sensor at {position} is {distance:,.0f} m from the people, so its position is treated as unknown: "
         "give it in the points' own frame and in meters (sensor_origin)"
     )
 
@@ -240,10 +240,10 @@ def scan_unit_warning(points: np.ndarray, count: int) -> str | None:
     extent = _extent(points)
     width, largest = float(extent[:2].max()), float(extent.max())
     if largest < _SMALLEST_SCAN:
-        return f"the points reach over {largest:.2g} m: are the units kilometers? multiply all coordinates by 1000"
+        return f"the points extend over {largest:.2g} m: are the units kilometers? multiply all coordinates by 1000"
     if width > _LONGEST_SCAN and count < _SPARSEST * width**2:
         unit, factor = ("millimeters", 1000) if width > _LONG_IN_MILLIMETERS else ("centimeters", 100)
-        return f"the points reach over {width:,.0f} m: are the units {unit}? divide all coordinates by {factor}"
+        return f"the points extend over {width:,.0f} m: are the units {unit}? divide all coordinates by {factor}"
     return unit_warning(extent, what="the scan")
 
 
@@ -258,7 +258,9 @@ def unlikely_origin(points: np.ndarray, origin: np.ndarray) -> str | None:
         problem = "has no ground below it"
     else:
         return None
-    return f"the sensor {problem}, so its place is taken as unknown: give it in the points' own frame (sensor origin)"
+    return (
+        f"the sensor {problem}, so its position is treated as unknown: give it in the points' own frame (sensor origin)"
+    )
 
 
 def flat_axis(points: np.ndarray) -> str | None:
@@ -277,7 +279,9 @@ def flat_along_another_axis(scan: Scan) -> str | None:
     axis = flat_axis(scan.points)
     if axis is None or axis == scan.upright_axis:
         return None
-    return f"the points extend least along {axis}, so {scan.up} is hardly the input's up axis: try {_option(axis)}"
+    return (
+        f"the points extend least along {axis}, so {scan.up} is probably not the input's up axis: try {_option(axis)}"
+    )
 
 
 def all_lying(scan: Scan, people: Poses) -> str | None:

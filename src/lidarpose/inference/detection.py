@@ -168,7 +168,7 @@ def other_up_axis(places: "DetectedScan", search: Search) -> str | None:
     if not boxes[best_axis]:
         return None
     people = counted(len(boxes[best_axis]), "person", "people")
-    return f"nobody is found with up {input_scan.up}, but {people} with up {best_axis}: try up {best_axis}"
+    return f"no people found with up {input_scan.up}, but {people} with up {best_axis}: try up {best_axis}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -206,7 +206,7 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
         degrees = np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1, 1)))
         direction = np.round(up @ scan.R_level_input, 3)
         warnings.append(
-            f"the ground leans by {degrees:.0f} degrees, which is taken for a tilt of the sensor: say it by "
+            f"the ground leans by {degrees:.0f} degrees, so the sensor is assumed to be tilted: confirm it with "
             f"up={','.join(f'{value:g}' for value in direction)}"
         )
         scan = replace(scan, up=up_text(up @ scan.R_level_input))
@@ -224,17 +224,18 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
         is_moving = ~is_static(scan.points, search.background)
         if (static_share := 1 - is_moving.mean()) < _LEAST_STATIC:
             warnings.append(
-                f"only {static_share:.0%} of the points lie on the background: is it of this sensor, in this frame?"
+                f"only {static_share:.0%} of the points lie on the background: is the background "
+                "from this sensor and in this frame?"
             )
         elif not is_moving.any():
             warnings.append(
-                "all points lie on the background, so nobody is looked for: was it learned from this scan alone? "
+                "all points lie on the background, so no people can be found: was it learned from this scan alone? "
                 "record for ten seconds or more"
             )
     detector = search.detector or _detector()
     detections = detector.detect(level, origin, max_range=search.max_range, limit=MOST_POSED, moving=is_moving)
     if not (detections.has_ground or frame_warning):
-        warnings.append("no ground was found, and people are searched without it: is the up axis right?")
+        warnings.append("no ground was found, so people are detected without it: is the up axis correct?")
     scan = replace(scan, warnings=tuple(warnings))
     return DetectedScan(given=input_scan, scan=scan, level=level, detections=detections, moving=is_moving)
 
@@ -322,7 +323,8 @@ def _thinned(scan: Scan, search: Search) -> tuple[Scan, list[str]]:
     rows, notes = np.concatenate(kept_rows), []
     if len(rows) < num_searched and (squared_dense_range is None or squared_dense_range > search.max_range**2):
         notes = [
-            f"thinned from {num_searched:,} to {len(rows):,} points to search them: give one scan at a time, or a part"
+            f"thinned from {num_searched:,} to {len(rows):,} points for detection: give one scan at a time, or a "
+            "part of it"
         ]
     return replace(scan, points=points[rows]), notes
 

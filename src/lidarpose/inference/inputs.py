@@ -65,8 +65,8 @@ class Clips:
         rows = [row for window in windows for row in np.unique(window).tolist()]
         if windows.ndim != 2 or windows.shape[1] != CLIP_FRAMES or sorted(rows) != list(range(count)):
             raise InputError(
-                f"clips: expected windows of {CLIP_FRAMES} rows, each of the {count} clouds in one of them, as "
-                f"Clips.of_run({count}) has them, got {reprlib.repr(windows.tolist())}"
+                f"clips: expected windows of {CLIP_FRAMES} rows, with each of the {count} clouds in one window, as "
+                f"in Clips.of_run({count}), got {reprlib.repr(windows.tolist())}"
             )
         surroundings = {}
         for name in ("background", "neighbors"):
@@ -143,7 +143,7 @@ def as_points(points: Any, what: str = "points") -> np.ndarray:
         )
     if array.ndim != 2 or array.shape[1] < 3 or looks_transposed or looks_depth:
         remedy = ": give points.T" if looks_transposed else ""
-        remedy = ": of a depth image give the points that its pixels are" if looks_depth else remedy
+        remedy = ": convert the depth image to points" if looks_depth else remedy
         raise InputError(f"{what} must be (n, 3) or (n, 3 + more) with x, y, z first, got shape {array.shape}{remedy}")
     return array[:, :3].astype(np.float64)
 
@@ -174,7 +174,7 @@ def clip_times(times: Any, count: int) -> np.ndarray:
         seconds = np.full(0, np.nan)
     if seconds.shape != (count,) or not (np.isfinite(seconds).all() and (np.diff(seconds) > 0).all()):
         raise InputError(
-            f"times: expected {count} finite numbers of seconds, one a cloud, each later than the one before, "
+            f"times: expected {count} finite numbers of seconds, one per cloud, each later than the one before, "
             f"got {reprlib.repr(times)}"
         )
     return seconds
@@ -196,7 +196,7 @@ def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     points, notes = _finite_returns(points)
     if len(points) > MAX_POINTS:
         notes.append(
-            f"thinned from {len(points)} to {MAX_POINTS} points: crop closer to the person if there are others"
+            f"thinned from {len(points)} to {MAX_POINTS} points: crop closer to the person if the crop contains others"
         )
         points = points[np.arange(MAX_POINTS) * len(points) // MAX_POINTS]
     return points, notes
@@ -211,8 +211,8 @@ def rounding_warning(points: np.ndarray) -> str | None:
     if step < _COARSE or not np.array_equal(points.astype(np.float32), points):
         return None
     return (
-        f"coordinates are rounded to {step:g} m, as 32-bit numbers of their size are: subtract an offset before they "
-        "are saved"
+        f"coordinates are rounded to {step:g} m, the precision of 32-bit floats at this magnitude: subtract an "
+        "offset before saving"
     )
 
 
@@ -231,7 +231,7 @@ def _finite_returns(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     # organized clouds fill pixels without a return with 0, 0, 0; a single zero may be a point of a centered cloud
     is_zero = ~points.any(1)
     if (num_zeros := int(is_zero.sum())) > 1:
-        notes.append(f"dropped {num_zeros} of {len(points)} points at 0,0,0, which are no returns")
+        notes.append(f"dropped {num_zeros} of {len(points)} points at 0,0,0, which are not returns")
         is_usable &= ~is_zero
     return (points[is_usable], notes) if notes else (points, [])
 

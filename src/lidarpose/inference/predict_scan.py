@@ -104,7 +104,7 @@ def predict(
     scan = read_scan(scan, path, columns)
     find = find or boxes is None and not crop and (not len(scan.points) or is_wide(scan))
     if not find and any(option is not None for option in options):
-        note = f"taken as one person, since under {CROP_SIZE:g} m across, and not searched: find looks for people"
+        note = f"treated as one person because under {CROP_SIZE:g} m across: use find to detect people"
         scan = replace(scan, warnings=(*scan.warnings, note))
     if sensor_origin is None and (find or boxes is not None):
         scan = replace(scan, origin=np.zeros(3))
@@ -129,8 +129,8 @@ def predictor_of(model: "Predictor | str | os.PathLike | Callable[[], Predictor]
         predictor = model()
     if not isinstance(predictor, Predictor):
         raise InputError(
-            "model: expected a predictor, weights by name or path, or a function without arguments that gives a "
-            f"predictor, got {type(predictor).__name__}: make one by lidarpose.load"
+            "model: expected a predictor, weights by name or path, or a function without arguments that returns "
+            f"a predictor, got {type(predictor).__name__}: make one with lidarpose.load"
         )
     return predictor
 
@@ -197,15 +197,15 @@ def check_up(boxes: Boxes, up: str | Sequence[float], *, most: float = _SAME_UP)
     directions, as unit vectors."""
     difference = rotation_from_up(boxes.up)[2] - rotation_from_up(up)[2]
     if boxes.up != "z" and np.linalg.norm(difference) > most:
-        raise InputError(f"the boxes say that up is {boxes.up}, not {up_text(up)}: give up {boxes.up}")
+        raise InputError(f"the up axis of the boxes is {boxes.up}, not {up_text(up)}: give up {boxes.up}")
 
 
 def check_choice(boxes: object, crop: bool, searched: bool, calib: object) -> None:
     """Raises InputError if more than one of boxes, crop and search is given, or a calibration without boxes."""
     if calib is not None and boxes is None:
-        raise InputError("calib is for boxes that are a KITTI label: expected boxes too, got none: name the label")
+        raise InputError("calib is for boxes from a KITTI label: expected boxes too, got none: give the label")
     if boxes is not None and crop:
-        raise InputError("expected boxes or a crop, got both: a crop is one person already, so leave the boxes away")
+        raise InputError("expected boxes or a crop, got both: a crop contains one person, so omit the boxes")
     if searched and (boxes is not None or crop):
         options = "find, min score, range, max people and background"
-        raise InputError(f"{options} are for people who are searched for: leave them away with boxes or a crop")
+        raise InputError(f"{options} are options of the detection: omit them with boxes or a crop")

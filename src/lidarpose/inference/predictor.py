@@ -105,9 +105,9 @@ def load(
         backend = "onnx" if is_exported or is_bundled and is_plain else "torch"
     if backend == "torch":
         if is_exported:
-            raise file_error(path, "torch runs a .safetensors file, not .onnx: name the one that it was made from")
+            raise file_error(path, "torch runs a .safetensors file, not .onnx: give the file that it was exported from")
         if threads is not None:
-            raise InputError("threads are of the backend onnx: for torch call torch.set_num_threads")
+            raise InputError("threads is an option of the backend onnx: for torch call torch.set_num_threads")
         network_backend = _torch_backend(path, device, compile)
     elif not is_plain:
         option = "torch.compile" if compile else f"device {device!r}"
@@ -120,7 +120,7 @@ def load(
     else:
         network_backend = exported_beside(path, threads=threads)
     if not network_backend.header.config.poses:
-        raise file_error(path, "holds a network that poses nobody: name weights of a pose network")
+        raise file_error(path, "contains a detection network: give the weights of a pose network")
     return Predictor(network_backend, name=path.stem, decode=decode, tta=tta)
 
 
@@ -246,11 +246,11 @@ class Predictor(PoseEstimator):
         """
         self.in_skeleton(skeleton)
         if clips is not None and getattr(self.backend, "frames", 1) == 1:
-            raise InputError(f"clips are for networks of clips, {self.model['name']} reads single frames")
+            raise InputError(f"clips are for networks that read clips, {self.model['name']} reads single frames")
         if find and boxes is not None:
-            raise InputError("find is for people who are searched for: leave it away with boxes")
+            raise InputError("find is an option of the detection: omit it with boxes")
         if clips is not None and (find or boxes is not None):
-            raise InputError("clips are of a list of clouds, each of one person: leave it away with boxes and find")
+            raise InputError("clips need a list of clouds, each of one person: omit clips with boxes or find")
         if boxes is not None or find:
             cloud, notes = only_returns(as_points(points))
             origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)
@@ -297,7 +297,7 @@ class Predictor(PoseEstimator):
         """
         self.in_skeleton(skeleton)
         if not _is_many(clouds) and getattr(clouds, "ndim", 0) != 3:
-            raise InputError("predict_clip: expected a list of clouds, one a frame, got one cloud: use predict")
+            raise InputError("predict_clip: expected a list of clouds, one per frame, got one cloud: use predict")
         seconds = clip_times(times, len(clouds))
         clips = Clips.of_run(len(clouds)) if len(clouds) and getattr(self.backend, "frames", 1) > 1 else None
         frame_clouds = [as_points(cloud, f"clouds[{i}]") for i, cloud in enumerate(clouds)]
@@ -454,7 +454,7 @@ def _range_warning(pose: Pose) -> str | None:
     if pose.in_range is None or pose.in_range.all():
         return None
     names = [name for name, is_in_range in zip(pose.skeleton.joints, pose.in_range, strict=True) if not is_in_range]
-    return f"at the end of the heatmap's range, so perhaps farther out than given: {first_names(names)}"
+    return f"at the edge of the heatmap's range, perhaps farther out than predicted: {first_names(names)}"
 
 
 def _with_person_probabilities(person: PersonPose, pose: Pose | None) -> Pose | None:

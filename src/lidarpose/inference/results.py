@@ -237,9 +237,9 @@ class Poses(Sequence[PersonPose]):
             named_people = [person for person in self.people if person.id is not None]
             matches = [person for person in named_people if str(person.id) == index]
             if self.people and not named_people:
-                raise KeyError(f"nobody has the id {index!r}: ids are not set, take people by place, as [0]")
+                raise KeyError(f"no person has the id {index!r}: ids are not set, use a position, such as [0]")
             if not matches:
-                raise KeyError(f"nobody has the id {index!r}: ids are {[person.id for person in self.people]}")
+                raise KeyError(f"no person has the id {index!r}: ids are {[person.id for person in self.people]}")
             return matches[0]
         return self.people[index]
 

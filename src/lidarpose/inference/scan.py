@@ -103,7 +103,7 @@ def read_scan(scan: Scan, points: str | os.PathLike | ArrayLike, columns: int | 
     cloud = Cloud(points=as_points(points)) if source is None else read_points(source, columns=columns)
     returns, notes = only_returns(cloud.points)
     if source is not None and not len(returns):
-        problem = f"none within {FARTHEST:g} m" if cloud.points.any() else "only 0,0,0, which are no returns"
+        problem = f"none within {FARTHEST:g} m" if cloud.points.any() else "only 0,0,0, which are not returns"
         raise file_error(source, f"expected points in meters, got {problem}: export it again")
     return replace(scan, points=returns, warnings=(*cloud.warnings, *notes), source=source)
 

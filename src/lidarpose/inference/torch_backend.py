@@ -46,7 +46,7 @@ def torch_backend(path: str | os.PathLike, *, device: str = "cpu", compile: bool
 
 def no_poses(network: nn.Module, header: Header, **settings: Any) -> Backend:
     """Raises InputError. Placeholder for the backend of networks that do not predict joints."""
-    raise InputError(f"the network {header.network} finds people and poses nobody: name weights of a pose network")
+    raise InputError(f"the network {header.network} predicts no poses: give the weights of a pose network")
 
 
 class TorchBackend:
@@ -77,7 +77,7 @@ class TorchBackend:
             values = self._module(*tensors)
         except torch._dynamo.exc.TorchDynamoException as error:
             reason = " ".join(str(error).split())[:160]
-            raise InputError(f"torch.compile failed ({reason}): leave compile away") from None
+            raise InputError(f"torch.compile failed ({reason}): omit compile") from None
         names = output_names(self.network.config)
         return Raw.from_pose({name: value.cpu().numpy() for name, value in zip(names, values, strict=True)})
 
@@ -90,9 +90,7 @@ class _PaperBackend:
 
     def __init__(self, network: nn.Module, header: Header, *, device: str = "cpu", compile: bool = False):
         if compile:
-            raise InputError(
-                "torch.compile is not offered for the paper's network and its baselines: leave compile away"
-            )
+            raise InputError("torch.compile is not supported for the paper's network and its baselines: omit compile")
         self.network: Any = network.to(device).eval()
         self.header = header
         self.device = device
