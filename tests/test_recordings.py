@@ -128,7 +128,7 @@ def test_a_killed_command_goes_on_and_ends_the_same(flag, drive, folder, tracked
     monkeypatch.setattr(FramePredictor, "_predicted", killed)
     run(*words, status=130)
     error = capsys.readouterr().err
-    assert f"stopped: the finished frames are in {path}, and the same command goes on" in error
+    assert f"stopped: the finished frames are in {path}, and the same command resumes" in error
     # a torn line, and one that is whole but that the predictor's state does not know
     with open(path, "ab") as file:
         file.write(path.read_bytes().splitlines()[0] + b'\n{"schema": "lidar')
@@ -151,7 +151,7 @@ def test_a_command_stopped_before_its_frames_leaves_nothing_and_after_them_says_
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, stop)
             run(*words, status=130)
-        assert ("a.jsonl.part, and the same command goes on" in capsys.readouterr().err) is is_kept
+        assert ("a.jsonl.part, and the same command resumes" in capsys.readouterr().err) is is_kept
         assert bool(list(tmp_path.iterdir())) is is_kept
     assert len(run(*words)) == 2
 
@@ -174,7 +174,7 @@ def test_lines_of_another_command_are_not_gone_on_with(drive, folder, monkeypatc
     assert not list(folder.glob("wrong*"))
     capsys.readouterr()
     assert main(["predict", str(drive), "--end", "0.2", "--max-people", "1", "--out", str(out)]) == 0
-    assert "of another command (max_people): beginning anew" in capsys.readouterr().err
+    assert "from another command (max_people): starting over" in capsys.readouterr().err
     assert [len(json.loads(line)["people"]) for line in open(out)] == [1, 1, 1]
 
 
@@ -186,11 +186,11 @@ def test_finished_lines_of_other_frames_are_an_error(drive, folder, monkeypatch,
         written = part.path.read_bytes()
         # by another process, whatever its command is
         for command in ({}, {"min_score": 0.1}):
-            with pytest.raises(InputError, match=r"a.jsonl.part: another lidarpose writes it"):
+            with pytest.raises(InputError, match=r"a.jsonl.part: another lidarpose process is writing it"):
                 output.PartFile(tmp_path / "a.jsonl", command)
         assert part.path.read_bytes() == written
     recording = IndexedRecording(name="made", ids=["here"], times=None, read=lambda i: Sweep(points=np.ones((9, 3))))
-    with pytest.raises(InputError, match=r"a.jsonl.part: was made of other frames, the last one gone: remove it"):
+    with pytest.raises(InputError, match=r"a.jsonl.part: was made from other frames, the last one gone: remove it"):
         output.write_recording(FrameSource(recording), steps, tmp_path / "a.jsonl", command={})
 
 
@@ -212,7 +212,7 @@ def test_finished_lines_of_points_that_changed_are_an_error(tmp_path, model, mon
         patch.setattr(FramePredictor, "_predicted", stop_at_second)
         with pytest.raises(KeyboardInterrupt):
             write(crop)
-    with pytest.raises(InputError, match=r"a.jsonl.part: was made of other frames, the last one a: remove it"):
+    with pytest.raises(InputError, match=r"a.jsonl.part: was made from other frames, the last one a: remove it"):
         write(crop + 50)
     write(crop)
 
@@ -258,13 +258,13 @@ def test_boxes_that_are_corrected_begin_anew(form, stopped, drive, tmp_path, cap
     stat = path.stat()
     os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns + 10**9))
     assert main(["predict", str(drive), *map(str, words)]) == 0
-    assert "of another command (files changed): beginning anew" in capsys.readouterr().err
+    assert "from another command (files changed): starting over" in capsys.readouterr().err
 
 
 def test_printed_lines_have_the_boxes_of_their_frames_too(drive, tmp_path, capsys):
     (tmp_path / "b.json").write_text('[{"frame": "elsewhere", "people": []}]')
     assert main(["predict", str(drive), "--end", "0.1", "--boxes", str(tmp_path / "b.json"), "--out", "-"]) == 2
-    assert "has boxes of frames elsewhere, none of which is here" in capsys.readouterr().err
+    assert "has boxes of frames elsewhere, but this recording has other frames" in capsys.readouterr().err
 
 
 def test_boxes_with_another_axis_up_are_not_taken_for_these_frames(drive, tmp_path, capsys):
@@ -462,10 +462,10 @@ def test_boxes_of_frames_are_read_by_name_or_number(form, tmp_path):
 @pytest.mark.parametrize(
     "content, problem",
     [
-        ('{"people": []}', 'expected an entry a frame, {"frame": 0'),
+        ('{"people": []}', 'expected one entry per frame, {"frame": 0'),
         ('[{"frame": 1, "people": []}, {"frame": 1, "people": []}]', "got 1 twice"),
         ("x", "expected JSON or JSON lines"),
-        ("[]", "expected boxes a frame"),
+        ("[]", "expected boxes for each frame"),
     ],
 )
 def test_boxes_that_are_not_of_frames(content, problem, drive, tmp_path, capsys):
@@ -507,9 +507,9 @@ def test_a_folder_without_one_readable_scan_is_an_error(tmp_path, capsys):
     for name in "ab":
         (tmp_path / f"{name}.pcd").write_bytes(b"garbage")
     assert main(["predict", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
-    assert "of 2 frames none can be read, the first: " in capsys.readouterr().err
+    assert "none of 2 frames can be read, the first: " in capsys.readouterr().err
     assert main(["predict", str(tmp_path), "--out", "-"]) == 2
-    assert "of 2 frames none can be read" in capsys.readouterr().err
+    assert "none of 2 frames can be read" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
@@ -768,5 +768,5 @@ def test_who_leaves_early_does_not_wait_for_the_next_frame(model):
 def test_boxes_of_other_frames_are_an_error_at_the_end(model):
     boxes = {"b": [[0, 0, 0, 1, 1, 2, 0]]}
     frames = lidarpose.predict_recording(fed([np.ones((9, 3))]), boxes=boxes, model=model)
-    with pytest.raises(InputError, match="has boxes of frames b, none of which is here: the last one is 0"):
+    with pytest.raises(InputError, match="has boxes of frames b, but this recording has other frames, the last one 0"):
         list(frames)

@@ -48,7 +48,9 @@ class FrameBoxes:
         else:
             self._by_frame = _by_frame(given)
         if not self._by_frame:
-            raise file_error(self._name, f"expected boxes a frame, files named as the frames are or {_FORM}, got none")
+            raise file_error(
+                self._name, f"expected boxes for each frame, files named like the frames or {_FORM}, got none"
+            )
 
     def of(self, frame: Frame | DamagedFrame) -> Boxes | None:
         """The boxes of a frame, None if none are given. Raises InputError for boxes that cannot be read."""
@@ -67,7 +69,9 @@ class FrameBoxes:
         last: id of the last frame."""
         if not self.was_used:
             ids = shorten(", ".join(list(self._by_frame)[:3]))
-            raise file_error(self._name, f"has boxes of frames {ids}, none of which is here: the last one is {last}")
+            raise file_error(
+                self._name, f"has boxes of frames {ids}, but this recording has other frames, the last one {last}"
+            )
 
 
 def _by_frame(path: str | os.PathLike) -> dict[str, Any]:
@@ -88,9 +92,9 @@ def _by_frame(path: str | os.PathLike) -> dict[str, Any]:
         if isinstance(frame, bool) or not isinstance(frame, str | int) or "people" not in entry:
             excerpt = shorten(json.dumps(entry), 60)
             raise file_error(
-                path, f"expected an entry a frame, {_FORM}, got {excerpt} as entry {i}: one box file is one scan"
+                path, f"expected one entry per frame, {_FORM}, got {excerpt} as entry {i}: one box file is one scan"
             )
         if str(frame) in by_frame:
-            raise file_error(path, f"expected a frame once, got {frame!r} twice: put its people into one entry")
+            raise file_error(path, f"expected each frame once, got {frame!r} twice: put its people into one entry")
         by_frame[str(frame)] = entry
     return by_frame

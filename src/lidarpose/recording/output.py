@@ -57,7 +57,9 @@ class PartFile:
         self._file = os.fdopen(os.open(self.path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666), "r+b")
         if not _is_locked(self._file):
             self._file.close()
-            raise file_error(self.path, "another lidarpose writes it: wait for its end, or choose another --out")
+            raise file_error(
+                self.path, "another lidarpose process is writing it: wait for its end, or choose another --out"
+            )
         # an existing part is kept until there is a line to write, so that a wrong command destroys nothing
         self._size: int | None = self._read()
 
@@ -247,9 +249,9 @@ def write_recording(
     summary = Summary()
     with PartFile(result, command) as part:
         if part.other:
-            tell(f"{part.path} is of another command ({', '.join(part.other)}): beginning anew")
+            tell(f"{part.path} is from another command ({', '.join(part.other)}): starting over")
         elif part.frames:
-            tell(f"{part.frames:,} frames are in {part.path}: going on")
+            tell(f"{part.frames:,} frames are in {part.path}: resuming")
         try:
             _add_frames(source, predictor, part)
             if not any(line["error"] is None for line in part.lines()):
@@ -269,7 +271,7 @@ def write_recording(
 
             write_result(result, final())
         except KeyboardInterrupt:
-            place = f"the finished frames are in {part.path}, and the same command goes on"
+            place = f"the finished frames are in {part.path}, and the same command resumes"
             raise KeyboardInterrupt(f"stopped: {place}" if part.frames else "stopped") from None
         part.remove()
     return summary
@@ -278,8 +280,8 @@ def write_recording(
 def nothing_read(name: str, frames: int, first_error: str | None) -> InputError:
     """The error for a recording without readable frames. frames: number of frames."""
     if not frames:
-        return file_error(name, "has no frames between start and end: choose others")
-    return file_error(name, f"of {counted(frames, 'frame')} none can be read, the first: {first_error}")
+        return file_error(name, "has no frames between start and end: choose another start or end")
+    return file_error(name, f"none of {counted(frames, 'frame')} can be read, the first: {first_error}")
 
 
 def _add_frames(source: FrameSource, predictor: FramePredictor, part: PartFile) -> None:
@@ -291,7 +293,7 @@ def _add_frames(source: FrameSource, predictor: FramePredictor, part: PartFile) 
         frames = source.frames(index)
         frame = next(frames, None)
         if frame is None or (frame.index, frame.id, _digest(frame)) != (index, id, digest):
-            raise file_error(part.path, f"was made of other frames, the last one {id}: remove it to begin anew")
+            raise file_error(part.path, f"was made from other frames, the last one {id}: remove it to start over")
     digests: dict[int, int] = {}
 
     def noted_frames() -> Iterator[Frame | DamagedFrame]:

@@ -138,7 +138,7 @@ def predict_recording(
         opened = open_source(paths, columns=columns, topic=topic, meta=meta, **choice)
         name, frames = opened.name, opened.frames()
     elif options := [option for option, value in choice.items() if value != (1 if option == "every" else None)]:
-        raise InputError(f"{options[0]} is for paths, got frames: give it to open_source, or leave frames out yourself")
+        raise InputError(f"{options[0]} is for paths, got frames: give it to open_source, or filter the frames")
     predictor = FramePredictor(columns=columns, topic=topic, meta=meta, name=name, **posing)
     return predictor.predict_all(frames)
 
