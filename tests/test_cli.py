@@ -344,7 +344,7 @@ def test_a_full_memory_is_one_line(monkeypatch, capsys):
     # more than any machine has
     monkeypatch.setattr(contact_sheet, "draw_dataset", lambda *args, **more: np.empty(2**60, np.uint8))
     assert run("view", "streetlife") == 2
-    assert "the memory is full (Unable to allocate 1.00 EiB" in one_line(capsys)
+    assert "out of memory (Unable to allocate 1.00 EiB" in one_line(capsys)
 
 
 @pytest.mark.filterwarnings("error")
@@ -533,7 +533,7 @@ def test_demo(out, capsys):
     assert sorted(path.name for path in out.iterdir()) == ["hdl-64e.png", "index.html", "os1-128.png", "vlp-32c.png"]
     lines = capsys.readouterr().out.splitlines()
     head = next(i for i, line in enumerate(lines) if line.startswith("LiDAR"))
-    for word in ("points", "distance", "MPJPE", "ms a person"):
+    for word in ("points", "distance", "MPJPE", "ms per person"):
         assert word in lines[head]
     assert len(lines) == head + 1 + 12 + 1
 

@@ -353,7 +353,7 @@ def test_hidden_labels_count_and_missing_ones_do_not(sets):
 def test_people_without_a_pose_are_counted_and_in_pem_alone(sets):
     turns = itertools.cycle([True, False])
     some = evaluated(sets, "waymo", Fake(lambda cloud: standing(cloud) if next(turns) else None)).result
-    words = "without a pose, and in no metric but PEM"
+    words = "without a pose, and in no metric except PEM"
     assert some.counts["without a pose"] and any(words in line for line in evaluating._lines(some))
     # each labeled keypoint is missed
     nobody = evaluated(sets, "waymo", Fake(lambda cloud: None)).result

@@ -410,10 +410,13 @@ def test_labels_are_taken_by_their_whole_names(tmp_path):
     "arguments, message",
     [
         (["detector", "bench"], "expected heldout or nothing as the detector's dataset, got bench: use --scans"),
-        (["detector", "--protocol", "dapt"], "--protocol is of networks, got the detector: leave it out"),
+        (["detector", "--protocol", "dapt"], "--protocol is an option for pose networks, got the detector: omit it"),
         (["detector", "--method", "yolo"], "method"),
         (["detector", "--limit", "0"], "limit must be a whole number of at least 1, got 0"),
-        (["small", "bench", "--range", "20"], "--range is of lidarpose evaluate detector, got the network small"),
+        (
+            ["small", "bench", "--range", "20"],
+            "--range is an option of lidarpose evaluate detector, got the network small",
+        ),
         (["small"], "expected a dataset to evaluate on"),
         (["detector", "--scans", "."], "expected labeled scans"),
     ],

@@ -521,7 +521,7 @@ def test_tables_of_joints_are_no_scans_and_the_world_may_not_be_known(clouds, tm
         assert main([*words, str(tmp_path)]) == 0
         output = capsys.readouterr()
         assert "2 frames, 4 people" in output.out + output.err
-        assert "in 2 of 2 frames the sensor's place in the world is not known" in output.err
+        assert "the sensor's pose in the world is unknown in 2 of 2 frames" in output.err
     assert len(list(tmp_path.glob("*.poses.csv"))) == 1
 
 
@@ -606,7 +606,7 @@ def test_of_a_long_recording_the_page_shows_some_frames(drive, tmp_path, monkeyp
     "words, problem",
     [
         (["DRIVE", "DRIVE/.."], "run the command for each folder"),
-        (["DRIVE", "--track", "--out", "-"], "say --live"),
+        (["DRIVE", "--track", "--out", "-"], "use --live"),
         (["DRIVE", "--out", "a.json"], "expected a folder or a file .jsonl or .csv or .parquet, got .json"),
         (["DRIVE", "--crop", "--boxes", "b.json"], "got both"),
         (["DRIVE", "--every", "0"], "every must be"),

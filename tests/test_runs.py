@@ -457,7 +457,7 @@ def test_the_command_line_trains_and_goes_on(tmp_path, capsys):
     for wrong, message in (
         (words, "expected a new or empty folder"),
         ([*go_on, "--batch", "4"], "the run has batch = 2, got 4"),
-        ([*go_on, "--recipe", "paper"], "leave --recipe away"),
+        ([*go_on, "--recipe", "paper"], "omit --recipe"),
         (["finetune", "some", "--out", str(folder), "--resume"], "`lidarpose pretrain`"),
     ):
         assert main(wrong) == 2

@@ -97,7 +97,7 @@ def test_workers_give_the_same_bytes(dataset, tmp_path, capsys):
     assert content(tmp_path / "two") == content(dataset)
     assert "60 people made -> " in capsys.readouterr().err
     assert synth(tmp_path / "two", *WORDS, "--workers", 2) == 0
-    assert "0 people made, 60 were there" in capsys.readouterr().err
+    assert "0 people made, 60 existed already" in capsys.readouterr().err
 
 
 @pytest.mark.long

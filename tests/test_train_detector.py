@@ -295,7 +295,7 @@ def test_the_command_trains(quick_scans, tmp_path, capsys):
     assert "name the folder of a run" in capsys.readouterr().err
     for words, other in (("--calibrate 3 --scenes 5", "--scenes"), ("--calibrate 3 --resume", "--resume")):
         assert main(["train-detector", str(folder), *words.split()]) == 2
-        assert f"expected only --scans beside it, got {other}" in capsys.readouterr().err
+        assert f"expected no other option than --scans, got {other}" in capsys.readouterr().err
     assert main(["train-detector", str(folder), "--scans", str(tmp_path)]) == 2
     assert "add --calibrate N" in capsys.readouterr().err
     assert main(["pretrain", str(folder), "--resume"]) == 2

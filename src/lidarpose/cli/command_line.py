@@ -62,10 +62,10 @@ def run(arguments: list[str] | None = None) -> int:
             return _failed(error)
         # errors of files have a file name, so this one is of the standard output
         _drop_output()
-        return _failed(InputError(f"cannot write the output ({error.strerror}): send it elsewhere"))
+        return _failed(InputError(f"cannot write the output ({error.strerror}): redirect it elsewhere"))
     except MemoryError as error:
         reason = f" ({error})" if str(error) else ""
-        return _failed(InputError(f"the memory is full{reason}: give less at once, as fewer points or people"))
+        return _failed(InputError(f"out of memory{reason}: give less at once, such as fewer points or people"))
     except KeyboardInterrupt as interrupt:
         # training puts into the message how to resume
         return _ended(str(interrupt) or "stopped", getattr(interrupt, "status", 130))

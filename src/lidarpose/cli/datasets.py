@@ -89,7 +89,7 @@ def _synth(options: argparse.Namespace) -> None:
     from lidarpose.synth.shard_job import SynthesisJob, write_dataset
 
     if options.clips and options.scenes:
-        raise InputError("--clips and --scenes are different datasets: name one of them")
+        raise InputError("--clips and --scenes are different datasets: give one of them")
     fields = ("count", "scene", "seed", "hard", "motion", "captured", "body", "per_shard")
     job = SynthesisJob(
         what="clips" if options.clips else "streets" if options.scenes else "people",
@@ -102,7 +102,7 @@ def _synth(options: argparse.Namespace) -> None:
         num_written = write_dataset(
             job, options.out, workers=options.workers, progress=lambda count, _: bar.update(count)
         )
-    note = "" if num_written == job.count else f", {job.count - num_written:,} were there"
+    note = "" if num_written == job.count else f", {job.count - num_written:,} existed already"
     tell(f"{content_count(num_written, job.what)} made{note} -> {options.out}")
 
 

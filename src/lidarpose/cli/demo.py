@@ -36,7 +36,7 @@ def run(folder: str | Path, *, seed: int, weights: str = DEFAULT) -> None:
     for name in names:
         check_writable(folder / name)
     model = load(weights, tta=TTA)
-    print("synthesizing people (the first time compiles the ray caster: some ten seconds) ...", flush=True)
+    print("synthesizing people (the first run compiles the ray caster: about ten seconds) ...", flush=True)
     scene = scene_config("wild").eased(_HARD)
     people: list = []
     with Progress(len(SENSORS) * PEOPLE_EACH, unit="people") as bar:
@@ -48,7 +48,7 @@ def run(folder: str | Path, *, seed: int, weights: str = DEFAULT) -> None:
     rows, contents = _report(model, people)
     write_all_atomic({folder / name: content for name, content in contents.items()})
     print(pandas.DataFrame(rows).to_string(index=False, justify="left"))
-    print(f"open {folder / 'index.html'} to turn the people in 3D; pictures: {folder}/*.png")
+    print(f"open {folder / 'index.html'} to view the people in 3D; pictures: {folder}/*.png")
 
 
 def _report(model: Predictor, people: list) -> tuple[list[dict], dict[str, bytes]]:
@@ -74,7 +74,7 @@ def _report(model: Predictor, people: list) -> tuple[list[dict], dict[str, bytes
                 "distance m": round(facts.distance, 1),
                 "visible %": round(facts.visible * 100),
                 "MPJPE mm": round(error),
-                "ms a person": round(milliseconds, 1),
+                "ms per person": round(milliseconds, 1),
             }
         )
         label = f"{facts.sensor}, {facts.distance:.1f} m"
@@ -82,7 +82,7 @@ def _report(model: Predictor, people: list) -> tuple[list[dict], dict[str, bytes
         panels.append(Panel(points=points, pose=pose.pose, truth=truth, label=label, caption=caption))
     contents = {
         f"{name}.png": draw_people(
-            panels[k * PEOPLE_EACH : (k + 1) * PEOPLE_EACH], title=f"{name}: predicted, and the truth dashed"
+            panels[k * PEOPLE_EACH : (k + 1) * PEOPLE_EACH], title=f"{name}: predicted (solid), true (dashed)"
         )
         for k, name in enumerate(SENSORS)
     }

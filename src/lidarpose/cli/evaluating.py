@@ -92,7 +92,8 @@ def _evaluate(options: argparse.Namespace) -> None:
         return _evaluate_detector(options)
     if detector_flags := [f"--{name}" for name in option_names(_DETECTOR) if getattr(options, name) is not None]:
         raise InputError(
-            f"{detector_flags[0]} is of lidarpose evaluate detector, got the network {options.weights}: leave it out"
+            f"{detector_flags[0]} is an option of lidarpose evaluate detector, got the network {options.weights}: "
+            "omit it"
         )
     folder = evaluation.new_folder(options.weights) if options.out is None else evaluation.check_folder(options.out)
     settings = {name: getattr(options, name) for name in option_names(_OPTIONS)}
@@ -116,7 +117,7 @@ def _evaluate_detector(options: argparse.Namespace) -> None:
 
     for name in option_names(_OPTIONS):
         if name not in _OF_BOTH and getattr(options, name) != options.defaults[name]:
-            raise InputError(f"{_flag(name)} is of networks, got the detector: leave it out")
+            raise InputError(f"{_flag(name)} is an option for pose networks, got the detector: omit it")
     if set(options.datasets) - {HELDOUT}:
         raise InputError(
             f"expected {HELDOUT} or nothing as the detector's dataset, got {options.datasets[0]}: use --scans"
@@ -152,15 +153,15 @@ def _detector_lines(result) -> Iterator[str]:
     rows["cell"] = [f"{_value(row)} {_interval_text(row)}".rstrip() for row in records]
     recall = rows[rows.figure == "recall"].set_index(["group", "of", "count", "at"]).cell.unstack(sort=False)
     recall.columns = [f"at {at} (score {score:.2f})" for at, score in result.thresholds.items()]
-    yield f"{result.dataset}: {result.scans:,} scans; recall, %, at so many false people a scan:"
+    yield f"{result.dataset}: {result.scans:,} scans; recall, %, at this many false positives per scan:"
     yield recall.to_string()
     if result.changed:
-        yield f"  note: {result.changed:,} scenes are not as they were frozen: other figures are not of the same"
+        yield f"  note: {result.changed:,} scenes differ from the frozen ones: not comparable with other scores"
     for row in rows[(rows.figure != "recall") & rows["at"].isin(["", "1", "default"])].itertuples():
         words = (row.figure.replace("_", " "), row.at and f"at {row.at}", row.group, row.of if row.of != "all" else "")
         yield f"  {' '.join(filter(None, words))}: {row.cell} {row.unit}"
     for kind, count in result.things.items():
-        yield f"  false at 1 a scan: {count:,} {kind}"
+        yield f"  false positives at 1 per scan: {count:,} {kind}"
 
 
 def _table(options: argparse.Namespace) -> None:
@@ -218,7 +219,7 @@ def _lines(result) -> Iterator[str]:
     for note in result.notes:
         yield f"  note: {note}"
     if counts["without a pose"]:
-        exception = " but PEM" if any(row.figure == "pem" for row in result.lines) else ""
+        exception = " except PEM" if any(row.figure == "pem" for row in result.lines) else ""
         yield f"  without a pose, and in no metric{exception}: {counts['without a pose']:,} people"
     for reason, entry in result.skipped.items():
         yield f"  skipped {entry['count']:,}: {reason} (first: {entry['first']})"
@@ -260,6 +261,6 @@ def _study(study) -> Iterator[str]:
         points = (f"{p.label}: {'-' if p.mpjpe is None else f'{p.mpjpe:.1f}'}" for p in curve.points)
         yield f"  {curve.title:<38} {'  '.join(points)}"
     for end in study.ends:
-        yield f"  {end.group} of the worst {end.worst:,}: {end.mean:.1f} mm, deviation {end.deviation:.1f}"
+        yield f"  {end.group} of the worst {end.worst:,} people: {end.mean:.1f} mm, deviation {end.deviation:.1f}"
     for note in study.notes:
         yield f"  note: {note}"

@@ -61,7 +61,7 @@ def _paper(commands, execute: Callable[[list[str]], int], options: argparse.Name
     check_out(out)
     if options.name == "fig6":
         if options.rows:
-            raise InputError("fig6 has no rows: leave --rows away")
+            raise InputError("fig6 has no rows: omit --rows")
         if options.dry_run:
             print("# Figure 6: synthesized bodies\n\nDrawn at once; there is nothing to train.")
             return

@@ -188,14 +188,14 @@ def _result_path(out: str, name: str, what: str, *suffixes: str) -> Path | None:
     InputError for a file of another type."""
     if out == "-":
         if sys.stdout is None:
-            raise InputError("--out - prints to the standard output, which is closed: name a file")
+            raise InputError("--out - prints to the standard output, which is closed: give a file")
         return None
     if is_file_name(out):
         suffix = Path(out).suffix.lower()
         if suffix in suffixes:
             return Path(out)
         files = " or ".join(suffixes)
-        raise InputError(f"--out {out}: expected a folder or a file {files}, got {suffix}: name one")
+        raise InputError(f"--out {out}: expected a folder or a file {files}, got {suffix}: give one")
     return Path(out) / f"{name}.{what}{suffixes[0]}"
 
 

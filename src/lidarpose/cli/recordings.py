@@ -130,9 +130,9 @@ def _print_lines(options: argparse.Namespace, source, predictor, on_line: Callab
     from lidarpose.recording.output import Summary, nothing_read
 
     if predictor.is_tracked and not predictor.live:
-        raise InputError("--out - prints frames as they come: say --live, which needs no later frames, or name a file")
+        raise InputError("--out - prints frames as they come: use --live, which needs no later frames, or give a file")
     if options.format not in (None, "jsonl"):
-        raise InputError(f"--out - prints lines of JSON, not {options.format}: name a file")
+        raise InputError(f"--out - prints lines of JSON, not {options.format}: give a file")
     summary, last = Summary(), None
     for frame in predictor.predict_all(source.frames()):
         line = frame.to_dict()
@@ -150,8 +150,8 @@ def _print_lines(options: argparse.Namespace, source, predictor, on_line: Callab
 def _report(options: argparse.Namespace, source_warnings: list[str], summary, outputs: str) -> None:
     if options.world and (num_others := summary.frames - summary.in_world):
         source_warnings.append(
-            f"in {num_others:,} of {counted(summary.frames, 'frame')} the sensor's place in the world is not known: "
-            "joints are in the sensor's frame there"
+            f"the sensor's pose in the world is unknown in {num_others:,} of {counted(summary.frames, 'frame')}: "
+            "their joints are in the sensor's frame"
         )
     for line in [*source_warnings, *summary.warning_lines(_MOST_WARNINGS)]:
         tell(f"lidarpose: warning: {line}")

@@ -36,7 +36,7 @@ def is_file_name(text: str) -> bool:
 def folder(text: str) -> str:
     """An argument that is the name of a folder, there or to be made."""
     if is_file_name(text):
-        raise argparse.ArgumentTypeError(f"expected a folder, got {text}: name one, or put / behind it")
+        raise argparse.ArgumentTypeError(f"expected a folder, got {text}: give a folder, or append / to it")
     return text
 
 

@@ -121,12 +121,12 @@ def _train(options: argparse.Namespace) -> None:
         other_options = [*changes, *(key for key in ("resume", "recipe", "device", "tracker") if getattr(options, key))]
         if other_options:
             flag = f"--{other_options[0].replace('_', '-')}"
-            raise InputError(f"--calibrate trains nothing: expected only --scans beside it, got {flag}: leave it out")
+            raise InputError(f"--calibrate does not train: expected no other option than --scans, got {flag}: omit it")
         print(calibrate(options.folder or latest(name), options.calibrate, labeled=options.scans))
         return
     if getattr(options, "scans", None) is not None:
         raise InputError(
-            "--scans is for --calibrate: expected both, got --scans alone: add --calibrate N or leave it out"
+            "--scans is for --calibrate: expected both, got only --scans: add --calibrate N or omit --scans"
         )
     if kind is Pretrain and (settings := scene_changes(options)):
         changes["set"] = settings
@@ -135,7 +135,7 @@ def _train(options: argparse.Namespace) -> None:
     folder = options.folder
     if options.resume:
         if options.recipe is not None:
-            raise InputError("a run keeps its recipe: leave --recipe away with --resume")
+            raise InputError("a run keeps its recipe: omit --recipe with --resume")
         folder = folder or latest(name)
         # a run keeps its recipe: only settings that are given again change
         run_recipe = kind(**(read_config(Path(folder), kind)[0].to_dict() | changes))
