@@ -40,7 +40,7 @@ def test_the_file_is_the_frozen_one_and_a_damaged_one_is_named(which, digest, mo
     damaged = tmp_path / "b.parquet"
     damaged.write_bytes(data[:-1])
     monkeypatch.setattr(module, "bench_path", lambda which: damaged)
-    with pytest.raises(InputError, match=f"is not {name} as it was frozen"):
+    with pytest.raises(InputError, match=f"differs from the frozen {name}"):
         load_bench(which)
 
 

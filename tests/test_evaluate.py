@@ -239,14 +239,14 @@ def test_a_frame_that_was_leveled_is_noted_where_it_is_compared_with_the_release
     [
         ("sloper4d", {"protocol": "dapt"}, "--split-by dapt into another folder"),
         ("leaking", {}, "use protocol dapt"),
-        ("humanm3", {"split": "val"}, "nobody in the split 'val'; there are test, train"),
+        ("humanm3", {"split": "val"}, "no people in the split 'val'; there are test, train"),
         ("humanm3", {"skeleton": "smpl24"}, "has no spine1"),
         ("humanm3", {"protocol": "clear"}, "did you mean clean"),
         ("humanm3", {"limit": 0}, "at least 1 person"),
         ("humanm3", {"limit": "4"}, "limit must be a whole number of at least 1 person, got '4'"),
         ("humanm3", {"limit": 4.0}, "limit must be a whole number"),
         ("humanm3", {"seed": -1}, "seed must be a whole number of at least 0, got -1"),
-        ("humanm3", {"tta": 4}, "of weights by name or path: give them to load instead"),
+        ("humanm3", {"tta": 4}, "are for weights by name or path: give them to load instead"),
         ("lidarhuman26m", {}, "two datasets are called lidarhuman26m"),
         ("nowhere", {}, "is no dataset"),
         ("a", {}, "is no dataset"),
@@ -294,7 +294,7 @@ def test_splits_that_are_scored_by_default(sets, tmp_path):
     assert everybody.split == "all" and everybody.count == 24
     assert open_eval_dataset("bench").split == "none"
     prepare("humanm3", sets / "a", tmp_path / "x", split="train")
-    with pytest.raises(InputError, match="only in train: say split"):
+    with pytest.raises(InputError, match="only in train: give split"):
         open_eval_dataset(tmp_path / "x")
     assert open_eval_dataset(tmp_path / "x", split="train").count == 8
 
@@ -399,7 +399,7 @@ def test_joints_that_both_have_are_scored_and_named(sets):
 
 
 def test_few_sequences_have_no_interval_and_are_drawn_whole(sets, monkeypatch):
-    for name, words in (("lidarhuman26m", "one sequence alone"), ("humanm3", "2 sequences alone")):
+    for name, words in (("lidarhuman26m", "only one sequence"), ("humanm3", "only 2 sequences")):
         result = evaluated(sets, name).result
         assert result.line("mpjpe").low is None and any(note.startswith(words) for note in result.notes)
     monkeypatch.setattr(aggregate, "LEAST_UNITS", 2)
@@ -614,7 +614,7 @@ def test_other_files_are_no_scores(written, tmp_path):
         ({"schema": "x/9"}, "x/9"),
         (good | {"weights": good["weights"] | {"digest": -1}}, "no scores.json .*digest"),
         (good | {"weights": good["weights"] | {"digest": float("nan")}}, "no scores.json .*digest"),
-        (nameless, "no scores.json .*dataset is no text"),
+        (nameless, "not a scores.json .*dataset is not text"),
     ]
     for content, words in [*((json.dumps(content), words) for content, words in cases), ("a", "no s")]:
         (tmp_path / "scores.json").write_text(content)
@@ -622,7 +622,7 @@ def test_other_files_are_no_scores(written, tmp_path):
             with pytest.raises(InputError, match=words):
                 read(tmp_path)
     (tmp_path / "poses.parquet").write_bytes(b"PAR1 and no more")
-    with pytest.raises(InputError, match="is no poses.parquet"):
+    with pytest.raises(InputError, match="is not the poses.parquet"):
         evaluation.read_poses(tmp_path / "poses.parquet")
 
 
@@ -680,7 +680,7 @@ def test_people_of_the_seed_that_a_network_was_trained_on_are_noted(made, recipe
     """Person i of a seed has the same body, pose and place at any difficulty."""
     card = {"recipe": {"seed": 5, "scene": "wild"}, "init_card": {"recipe": recipe}}
     notes = evaluated(made.parent, made.name, Fake(standing, card=card)).result.notes
-    assert any("of seed 0, as these are" in note for note in notes) == noted
+    assert any("of seed 0, like these" in note for note in notes) == noted
 
 
 def test_what_is_hidden_is_not_visible(made):

@@ -282,7 +282,7 @@ def test_poses_are_not_told_where_an_unknown_sensor_stands():
 
 
 def test_nobody_to_find_is_an_error():
-    with pytest.raises(InputError, match="made has nobody of 10 points and more within 3 m"):
+    with pytest.raises(InputError, match="made has no people of 10 or more points within 3 m"):
         score_detector(answers([]), scan_set([scan([5])]), max_range=3.0)
 
 

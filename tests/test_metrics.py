@@ -159,7 +159,7 @@ def test_lists_single_people_and_leading_shapes():
         ({"pred": np.zeros((3, 0, 3)), "true": np.zeros((3, 0, 3)), "visible": None}, r"\(..., joints, 3\)"),
         ({"pred": np.full((3, 14, 3), np.nan)}, "pred must be finite, got NaN or infinity in 42 joints"),
         ({"true": np.full((3, 14, 3), np.inf)}, "true must be finite, or NaN where"),
-        ({"visible": np.ones((3, 13))}, r"visible must be \(3, 14\), one a joint, got \(3, 13\)"),
+        ({"visible": np.ones((3, 13))}, r"visible must be \(3, 14\), one per joint, got \(3, 13\)"),
         ({"visible": np.full((3, 14), 2)}, "codes > 0"),
         ({"visible": np.full((3, 14), np.nan)}, "bool, or 0 and 1"),
         ({"pred": [[[0, 0, 0]], [[0, 0]]]}, "pred must hold numbers, in lists of equal length"),
@@ -255,7 +255,7 @@ def test_auroc_is_the_share_of_pairs_in_order(seed):
     [
         (metrics.auroc, [0.5, 0.1], [1, 1], {}, "needs hits and misses, got 2 hits and 0 misses"),
         (metrics.auroc, [0.5, np.nan], [1, 0], {}, "score must hold numbers, got NaN in 1 of 2"),
-        (metrics.auroc, [0.5, 0.1], [1, 0, 1], {}, r"hit must be \(2,\), one a score, got \(3,\)"),
+        (metrics.auroc, [0.5, 0.1], [1, 0, 1], {}, r"hit must be \(2,\), one per score, got \(3,\)"),
         (metrics.auroc, [[0.5], [0.1]], [[1], [0]], {}, r"score must be \(n,\), got \(2, 1\)"),
         (metrics.auroc, ["a", "b"], [1, 0], {}, "score must hold numbers"),
         (metrics.calibration_error, [np.nan], [1], {}, "confidence must hold numbers, got NaN"),

@@ -73,7 +73,7 @@ def test_items_come_back_from_the_shards(raw, prepared):
         np.testing.assert_array_equal(sample.points, item.points)
     tests = list(dataset.items("test"))
     assert {item.sequence for item in tests} == {"test/c"} and len(tests) == 6
-    with pytest.raises(InputError, match="nobody in the split 'val'"):
+    with pytest.raises(InputError, match="no people in the split 'val'"):
         list(dataset.items("val"))
 
 

@@ -76,7 +76,7 @@ def sliced(**change):
 @pytest.mark.parametrize(
     "call, message",
     [
-        (lambda: metrics.by_group(drawn(0), "human15"), "human15 has 15 columns, one a joint, got 14"),
+        (lambda: metrics.by_group(drawn(0), "human15"), "human15 has 15 columns, one per joint, got 14"),
         (lambda: metrics.by_group(drawn(0), "waymo"), "unknown skeleton 'waymo'"),
         (lambda: metrics.mean(np.zeros((1, 2, 3))), r"\(people, joints\) or \(people,\), got \(1, 2, 3\)"),
         (lambda: metrics.mean([np.inf]), "got infinity"),
@@ -86,9 +86,9 @@ def sliced(**change):
         (lambda: metrics.interval([1.0, 2], np.random.default_rng(0), clusters=[0]), r"clusters must be \(2,\)"),
         (lambda: metrics.interval([1.0, 2], np.random.default_rng(0), level=95), "level must lie between"),
         (lambda: metrics.interval([1.0, 2], np.random.default_rng(0), repeats=0), "repeats must be"),
-        (sliced(values=np.zeros(29)), r"values of slices must be \(30,\), one a person, got \(29,\)"),
-        (sliced(edges=(0, 0, 1)), "two or more rising numbers"),
-        (sliced(edges=(0,)), "two or more rising numbers"),
+        (sliced(values=np.zeros(29)), r"values of slices must be \(30,\), one per person, got \(29,\)"),
+        (sliced(edges=(0, 0, 1)), "two or more increasing numbers"),
+        (sliced(edges=(0,)), "two or more increasing numbers"),
         (sliced(values=["near"] * 30), "values of slices must hold numbers"),
         (sliced(clusters=np.zeros(3)), r"clusters must be \(30,\)"),
     ],

@@ -271,7 +271,7 @@ def test_joints_that_are_not_claimed_decide_nothing():
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"true": []}, "one entry a frame of everything"),
+        ({"true": []}, "one entry per frame in every argument"),
         ({"pred": [np.zeros((1, 13, 3))]}, "frame 0: pred and true must have the same joints"),
         ({"pred": [np.zeros((J, 3))]}, r"frame 0: pred must be \(people, joints, 3\)"),
         ({"pred": [np.full((1, J, 3), np.nan)]}, "frame 0: pred must be finite"),

@@ -88,11 +88,11 @@ class Pose:
         for name in PER_JOINT:
             value = getattr(self, name)
             if value is not None and value.shape != self.joints.shape[:-1]:
-                raise InputError(f"Pose.{name} must be {self.joints.shape[:-1]}, one a joint, got {value.shape}")
+                raise InputError(f"Pose.{name} must be {self.joints.shape[:-1]}, one per joint, got {value.shape}")
         for name in PER_PERSON:
             value = getattr(self, name)
             if value is not None and value.shape != self.joints.shape[:-2]:
-                raise InputError(f"Pose.{name} must be {self.joints.shape[:-2]}, one a person, got {value.shape}")
+                raise InputError(f"Pose.{name} must be {self.joints.shape[:-2]}, one per person, got {value.shape}")
         if self.in_range is not None and self.in_range.dtype != bool:
             raise InputError(f"Pose.in_range must be true or false for each joint, got {self.in_range.dtype}")
 
@@ -282,7 +282,7 @@ class Sample:
         for name in ("part", "ring"):
             value = getattr(self, name)
             if value is not None and value.shape != (len(self.points),):
-                raise InputError(f"Sample.{name} must be ({len(self.points)},), one a point, got {value.shape}")
+                raise InputError(f"Sample.{name} must be ({len(self.points)},), one per point, got {value.shape}")
         if self.rotations is not None and self.rotations.shape != (len(SMPL24), 3):
             raise InputError(f"Sample.rotations must be ({len(SMPL24)}, 3), got {self.rotations.shape}")
         for name in ("background", "neighbors"):
@@ -349,7 +349,7 @@ class LabeledSample(Sample):
         if self.pose is None or self.joint_labels.shape != (len(self.pose.skeleton),):
             raise InputError(f"LabeledSample needs a pose and a label per joint, got {self.joint_labels.shape} labels")
         if (np.isnan(self.pose.joints).any(-1) != (self.joint_labels == UNLABELED)).any():
-            raise InputError("LabeledSample: a joint is NaN exactly where its label is UNLABELED")
+            raise InputError("LabeledSample: a joint must be NaN exactly where its label is UNLABELED")
 
     @property
     def joints(self) -> np.ndarray:

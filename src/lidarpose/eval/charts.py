@@ -34,7 +34,7 @@ def draw_errors(result: Result) -> bytes:
     panels = {
         "distance, m": ("by distance from the sensor, m", "the sensor's position is not known"),
         "points": ("by number of points", "nobody"),
-        "hidden share": ("by share that is hidden", "the dataset does not tell what is hidden"),
+        "hidden share": ("by hidden share", "the dataset has no labels of hidden points"),
         "joints": ("by joint", "nobody"),
     }
     setting = result.setting
@@ -75,7 +75,7 @@ def draw_reliability(predictions: Predictions, result: Result) -> bytes | None:
         people.spread[is_stated].astype(float),
     )
     setting = result.setting
-    title = f"{setting.dataset}: confidence and spread that {setting.method} predicts"
+    title = f"{setting.dataset}: confidence and spread predicted by {setting.method}"
     left_axes, right_axes = (figure := _figure(9.0, 4.3, title, setting.summary)).subplots(1, 2)
     _confidence(left_axes, confidence, error < 1e3 * CONFIDENCE_RADIUS, result)
     _spread(right_axes, spread * 1e3, error)
@@ -93,7 +93,7 @@ def draw_stability(study: Stability) -> bytes:
     values = [p.high or p.mpjpe for curve in curves for p in curve.points if p.mpjpe is not None]
     for curve in study.curves:
         if all(point.mpjpe is None for point in curve.points):
-            _empty(next(axes), "nobody has a pose", curve.title)
+            _empty(next(axes), "no person has a pose", curve.title)
         elif curve.name == "sensors":
             _sensors(next(axes), curve)
         else:

@@ -181,15 +181,15 @@ def _open_folder(folder: Path, split: str | None, limit: int | None) -> EvalData
         split = next((name for name in _DEFAULT_SPLITS if name in splits), EVERYBODY)
         if splits and split != _DEFAULT_SPLITS[0] and damaged_shards:
             (entry,) = damaged_shards.values()
-            problem = f"of its {card.shards} shards {entry['count']} cannot be read, perhaps those of the split test"
-            raise file_error(folder, f"{problem}; the first: {entry['first']}; or say split NAME")
+            problem = f"{entry['count']} of its {card.shards} shards cannot be read, perhaps those of the split test"
+            raise file_error(folder, f"{problem}; the first: {entry['first']}; or give split NAME")
         if split == EVERYBODY and splits:
-            raise file_error(folder, f"has nobody in test or val, only in {', '.join(splits)}: say split NAME")
+            raise file_error(folder, f"has no people in test or val, only in {', '.join(splits)}: give split NAME")
     people = rows if split == EVERYBODY else rows[rows["split"] == split]
     total = len(people)
     if not total:
         split_names = ", ".join(splits) or "no splits"
-        raise file_error(folder, f"has nobody in the split {split!r}; there are {split_names}: say one as split")
+        raise file_error(folder, f"has no people in the split {split!r}; there are {split_names}: give one as split")
     people = people.iloc[evenly_drawn(total, limit)]
     source, _, leaks = str(card.about.get("split", "")).partition("; LEAKS: ")
     dataset_skeleton = skeleton(card.skeleton)
@@ -300,7 +300,7 @@ def load_bench(which: str = BENCH) -> Bench:
     path, (name, sha256) = bench_path(which), BENCHES[which]
     data = read_bytes(path, expected=f"{name}, a Parquet file")
     if hashlib.sha256(data).hexdigest() != sha256:
-        raise file_error(path, f"is not {name} as it was frozen: install lidarpose again")
+        raise file_error(path, f"differs from the frozen {name}: install lidarpose again")
     table = parquet.read_table(pa.BufferReader(data)).to_pandas()
     columns: dict[str, Any] = {name: values.to_numpy() for name, values in table.items()}
     columns |= {name: np.stack(columns[name]) for name in ("origin", "joints", "box")}

@@ -195,4 +195,4 @@ def read_poses(path: str | Path) -> dict[str, Predictions]:
             predictions[name] = stack(Skeleton(name=entry["skeleton"], joints=joints, parents=parents), rows)
         return predictions
     except (pa.ArrowException, OSError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise file_error(path, f"is no poses.parquet of an evaluation ({error}); evaluate again") from None
+        raise file_error(path, f"is not the poses.parquet of an evaluation ({error}); evaluate again") from None

@@ -183,7 +183,7 @@ class EvalSetup:
             if center not in person.sample.centers:
                 return None, f"people without the center {center!r}"
             if kind == "humanm3" and (person.sample.joint_labels == UNLABELED).all():
-                return None, "people without a labelled joint, whom their box is made of"
+                return None, "people without a labelled joint, which their box needs"
         points, box = self.crop(person)
         if len(points) < min_points:
             return None, f"people of under {min_points} points, as the released code skips them"
@@ -222,7 +222,7 @@ class EvalSetup:
         ):
             raise InputError(
                 f"{model.model['name']}.predict: expected an answer for each of {len(clouds)} clouds, with a `pose` of "
-                f"{name} or None, got {shorten(repr(people), 60)}: answer as lidarpose.Predictor does"
+                f"{name} or None, got {shorten(repr(people), 60)}: return the same as lidarpose.Predictor"
             )
         for person in people:
             yield {} if person.pose is None else self._prediction_columns(person.pose, ())
@@ -327,7 +327,7 @@ def eval_setup(
     check_protocol(protocol, dataset)
     if protocol == "dapt" and not (hasattr(model, "outputs") and hasattr(model, "backend")):
         raise InputError(
-            "the protocol dapt needs a model with `outputs` and `backend`, as Predictor: use protocol clean"
+            "the protocol dapt needs a model with `outputs` and `backend`, like Predictor: use protocol clean"
         )
     if protocol == "dapt" and model.model.get("tta", 1) > 1:
         raise InputError("the protocol dapt predicts each person once, as the released code does: leave tta out")
@@ -336,7 +336,7 @@ def eval_setup(
         target_skeleton = skeleton_of(skeleton)
         if missing_joints := [name for name in target_skeleton.joints if name not in dataset.skeleton.joints]:
             raise InputError(
-                f"{dataset.name} has no {', '.join(missing_joints)}, which {target_skeleton.name} asks for: its joints "
+                f"{dataset.name} has no {', '.join(missing_joints)}, which {target_skeleton.name} needs: its joints "
                 f"are {dataset.skeleton.name}"
             )
     network_joints, excluded_joints = model.skeleton.joints, DAPT[dataset.kind].without if protocol == "dapt" else ()

@@ -108,13 +108,13 @@ PERTURBATIONS = {
         lambda points, box, amount, rng: jitter(points, sigma=_SIGMA * amount, clip=amount, rng=rng),
         "point jitter, clip in cm",
         (0.02, 0.05, 0.1, 0.15, 0.2),
-        "normal steps on every coordinate, cut at the clip, of half the clip as standard deviation",
+        "normal noise on each coordinate, clipped, with half the clip as standard deviation",
     ),
     "clusters": Perturbation(
         with_clusters,
         "points in each of two noise clusters",
         (10, 25, 50, 100, 200),
-        "two clusters within 0.3 m of places up to 0.4 m, in height 0.8 m, from the middle of the points",
+        "two clusters of 0.3 m radius, up to 0.4 m (in height 0.8 m) from the middle of the points",
         scale=1,
     ),
     "dropped": Perturbation(
@@ -122,26 +122,26 @@ PERTURBATIONS = {
         lambda points, box, amount, rng: points[random_keep(len(points), share=amount, rng=rng)],
         "points dropped, %",
         (0.25, 0.5, 0.75, 0.9, 0.95),
-        "a random share of the points is gone",
+        "a random share of the points is removed",
     ),
     "occluder": Perturbation(
         behind_an_edge,
         "points behind an edge, %",
         (0.1, 0.25, 0.4, 0.55, 0.7),
-        "all is gone that lies on one side of an edge, straight as the sensor sees it, of a random direction",
+        "all points on one side of a straight edge in the sensor's view are removed; its direction is random",
     ),
     "crop": Perturbation(
         lambda points, box, amount, rng: points[moved_box(points, box, amount, rng).contains(points)],
         "box displaced, cm",
         (0.05, 0.1, 0.2, 0.3, 0.4),
-        "the crop's box is moved in a random level direction; what it leaves is lost, nothing new comes in unless "
-        "the dataset holds points around the box",
+        "the crop's box is moved in a random level direction; points outside it are removed, none are added unless "
+        "the dataset contains points around the box",
     ),
     "tilt": Perturbation(
         out_of_level,
         "frame out of level, deg",
         tuple(np.radians([5.0, 10.0, 15.0, 20.0, 30.0]).tolist()),
-        "the sensor is mounted askew, in a random direction, and its own axis is taken for up",
+        "the sensor is tilted in a random direction, and its own axis is taken as up",
         scale=180 / np.pi,
         rigid=True,
     ),
@@ -282,9 +282,9 @@ def study(
         try:
             curves.append(_sensor_curve(setup, advance))
         except (MissingExtra, ModuleNotFoundError):
-            notes.append("other sensors need people cast anew: in the clone, pip install '.[synth]'")
+            notes.append("other sensors need new ray casts of people: in the clone, pip install '.[synth]'")
     else:
-        notes.append("other sensors: people cast anew have no released center")
+        notes.append("other sensors: people in new ray casts have no released center")
     who, ends = f"{len(people):,} {_people_text(setup)}", end_errors(predictions)
     return Stability(setting=setup.setting, who=who, curves=tuple(curves), ends=ends, notes=tuple(notes))
 
@@ -383,8 +383,10 @@ def _sensor_curve(setup: EvalSetup, advance: Callable[[int], None]) -> Curve:
         point = _point(predictions, predictions.errors(), float(k), name, setting)
         points.append(replace(point, increase=None, increase_low=None, increase_high=None))
         advance(len(samples))
-    says = f"{CAST} people of the procedural prior, {_DISTANCE[0]:g} to {_DISTANCE[1]:g} m away, cast anew for each "
-    says += "sensor: the same bodies, poses and distances, nothing around them"
+    says = (
+        f"{CAST} people of the procedural prior, {_DISTANCE[0]:g} to {_DISTANCE[1]:g} m away, with a new ray cast for "
+    )
+    says += "each sensor: the same bodies, poses and distances, nothing around them"
     return Curve(name="sensors", title="other sensors", says=says, points=tuple(points))
 
 

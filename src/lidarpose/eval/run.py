@@ -74,7 +74,7 @@ def evaluate_dataset(
         progress(num_people, dataset.count)
     if not parts:
         reasons = "; ".join(f"{reason}: {entry['first']}" for reason, entry in dataset.skipped.items())
-        raise InputError(f"nobody of {dataset.name} could be scored ({reasons})")
+        raise InputError(f"no person of {dataset.name} could be scored ({reasons})")
     predictions = concatenate(parts)
     if setting.sensor == "known" and num_unknown:
         setting = replace(setting, sensor="unknown" if num_unknown == num_people else "of some people")
@@ -153,12 +153,12 @@ def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iter
         if setup.dataset.settings.get("level"):
             yield "sequences out of level were turned; for the released code's frame, prepare with --no-level"
     if setting.kind == "waymo" and not (predictions.labels == UNLABELED).all():
-        yield "joints that are labeled as hidden count, but in PEM; people are predicted in their labeled boxes"
+        yield "joints that are labeled as hidden count, except in PEM; people are predicted in their labeled boxes"
     sequences = len(np.unique(predictions.sequence[~predictions.moving]))
     if setting.clusters and sequences < aggregate.LEAST_UNITS:
-        sequence_count = "one sequence alone" if sequences == 1 else f"{sequences} sequences alone"
+        sequence_count = "only one sequence" if sequences == 1 else f"only {sequences} sequences"
         yield (
-            f"{sequence_count}: no intervals, which take {aggregate.LEAST_UNITS}, since frames of a sequence are not "
+            f"{sequence_count}: no intervals, which need {aggregate.LEAST_UNITS}, since frames of a sequence are not "
             "independent"
         )
     if setting.kind == BENCH:
@@ -174,7 +174,7 @@ def _notes_of_run(run: dict, dataset: EvalDataset) -> Iterator[str]:
     data, split = run.get("data") or recipe.get("shards"), recipe.get("split", "all")
     if isinstance(data, list) and dataset.name in data:
         if split == dataset.split or "all" in (split, dataset.split):
-            yield f"the network was trained on split {split} of {dataset.name}: it knows who it is scored on"
+            yield f"the network was trained on split {split} of {dataset.name}: it has seen the people it is scored on"
         elif dataset.split == "val" and "validation_mm" in run:
             yield "the network's run was validated on this split: its best.safetensors was selected on these people"
     settings = dataset.settings if dataset.kind == "synth" else {}
@@ -183,8 +183,8 @@ def _notes_of_run(run: dict, dataset: EvalDataset) -> Iterator[str]:
         settings.get(name) == recipe.get(name) for name in ("seed", "scene")
     )
     if is_synthetic and has_same_settings:
-        people = f"synthesized people of seed {settings['seed']}, as these are: they may be the very same"
-        yield f"the network was trained on {people}; make others by lidarpose synth --seed"
+        people = f"synthesized people of seed {settings['seed']}, like these: they may be identical"
+        yield f"the network was trained on {people}; make others with lidarpose synth --seed"
 
 
 # ---- one call
@@ -291,7 +291,7 @@ def _loaded(model: Model | str | os.PathLike, **options: Any) -> tuple[Model, di
     elif not callable(getattr(model, "predict", None)):
         raise InputError(f"expected a network to evaluate, weights by name or path or a predictor, got {model!r}")
     elif options != {"device": "cpu", "backend": None, "decode": "window", "tta": 1}:
-        raise InputError("device, backend, decode and tta are of weights by name or path: give them to load instead")
+        raise InputError("device, backend, decode and tta are for weights by name or path: give them to load instead")
     elif not isinstance(model, Predictor):
         model = _described(model)
     # only the checkpoint shows whether it was trained on the dataset's own sequences
@@ -303,7 +303,9 @@ def _described(model: Any) -> Model:
     """A user's own model with missing attributes added. Raises InputError if its skeleton is unknown."""
     kind, skeleton, known = type(model).__name__, getattr(model, "skeleton", None), getattr(model, "model", None)
     if not isinstance(skeleton, str | Skeleton):
-        raise InputError(f"{kind}.skeleton: expected a Skeleton or its name, got {skeleton!r}: say whose joints it has")
+        raise InputError(
+            f"{kind}.skeleton: expected a Skeleton or its name, got {skeleton!r}: give the skeleton of its joints"
+        )
     names = ("predict", "predict_in", "outputs", "backend", "header")
     parts: dict[str, Any] = {name: getattr(model, name) for name in names if hasattr(model, name)}
     known = {"name": kind} | (known if isinstance(known, dict) else {})

@@ -152,11 +152,11 @@ def read_scores(path: str | PathLike) -> Scores:
         if (schema := content["schema"]) == SCHEMA:
             head = {name: kind(content[name]) for name, kind in _HEAD.items()}
             if not isinstance(head["weights"].get("digest") or "", str):
-                raise TypeError("the digest of the weights is no text")
+                raise TypeError("the digest of the weights is not text")
             return Scores(**head, results=tuple(map(_result, content["results"])))
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         problem = f"{error} is missing" if isinstance(error, KeyError) else error
-        raise file_error(path, f"is no {FILE} of lidarpose evaluate ({problem})") from None
+        raise file_error(path, f"is not a {FILE} of lidarpose evaluate ({problem})") from None
     remedy = "evaluate again, or use the lidarpose version that wrote it"
     raise file_error(path, f"is of schema {schema!r}, this lidarpose reads {SCHEMA}: {remedy}")
 
@@ -166,11 +166,11 @@ def _result(content: dict[str, Any]) -> Result:
     setting["joints"] = tuple(setting["joints"])
     for field in fields(Setting):
         if field.type is str and not isinstance(setting[field.name], str):
-            raise TypeError(f"{field.name} is no text")
+            raise TypeError(f"{field.name} is not text")
     counts = dict(content["counts"])
     for name in ("people", "without a pose"):
         if type(counts[name]) is not int:
-            raise TypeError(f"{name} is no whole number")
+            raise TypeError(f"{name} is not a whole number")
     return Result(
         setting=Setting(**setting),
         counts=counts,
@@ -195,7 +195,7 @@ COLUMNS = {"mpjpe": ("MPJPE", "mm"), "pa_mpjpe": ("PA-MPJPE", "mm"), "pck3": ("P
 _WITHOUT_PA = ("waymo", "humanm3")
 _BLOCKS = {
     "dapt": "Evaluated here, protocol dapt: crop and center from labels, as the released code. Nearest to the block "
-    "above; the notes tell what differs",
+    "above; the notes list the differences",
     "clean": "Evaluated here, protocol clean: a detector's box and a center from the points alone. Not comparable with "
     "the blocks above",
 }

@@ -37,7 +37,7 @@ class TrackPoses:
         for name in _PER_JOINT:
             value = getattr(self, name)
             if value is not None and value.shape != shape:
-                raise InputError(f"TrackPoses.{name} must be {shape}, one a joint, got {value.shape}")
+                raise InputError(f"TrackPoses.{name} must be {shape}, one per joint, got {value.shape}")
         if not (np.isfinite(self.times).all() and (np.diff(self.times) > 0).all()):
             raise InputError("TrackPoses.times must be finite seconds, each later than the one before")
         if self.filled is None:

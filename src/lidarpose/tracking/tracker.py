@@ -219,7 +219,7 @@ class Tracker:
 def _checked(boxes: Iterable[Box]) -> list[Box]:
     box_list = list(boxes) if isinstance(boxes, Iterable) else None
     if box_list is None or not all(isinstance(box, Box) for box in box_list):
-        raise InputError(f"expected a list of Box, got {reprlib.repr(boxes)}: make them of it by lidarpose.read_boxes")
+        raise InputError(f"expected a list of Box, got {reprlib.repr(boxes)}: convert it with lidarpose.read_boxes")
     return box_list
 
 

@@ -107,7 +107,7 @@ def draw_scans(
         va="top",
         parse_math=False,
     )
-    tracks = "; dotted: the way over the frames" if any(panel.tracks for panel in panels) else ""
+    tracks = "; dotted: path over the frames" if any(panel.tracks for panel in panels) else ""
     limbs = "; left limbs blue, right ones orange" if any(is_known(panel.poses) for panel in panels) else ""
     note = f"arrow: facing{tracks}{limbs}"
     figure.text(0.15 / width, 1 - 0.42 / height, note, fontsize=8, color=_FAINT, va="top")

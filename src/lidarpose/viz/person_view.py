@@ -42,7 +42,7 @@ class Panel:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
             raise InputError(f"Panel.points must be (n, 3) meters, got {self.points.shape}")
         if self.part is not None and self.part.shape != (len(self.points),):
-            raise InputError(f"Panel.part must be ({len(self.points)},), one a point, got {self.part.shape}")
+            raise InputError(f"Panel.part must be ({len(self.points)},), one per point, got {self.part.shape}")
         for name, pose in (("pose", self.pose), ("truth", self.truth)):
             if pose is not None and pose.joints.ndim != 2:
                 raise InputError(

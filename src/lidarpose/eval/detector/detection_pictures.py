@@ -39,7 +39,7 @@ def draw_false(result: DetectorResult, scans: ScanSet) -> bytes | None:
     for row in false_people.head(MOST).itertuples():
         label_parts = (f"{row.score:.2f}", row.thing, f"{row.distance:.0f} m")
         crops.append(_crop(scans.loaders[row.scan](), result.boxes[row.scan][row.detection], label_parts))
-    return _sheet(crops, f"{result.dataset}: the strongest false people (red), labeled people blue")
+    return _sheet(crops, f"{result.dataset}: false positives with the highest scores (red), labeled people (blue)")
 
 
 def draw_missed(result: DetectorResult, scans: ScanSet) -> bytes | None:
@@ -51,7 +51,9 @@ def draw_missed(result: DetectorResult, scans: ScanSet) -> bytes | None:
         scan, score = scans.loaders[row.scan](), f"{row.score:.2f}" if row.detection >= 0 else "no score"
         label_parts = (score, f"{row.points} points", f"{row.distance:.0f} m", "mounted" * row.mounted)
         crops.append(_crop(scan, scan.boxes[row.person], label_parts))
-    title = f"{result.dataset}: {len(missed_people)} people missed above {threshold:.2f}, the most points first (red)"
+    title = (
+        f"{result.dataset}: {len(missed_people)} people missed at threshold {threshold:.2f} (red), by number of points"
+    )
     return _sheet(crops, title)
 
 

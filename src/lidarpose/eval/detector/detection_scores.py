@@ -196,7 +196,7 @@ def score_detector(
     *tables, all_boxes, rows_about = zip(*scan_results, strict=True)
     people, detections = (pd.concat(parts, ignore_index=True) for parts in tables)
     if people.empty:
-        raise InputError(f"{scans.name} has nobody of {LEAST_POINTS} points and more within {max_range:g} m")
+        raise InputError(f"{scans.name} has no people of {LEAST_POINTS} or more points within {max_range:g} m")
     rng = np.random.default_rng(seed)
     table = pd.DataFrame(rows_about)
     rows, thresholds = _figures(people, detections, table, rng, default_score)

@@ -61,7 +61,7 @@ def as_flags(name: str, value: ArrayLike, shape: tuple[int, ...], *, of: str = "
     """
     flags = as_numbers(name, np.ma.filled(value, 0) if isinstance(value, np.ma.MaskedArray) else value)
     if flags.shape != shape:
-        raise InputError(f"{name} must be {shape}, one a {of}, got {flags.shape}")
+        raise InputError(f"{name} must be {shape}, one per {of}, got {flags.shape}")
     if not ((flags == 0) | (flags == 1)).all():
         raise InputError(f"{name} must be bool, or 0 and 1; of other codes pass a comparison, such as codes > 0")
     return flags == 1
@@ -85,7 +85,7 @@ def check_positive(name: str, value: float) -> None:
 
 def _cluster_labels(clusters: ArrayLike | None, count: int) -> np.ndarray | None:
     if clusters is not None and np.shape(clusters) != (count,):
-        raise InputError(f"clusters must be ({count},), one label a person, got {np.shape(clusters)}")
+        raise InputError(f"clusters must be ({count},), one label per person, got {np.shape(clusters)}")
     if clusters is None:
         return None
     labels = np.asarray(clusters)
@@ -128,7 +128,7 @@ def mean(table: ArrayLike, average: str = "person", *, empty: float | None = Non
     """
     check_name("average", average, AVERAGES)
     if average == "joint" and empty is not None:
-        raise InputError('empty is for average="person": people without labeled joints add none to the other')
+        raise InputError('empty is for average="person": people without labeled joints have no effect on the other')
     total, count = _person_sums(as_table(table))
     is_counted = count > 0 if empty is None else np.ones(len(count), bool)
     person_means = np.where(count > 0, total / np.maximum(count, 1), np.nan if empty is None else empty)
@@ -263,7 +263,7 @@ def by_group(
     """`mean` of a table (n, J) for each joint group of the skeleton; NaN for a group without any label."""
     table, of = as_table(table), as_skeleton(of)
     if table.shape[1] != len(of):
-        raise InputError(f"a table of {of.name} has {len(of)} columns, one a joint, got {table.shape[1]}")
+        raise InputError(f"a table of {of.name} has {len(of)} columns, one per joint, got {table.shape[1]}")
     return {name: mean(table[:, index], average, empty=empty) for name, index in joint_groups(of, groups).items()}
 
 
@@ -307,9 +307,9 @@ def by_span(
     table = as_table(table)
     values, edges = as_numbers("values of slices", values), as_numbers("edges of slices", edges)
     if values.shape != (len(table),):
-        raise InputError(f"values of slices must be ({len(table)},), one a person, got {values.shape}")
+        raise InputError(f"values of slices must be ({len(table)},), one per person, got {values.shape}")
     if edges.ndim != 1 or len(edges) < 2 or not (np.diff(edges) > 0).all():
-        raise InputError(f"edges of slices must be two or more rising numbers, got {edges.tolist()}")
+        raise InputError(f"edges of slices must be two or more increasing numbers, got {edges.tolist()}")
     labels = _cluster_labels(clusters, len(table))
     spans = span_rows(values, edges)
     is_elsewhere = ~np.any(list(spans.values()), axis=0)

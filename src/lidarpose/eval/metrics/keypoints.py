@@ -140,7 +140,7 @@ def _box_scale(size: ArrayLike, people: int) -> np.ndarray:
 def _checked_sigmas(sigmas: ArrayLike, joints: int) -> np.ndarray:
     sigmas = as_numbers("sigmas", sigmas)
     if sigmas.shape != (joints,) or not (np.isfinite(sigmas) & (sigmas > 0)).all():
-        raise InputError(f"sigmas must be ({joints},) positive numbers, one a joint, got {sigmas.shape}")
+        raise InputError(f"sigmas must be ({joints},) positive numbers, one per joint, got {sigmas.shape}")
     return sigmas
 
 
@@ -191,7 +191,7 @@ def pem(
     columns = {"pred": pred, "true": true, "boxes": boxes, "visible": visible, "predicted": predicted}
     lengths = {name: len(value) for name, value in columns.items() if value is not None}
     if len(set(lengths.values())) != 1:
-        raise InputError(f"PEM needs one entry a frame of everything, got {lengths}")
+        raise InputError(f"PEM needs one entry per frame in every argument, got {lengths}")
     totals = np.zeros(8)
     for k in range(lengths["pred"]):
         frame = {name: None if value is None else value[k] for name, value in columns.items()}
