@@ -87,8 +87,8 @@ def test_all_that_is_new_learns(arrays):
 def test_growing_needs_room_and_the_same_meaning():
     tiny = PoseNet(preset("tiny"))
     for change, words in (
-        ({"channels": (32, 64, 96)}, "none may shrink"),
-        ({"blocks": (1, 0, 1)}, "none may shrink"),
+        ({"channels": (32, 64, 96)}, "must not shrink"),
+        ({"blocks": (1, 0, 1)}, "must not shrink"),
         ({"grid": 0.04}, "grid is 0.04, there 0.06"),
         ({"heatmap": "none"}, "heatmap"),
         ({"head_channels": 16}, "head_channels"),
@@ -112,5 +112,5 @@ def test_pretraining_goes_on_from_weights(tmp_path):
         make_setup(Pretrain(size="paper-small", init="tiny"))
     path = tmp_path / "small.safetensors"
     save_checkpoint(path, network, card={})
-    with pytest.raises(InputError, match="none may shrink"):
+    with pytest.raises(InputError, match="must not shrink"):
         make_setup(Pretrain(size="tiny", init=str(path)))
