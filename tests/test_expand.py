@@ -89,11 +89,11 @@ def test_growing_needs_room_and_the_same_meaning():
     for change, words in (
         ({"channels": (32, 64, 96)}, "must not shrink"),
         ({"blocks": (1, 0, 1)}, "must not shrink"),
-        ({"grid": 0.04}, "grid is 0.04, there 0.06"),
+        ({"grid": 0.04}, "grid is 0.04 instead of 0.06"),
         ({"heatmap": "none"}, "heatmap"),
         ({"head_channels": 16}, "head_channels"),
-        ({"convolution": 0}, "convolution is 0, there 12"),
-        ({"convolution": 16}, "convolution is 16, there 12"),
+        ({"convolution": 0}, "convolution is 0 instead of 12"),
+        ({"convolution": 16}, "convolution is 16 instead of 12"),
     ):
         with pytest.raises(InputError, match=words):
             expand_weights(tiny, replace(preset("tiny"), **change))
