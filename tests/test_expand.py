@@ -108,7 +108,7 @@ def test_pretraining_goes_on_from_weights(tmp_path):
     torch.manual_seed(0)
     assert all(map(torch.equal, network.state_dict().values(), setup.network().state_dict().values()))
     assert make_setup(Pretrain(size="base", init="tiny")).network().config == preset("base")
-    with pytest.raises(InputError, match="dapt begins at random"):
+    with pytest.raises(InputError, match="dapt starts from random weights"):
         make_setup(Pretrain(size="paper-small", init="tiny"))
     path = tmp_path / "small.safetensors"
     save_checkpoint(path, network, card={})

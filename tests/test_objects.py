@@ -131,7 +131,7 @@ def test_networks_that_say_whether_somebody_is_there():
     setup = make_setup(Pretrain(objects=0.1, people=64))
     assert setup.objective.config.person and setup.network().person is not None
     assert not make_setup(Pretrain(people=64)).objective.config.person
-    with pytest.raises(InputError, match="objects are for the package's own networks, of which paper is none"):
+    with pytest.raises(InputError, match="objects are for the package's own networks, and paper is not one of them"):
         make_setup(Pretrain(objects=0.1, size="paper"))
     with pytest.raises(InputError, match="objects must be a share, below 1, got 1"):
         Pretrain(objects=1)
