@@ -109,7 +109,7 @@ def test_a_thing_that_stands_still_is_in_one_place_for_all_scans(frames, sensors
 
 def test_sensors_that_reach_nothing_are_an_error():
     far = replace(WILD, sensors=("vlp-16",), distance=(300.0, 400.0), median_points=0)
-    with pytest.raises(InputError, match="scene wild: no draw of 16 left 15 points on an object"):
+    with pytest.raises(InputError, match="scene wild: none of 16 draws left 15 points on an object"):
         draw_object(far, 0, 0)
 
 

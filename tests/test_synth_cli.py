@@ -169,7 +169,7 @@ BAD = {
     "workers": (["-n", "5", "--workers", "0"], "worker"),
     "motion": (["-n", "5", "--motion", "none.npz"], "none.npz"),
     "subjects": (["-n", "5", "--subjects", "a"], "--motion"),
-    "no subject": (["-n", "5", "--motion", "none.npz", "--subjects", ","], "leave --subjects away"),
+    "no subject": (["-n", "5", "--motion", "none.npz", "--subjects", ","], "omit --subjects"),
     "both": (["-n", "5", "--clips", "--scenes"], "are different datasets"),
     "shard": (["-n", "5", "--per-shard", "0"], "--per-shard must be a whole number of at least 1, got 0"),
     "captured": (["-n", "5", "--captured", "0.3"], "--motion"),
