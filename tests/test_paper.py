@@ -353,7 +353,7 @@ def test_a_plan_runs_nothing(tmp_path, monkeypatch, capsys):
         (["table1", "--data", "freemotion-poses=x"], "needs a dataset to score on"),
         (["fig6", "--rows", "dapt"], "fig6 has no rows"),
         (["table1", "--held-out", "2"], "--motion"),
-        (["table1", "--out", "file"], "name another by --out"),
+        (["table1", "--out", "file"], "give another by --out"),
     ],
 )
 def test_wrong_words_are_one_line(tmp_path, monkeypatch, capsys, words, told):

@@ -156,7 +156,7 @@ BAD = {
     "unreadable motion, workers": (["-n", "5", "--motion", "../broken.npz", "--workers", "2"], "broken.npz"),
     "short motion": (["-n", "2", "--clips", "--motion", "../short.npz"], "no clip lasts 1.6 s"),
     "nobody seen": (["-n", "3", "--sensor", "../near.json"], "sensors such as near"),
-    "scene of streets": (["-n", "1", "--scenes", "--scene", "paper"], "of their own"),
+    "scene of streets": (["-n", "1", "--scenes", "--scene", "paper"], "their own scene"),
     "none": (["-n", "0"], "the number of people must be a whole number of at least 1, got 0"),
     "negative": (["-n", "-3"], "got -3"),
     "sensor": (["-n", "5", "--sensor", "os1-129"], "did you mean os1-128"),
