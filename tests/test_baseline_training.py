@@ -322,7 +322,7 @@ def test_pretrain_predict_evaluate_and_finetune(tmp_path, capsys, monkeypatch):
     np.testing.assert_allclose(pose.joints, expected + [20, 0, 1], atol=2e-3)
     # and goes on, if it is what is asked for
     assert main(["pretrain", "more", "--model", "prn", "--init", "run/model.safetensors"]) == 2
-    assert "prn begins at random" in capsys.readouterr().err
+    assert "prn starts from random weights" in capsys.readouterr().err
     folder = tmp_path / "people"
     assert not main(["synth", "--out", str(folder), "--count", "8", "--scene", "paper"])
     common = [str(folder), "--split", "all", "--epochs", "1", "--batch", "4", *words]
@@ -336,7 +336,7 @@ def test_pretrain_predict_evaluate_and_finetune(tmp_path, capsys, monkeypatch):
     third = load_checkpoint("third/model.safetensors")[1]
     assert third.config.resample_with_replacement and third.card["init"] == "random"
     assert main(["finetune", *common, "--model", "lpformer", "--init", "run/model.safetensors", "--out", "no"]) == 2
-    assert "holds the network prn, not lpformer" in capsys.readouterr().err
+    assert "contains the network prn, not lpformer" in capsys.readouterr().err
 
 
 # ---- learning

@@ -93,13 +93,16 @@ def test_no_such_file_and_a_folder(tmp_path):
     [
         *((lambda b, keep=keep: b[:keep], f"ends at byte {keep:,}: it was not") for keep in (4, 7)),
         *((lambda b, keep=keep: b[:keep], f"ends at byte {keep:,}, within its header") for keep in (8, 100, 5000)),
-        (lambda b: b[:-1], "where its header says {size:,}: it was not copied completely: get it again"),
-        (lambda b: b + b"more", "where its header says {size:,}"),
+        (lambda b: b[:-1], "but its header says {size:,}: it was not copied completely: get it again"),
+        (lambda b: b + b"more", "but its header says {size:,}"),
         (lambda b: b"", "is empty"),
         (lambda b: b[:1000] + b"\x00}}{" + b[1004:], "at byte 1,000"),
         # a high bit of an exponent: still a finite number
-        (lambda b: b[:-1] + bytes([b[-1] ^ 0x08]), "does not fit the SHA-256 digest in its header: get the file again"),
-        (lambda b: b"hello world, this is text", "something else: name a checkpoint"),
+        (
+            lambda b: b[:-1] + bytes([b[-1] ^ 0x08]),
+            "does not match the SHA-256 digest in its header: get the file again",
+        ),
+        (lambda b: b"hello world, this is text", "something else: give a checkpoint"),
         (lambda b: b"\x80\x02}q\x00(X\x01\x00\x00\x00aK\x01u.", "something else"),
         (lambda b: b"\x1f\x8b" + bytes(50), "something else"),
         (lambda b: bytes(64), "something else"),
@@ -182,16 +185,16 @@ def rewritten(stored, path, *, tensors=dict, header=lambda entry: entry, config=
     "tensors, words",
     [
         (lambda t: {k: v for k, v in t.items() if k != "vote.query.bias"}, "tensor vote.query.bias is missing"),
-        (lambda t: t | {"more": torch.zeros(1)}, "unknown tensor more, which its configuration (tiny) has not"),
+        (lambda t: t | {"more": torch.zeros(1)}, "unknown tensor more, not part of its configuration (tiny)"),
         (
             lambda t: t | {"part.weight": torch.zeros(24, 48)},
-            "part.weight should be (25, 48) by its configuration (tiny), got (24, 48)",
+            "part.weight should be (25, 48) for its configuration (tiny), got (24, 48)",
         ),
         (
             lambda t: t | {"part.bias": torch.full((25,), torch.nan)},
-            "tensor part.bias holds numbers that are not finite",
+            "tensor part.bias holds values that are not finite",
         ),
-        (lambda t: t | {"part.bias": torch.zeros(25, dtype=torch.int32)}, "tensor part.bias holds .* no floats"),
+        (lambda t: t | {"part.bias": torch.zeros(25, dtype=torch.int32)}, "tensor part.bias holds .* not floats"),
         # finite until they are float32
         (lambda t: t | {"part.bias": torch.full((25,), 1e300, dtype=torch.float64)}, "part.bias .* not finite"),
     ],
@@ -260,7 +263,7 @@ def test_a_header_that_does_not_fit(stored, tmp_path, header, words):
         ({"channels": 64.0}, "channels must be 3 whole numbers"),
         ({"channels": [64, -1, 64]}, "channels must be 3 whole numbers"),
         ({"head_channels": 0}, "head_channels must be a whole number"),
-        ({"head_channels": 5}, "must divide by head_channels"),
+        ({"head_channels": 5}, "must be divisible by head_channels"),
         ({"blocks": [1, 1]}, "blocks must be 3 whole numbers"),
         ({"blocks": 3}, "blocks must be 3 whole numbers"),
         ({"grid": -1}, "grid must be a positive number"),
@@ -353,7 +356,7 @@ def test_a_refused_import_writes_nothing(tmp_path, stored):
     with safe_open(str(TINY_DAPT), framework="pt") as file:
         metadata = file.metadata()
     save_file(whole | {name: whole[name].int()}, tmp_path / "whole.safetensors", metadata=metadata)
-    with pytest.raises(InputError, match=f"tensor {name} holds numbers that are not finite or no floats"):
+    with pytest.raises(InputError, match=f"tensor {name} holds values that are not finite or not floats"):
         import_released(tmp_path / "whole.safetensors", tmp_path / "in.safetensors")
     assert [path.name for path in tmp_path.iterdir()] == ["whole.safetensors"]
 

@@ -285,15 +285,15 @@ def test_the_rate_goes_by_the_losses_of_whole_epochs(folder, tmp_path):
 def test_settings_that_clips_cannot_have_are_refused(folder, tmp_path):
     with refused("lidarcap learns from clips: .* by --shards"):
         make_setup(recipe(Pretrain, "lidarcap"))
-    with refused("batch counts frames, so a clip counts 16: give a multiple, got 24"):
+    with refused("batch counts frames, and a clip has 16: give a multiple, got 24"):
         loop.train(recipe(Pretrain, "lidarcap", shards=(str(folder),), batch=24), tmp_path / "run", device="cpu")
-    with refused("head is of the paper's network, lidarcap has none"):
+    with refused("head is an option of the paper's network, lidarcap has none"):
         make_setup(recipe(Finetune, "lidarcap", data=(str(folder),), split="all", head="coordinates"))
-    with refused("keep_anchors is of the paper's network"):
+    with refused("keep_anchors is an option of the paper's network"):
         make_setup(recipe(Finetune, "lidarcap", data=(str(folder),), split="all", keep_anchors=False))
     with refused("leave --mix at 0, and --augment at none or turn"):
         make_setup(recipe(Finetune, "ne", data=(str(folder),), split="all", mix=0.25))
-    with refused("shift_windows is of networks of clips, tiny reads single frames"):
+    with refused("shift_windows is for clip networks, tiny reads single frames"):
         make_setup(recipe(Finetune, data=(str(folder),), init="tiny", split="all", mix=0.0, shift_windows=True))
     with refused("the joints of lidarcap are SMPL's 24"):
         replace(LidarcapConfig(), joints=BODY26.joints)

@@ -586,8 +586,8 @@ def test_joints_of_the_released_networks_by_name():
         ({"encoder_depths": (1,)}, "encoder_depths must be 2 whole numbers"),
         ({"encoder_channels": (16, 16)}, "encoder_channels must be 3 whole numbers"),
         ({"decoder_heads": (1, 0)}, "decoder_heads must be 2 whole numbers"),
-        ({"encoder_heads": (3, 1, 1)}, "encoder_channels must divide by encoder_heads"),
-        ({"anchor_heads": 5}, "decoder_channels must divide by anchor_heads"),
+        ({"encoder_heads": (3, 1, 1)}, "encoder_channels must be divisible by encoder_heads"),
+        ({"anchor_heads": 5}, "decoder_channels must be divisible by anchor_heads"),
         ({"patch": 0}, "patch must be a whole number"),
         ({"grid": -0.01}, "grid must be a positive number"),
         ({"strides": (2, 3)}, "strides must be 2, 4 or 8"),
@@ -598,7 +598,7 @@ def test_joints_of_the_released_networks_by_name():
         ({"joints": ("noze",)}, "unknown joint of body26 'noze': did you mean nose"),
         ({"bins": (44, 44)}, "bins must be 3"),
         ({"ranges": ((1.0, -1.0),) * 3}, "ranges must be three pairs"),
-        ({"bins": (), "ranges": (), "coordinates": False}, "it would predict nothing"),
+        ({"bins": (), "ranges": (), "coordinates": False}, "without them it predicts nothing"),
         ({"parts": 1}, "parts must be 0"),
         ({"parts": 10**19}, "parts must be a whole number from 0 to 16384"),
         ({"bins": (10**19, 1, 1)}, "bins must be 3"),
@@ -623,7 +623,7 @@ def test_wider_strides():
     levels |= {"encoder_channels": (8,) * 8, "decoder_channels": (8,) * 7, "anchor_channels": (8,) * 8}
     config = replace(TINY, **levels | {"anchor_heads": 1, "strides": (4, 4, 4, 4, 4, 8, 8)})
     assert len(build_tables([cloud], config).levels) == 8
-    with pytest.raises(InputError, match="65536 in all at most"):
+    with pytest.raises(InputError, match="their product at most 65536"):
         replace(config, strides=(8,) * 7)
 
 
@@ -676,14 +676,14 @@ FIRST_BIAS = "heads.query.fcs.0.fc1.bias"
         (lambda t: t.update({"heads.other.weight": torch.zeros(3)}), "unknown tensor heads.other.weight"),
         (
             lambda t: t.update({"backbone.keypoint_embedding": torch.zeros(15, 64)}),
-            r"keypoint_embedding should be \(14, 64\) by the configuration released, got \(15, 64\)",
+            r"keypoint_embedding should be \(14, 64\) for the configuration released, got \(15, 64\)",
         ),
-        (lambda t: t[FIRST_BIAS].fill_(np.nan), f"tensor {FIRST_BIAS} holds numbers that are not finite"),
+        (lambda t: t[FIRST_BIAS].fill_(np.nan), f"tensor {FIRST_BIAS} holds values that are not finite"),
         (
             lambda t: t["heads.query.coord_range"].mul_(2),
-            "tensor heads.query.coord_range says .*-1.8, 1.8.*the configuration released \\[\\[-0.9",
+            "tensor heads.query.coord_range says .*-1.8, 1.8.*the configuration released says \\[\\[-0.9",
         ),
-        (lambda t: t.clear(), "has 0 tensors, too few for .* layers by the configuration released"),
+        (lambda t: t.clear(), "has 0 tensors, too few for the .* layers of the configuration released"),
     ],
 )
 def test_import_of_tensors_that_do_not_fit(tmp_path, change, message):
@@ -702,7 +702,7 @@ THEIRS = header()
     "config, message",
     [
         ("waymoo", "unknown DAPT configuration 'waymoo': did you mean waymo"),
-        ("waymo", "enc0.block1.* is missing, which the configuration waymo has: name the configuration"),
+        ("waymo", "enc0.block1.* is missing, but the configuration waymo needs it: give the configuration"),
         ({"enc_depths": [1, 1]}, "does not fit: encoder_channels must be 2"),
         ({"widths": 3}, "unknown setting of the network 'widths'"),
         ({"name": "x"}, "needs the entry 'joints'"),
@@ -730,7 +730,7 @@ def test_import_of_files_that_are_none(tmp_path):
     cut.write_bytes(WEIGHTS.read_bytes()[:100])
     with pytest.raises(InputError, match="cut.safetensors: .*ends at byte"):
         import_dapt(cut)
-    for entry, message in (({}, "no configuration: name one of paper, waymo"), ({"config": "{"}, "not JSON")):
+    for entry, message in (({}, "no configuration: give one of paper, waymo"), ({"config": "{"}, "not JSON")):
         save_file(load_file(WEIGHTS), cut, entry)
         with pytest.raises(InputError, match=message):
             import_dapt(cut)

@@ -570,7 +570,7 @@ def test_the_released_faults_are_options():
         finetuned_network(recipe, trained(mended), HUMAN15, "humanm3")
     with pytest.raises(InputError, match="unknown option of .* 'grid': "):
         pretraining_network(Pretrain(size="paper-tiny", options=("grid=0.02",)))
-    with pytest.raises(InputError, match="small has none: leave --options away"):
+    with pytest.raises(InputError, match="small has none: omit --options"):
         pretraining_network(Pretrain(size="small", options=options))
 
 

@@ -87,13 +87,13 @@ def test_all_that_is_new_learns(arrays):
 def test_growing_needs_room_and_the_same_meaning():
     tiny = PoseNet(preset("tiny"))
     for change, words in (
-        ({"channels": (32, 64, 96)}, "none may shrink"),
-        ({"blocks": (1, 0, 1)}, "none may shrink"),
-        ({"grid": 0.04}, "grid is 0.04, there 0.06"),
+        ({"channels": (32, 64, 96)}, "must not shrink"),
+        ({"blocks": (1, 0, 1)}, "must not shrink"),
+        ({"grid": 0.04}, "grid is 0.04 instead of 0.06"),
         ({"heatmap": "none"}, "heatmap"),
         ({"head_channels": 16}, "head_channels"),
-        ({"convolution": 0}, "convolution is 0, there 12"),
-        ({"convolution": 16}, "convolution is 16, there 12"),
+        ({"convolution": 0}, "convolution is 0 instead of 12"),
+        ({"convolution": 16}, "convolution is 16 instead of 12"),
     ):
         with pytest.raises(InputError, match=words):
             expand_weights(tiny, replace(preset("tiny"), **change))
@@ -108,9 +108,9 @@ def test_pretraining_goes_on_from_weights(tmp_path):
     torch.manual_seed(0)
     assert all(map(torch.equal, network.state_dict().values(), setup.network().state_dict().values()))
     assert make_setup(Pretrain(size="base", init="tiny")).network().config == preset("base")
-    with pytest.raises(InputError, match="dapt begins at random"):
+    with pytest.raises(InputError, match="dapt starts from random weights"):
         make_setup(Pretrain(size="paper-small", init="tiny"))
     path = tmp_path / "small.safetensors"
     save_checkpoint(path, network, card={})
-    with pytest.raises(InputError, match="none may shrink"):
+    with pytest.raises(InputError, match="must not shrink"):
         make_setup(Pretrain(size="tiny", init=str(path)))

@@ -360,7 +360,8 @@ def test_sequences_are_held_out_unless_the_dataset_has_a_split_for_it(datasets, 
     setup = make_setup(Finetune(data=(str(datasets[name]),), mix=0.0, **settings))
     assert setup.card["held_out_sequences"] == held_out and not {*held_out} & {*setup.source.dataset.sequences}
     assert len(setup.validation()) == watched
-    lost = "nobody is left to validate on: no split val, and no sequence is held out (--hold-out, or too few of them)"
+    no_split = "no validation people: there is no split val"
+    lost = f"{no_split}, and no sequence is held out (--hold-out 0, or too few sequences)"
     assert setup.warnings == (() if watched else (lost,))
 
 
@@ -379,7 +380,7 @@ def test_a_dataset_is_remembered_by_the_name_that_an_evaluation_gives_it(dataset
 
 
 def test_pretraining_takes_nobody_who_is_kept_for_testing(datasets, tmp_path):
-    with pytest.raises(InputError, match="has people for testing, by the split official.*--split train") as error:
+    with pytest.raises(InputError, match="contains test people, by the split official.*--split train") as error:
         make_setup(Pretrain(shards=(datasets["humanm3"],)))
     assert "\n" not in str(error.value)
     raw = datasets["humanm3"].parent / "raw-humanm3"
@@ -496,11 +497,11 @@ def test_a_run_on_a_dataset_is_taken_up(datasets, tmp_path):
         (["{humanm3}", "--split", "morning"], "expected labeled people in the split 'morning'"),
         (["{humanm3}", "--init", "huge"], "unknown bundled weights 'huge'"),
         (["{humanm3}", "--init", "none.safetensors"], "does not exist"),
-        (["{humanm3}", "{waymo}"], "need one skeleton"),
-        (["{synthetic}"], "have no split 'train': say --split all"),
+        (["{humanm3}", "{waymo}"], "need the same skeleton"),
+        (["{synthetic}"], "have no split 'train': give --split all"),
         (["{humanm3}", "--augment", "much"], "unknown augmentation 'much'"),
         (["{humanm3}", "--keep-anchors", "perhaps"], "keep_anchors must be true or false, got 'perhaps'"),
-        (["{humanm3}", "--hold-out", "0.99"], "leaves nobody to learn from"),
+        (["{humanm3}", "--hold-out", "0.99"], "leaves no people for training"),
         (["{humanm3}", "--epochs", "0"], "epochs must be above 0"),
         (["{humanm3}", "--epochs", "inf"], "epochs must be a finite number"),
         (["{humanm3}", "--recipe", "paper"], "name it by --init"),
@@ -542,7 +543,7 @@ def test_points_are_jittered_lost_and_added():
 
 def test_weights_that_pose_nobody_are_no_beginning():
     for name in ("verifier", "detector"):
-        with pytest.raises(InputError, match=f"holds the network {name}, which poses nobody"):
+        with pytest.raises(InputError, match=f"contains the network {name}, which predicts no poses"):
             initial_network(Finetune(data=("any",), init=str(weights_file(f"{name}.safetensors"))))
-        with pytest.raises(InputError, match=f"holds the network {name}: --init names one of the package's own"):
+        with pytest.raises(InputError, match=f"contains the network {name}: --init needs one of the package's own"):
             expanded_network(str(weights_file(f"{name}.safetensors")), PRETRAINED["tiny"][0])

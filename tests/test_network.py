@@ -152,7 +152,7 @@ SMALL_ONE = {"size": "x", "channels": [4, 8, 8], "head_channels": 8, "blocks": [
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"head_channels": 5}, r"must divide by head_channels, got \(4, 8, 8\) and 5"),
+        ({"head_channels": 5}, r"must be divisible by head_channels, got \(4, 8, 8\) and 5"),
         ({"channels": 8}, r"channels must be 3 whole numbers \(fine, mid, coarse\) from 1 to 16384, got 8"),
         ({"channels": [4, 0, 8]}, "channels must be 3 whole numbers"),
         ({"blocks": (1, -1, 1)}, r"blocks must be 3 whole numbers \(mid encoder, coarse, mid decoder\)"),

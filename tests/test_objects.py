@@ -109,7 +109,7 @@ def test_a_thing_that_stands_still_is_in_one_place_for_all_scans(frames, sensors
 
 def test_sensors_that_reach_nothing_are_an_error():
     far = replace(WILD, sensors=("vlp-16",), distance=(300.0, 400.0), median_points=0)
-    with pytest.raises(InputError, match="scene wild: no draw of 16 left 15 points on an object"):
+    with pytest.raises(InputError, match="scene wild: none of 16 draws left 15 points on an object"):
         draw_object(far, 0, 0)
 
 
@@ -131,7 +131,7 @@ def test_networks_that_say_whether_somebody_is_there():
     setup = make_setup(Pretrain(objects=0.1, people=64))
     assert setup.objective.config.person and setup.network().person is not None
     assert not make_setup(Pretrain(people=64)).objective.config.person
-    with pytest.raises(InputError, match="objects are for the package's own networks, of which paper is none"):
+    with pytest.raises(InputError, match="objects are for the package's own networks, and paper is not one of them"):
         make_setup(Pretrain(objects=0.1, size="paper"))
     with pytest.raises(InputError, match="objects must be a share, below 1, got 1"):
         Pretrain(objects=1)

@@ -309,7 +309,7 @@ def test_a_set_that_the_protocol_refuses_is_refused_before_anything_is_trained(t
     with pytest.raises(InputError, match="run lidarpose prepare sloper4d RAW OUT --split-by dapt into another folder"):
         run_table(TABLES["table1"], options, tmp_path / "out", [], lambda words: pytest.fail(str(words)), print)
     # which has no column of it
-    with pytest.raises(InputError, match="table3 scores on waymo: name one by --data"):
+    with pytest.raises(InputError, match="table3 is scored on waymo: give one by --data"):
         run_table(TABLES["table3"], options, tmp_path / "out", [], pytest.fail, print)
     monkeypatch.chdir(tmp_path)
     words = ["--data", f"sloper4d={options.data['sloper4d']}"]
@@ -349,11 +349,11 @@ def test_a_plan_runs_nothing(tmp_path, monkeypatch, capsys):
         (["table1", "--size", "huge"], "unknown size of the paper's network"),
         (["table1", "--data", "waymo"], "NAME=DIR"),
         (["table1", "--data", "wymo=x"], "unknown dataset 'wymo'"),
-        (["table1", "--data", "waymo=nowhere"], "is no prepared dataset"),
+        (["table1", "--data", "waymo=nowhere"], "is not a prepared dataset"),
         (["table1", "--data", "freemotion-poses=x"], "needs a dataset to score on"),
         (["fig6", "--rows", "dapt"], "fig6 has no rows"),
         (["table1", "--held-out", "2"], "--motion"),
-        (["table1", "--out", "file"], "name another by --out"),
+        (["table1", "--out", "file"], "give another by --out"),
     ],
 )
 def test_wrong_words_are_one_line(tmp_path, monkeypatch, capsys, words, told):
@@ -442,7 +442,7 @@ def test_two_tables_in_one_folder_share_a_step(tmp_path):
         # waits, and finds it done
         pool.submit(run_steps, step, tmp_path, execute, tell).result(60)
         first.result(60)
-    assert len(asked) == 1 and told[1] == f"{step.name}: another process is at it, waiting for its end"
+    assert len(asked) == 1 and told[1] == f"{step.name}: another process is running it, waiting for its end"
 
 
 def test_an_evaluation_that_was_killed_while_its_files_were_put_in_place_is_done_again(tmp_path):

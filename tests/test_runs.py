@@ -168,7 +168,7 @@ def test_a_run_may_become_shorter_and_longer(tmp_path):
     loop.train(replace(RECIPE, people=CHUNK + 4, workers=1), folder, resume=True)
     assert people_of(folder) == [CHUNK, CHUNK + 4]
     loop.train(RECIPE, folder, resume=True)
-    with pytest.raises(InputError, match=f"the run has seen {RECIPE.people} people already, got {CHUNK} in all"):
+    with pytest.raises(InputError, match=f"the run has seen {RECIPE.people} people already, got a total of {CHUNK}"):
         loop.train(replace(RECIPE, people=CHUNK), folder, resume=True)
     assert people_of(folder)[-1] == RECIPE.people
 
@@ -250,7 +250,7 @@ def test_a_dead_worker_is_one_line(tmp_path, monkeypatch, where, name):
         raise RuntimeError("DataLoader worker (pid 12) is killed by signal: Killed.")
 
     monkeypatch.setattr(where, name, lost)
-    with refused("a process that makes people was killed"):
+    with refused("a data loader process was killed"):
         loop.train(RECIPE, tmp_path / "run")
 
 
@@ -333,7 +333,7 @@ DAMAGE = [
         for name in (run_dir.CONFIG, run_dir.STATE)
     ),
     (run_dir.STATE, lambda path: shutil.copy(path.with_name(run_dir.MODEL), path), "damaged"),
-    (run_dir.STATE, of_another_network, "not of this network"),
+    (run_dir.STATE, of_another_network, "the state belongs to another network"),
     (run_dir.STATE, rewritten(progress=lambda _: []), "damaged"),
     *(
         (run_dir.STATE, rewritten(progress=lambda known, change=change: known | change), "damaged")
@@ -422,7 +422,7 @@ def test_what_is_not_finite_stops_the_run_and_never_reaches_what_is_saved(tmp_pa
         return terms | {"vote": terms["vote"] + poison(terms["vote"])} if len(calls) == step else terms
 
     chunk, batch = divmod(step - 1, BATCHES)
-    where = f"batch {batch} of the {BATCHES} from person {CHUNK * chunk} on"
+    where = f"batch {batch} of the {BATCHES} that start at person {CHUNK * chunk}"
     message = f"its gradient is not finite in {where}: start in another folder "
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(PoseNetObjective, "terms", poisoned)
@@ -437,7 +437,7 @@ def test_what_is_not_finite_stops_the_run_and_never_reaches_what_is_saved(tmp_pa
 
 
 def test_an_absurd_rate_stops_the_run(tmp_path):
-    with refused(f"not finite in batch [0-9] of the {BATCHES} from person 0 on"):
+    with refused(f"not finite in batch [0-9] of the {BATCHES} that start at person 0"):
         loop.train(replace(RECIPE, rate=1e30), tmp_path / "run")
 
 

@@ -118,7 +118,7 @@ def test_they_join_pretraining_as_a_share(monkeypatch):
     assert setup.source.other.load_scene is populated_scan
     with pytest.raises(InputError, match="whole_scans are for the package's own networks: leave whole_scans or prn"):
         make_setup(Pretrain(whole_scans=0.1, size="prn"))
-    with pytest.raises(InputError, match="whole_scans are made during training: leave whole_scans or shards away"):
+    with pytest.raises(InputError, match="whole_scans are made during training: omit whole_scans or shards"):
         make_setup(Pretrain(whole_scans=0.1, shards=("somewhere",)))
     with pytest.raises(InputError, match="whole_scans must be a share, below 1, got 1"):
         Pretrain(whole_scans=1)

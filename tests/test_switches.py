@@ -124,7 +124,7 @@ def test_recorded_places_need_motion_and_single_people(tmp_path):
     with pytest.raises(InputError, match="--clips"):
         SynthesisJob(what="clips", count=1, motion="m.npz", set=("recorded=1",))
     bank, _ = _bank(np.zeros(3))
-    with pytest.raises(InputError, match="clips have no recorded places: set recorded=0"):
+    with pytest.raises(InputError, match="clips have no recorded positions: set recorded=0"):
         Generator(scene=scene, bank=bank, captured=1.0).clip(1, 0)
     for changes, words in ((("accumulated=0.1",), "set accumulated=0"), (("integration=1",), "set integration=0")):
         with pytest.raises(InputError, match=words):

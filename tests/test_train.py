@@ -405,7 +405,7 @@ def test_numbers_of_numpy_paths_and_one_name_alone_are_settings_too():
         ({"scene": 3}, "scene must be text, got 3"),
         ({"shards": [3]}, r"shards must be a list of texts, got \[3\]"),
         # without a file they would choose nobody
-        ({"subjects": ("a",)}, "subjects are of captured clips: name their file by motion too"),
+        ({"subjects": ("a",)}, "subjects select captured clips: give their file by motion too"),
         ({"head": "arms"}, "unknown head 'arms': .*"),
         ({"drop_path": "much"}, "drop_path must be a number, got 'much'"),
         *(({"keep_anchors": value}, "keep_anchors must be true or false, got .*") for value in ("false", 0, None)),
@@ -419,11 +419,11 @@ def test_a_recipe_refuses_what_is_no_such_setting(change, message):
 @pytest.mark.parametrize(
     "kind, change, message",
     [
-        (Pretrain, {"neck": "prn"}, "neck, head and drop_path are of the paper's network: add --size paper"),
+        (Pretrain, {"neck": "prn"}, "neck, head and drop_path are options of the paper's network: add --size paper"),
         (Pretrain, {"size": "paper-small", "neck": "giraffe"}, "unknown neck 'giraffe'"),
         (Pretrain, {"size": "paper-small", "neck": "prn", "head": "heatmaps"}, "has coordinates and no heatmaps"),
         (Pretrain, {"size": "paper-small", "drop_path": 1.5}, "drop_path must be a probability below 1"),
-        (Finetune, {"data": "a", "neck": "prn"}, "a checkpoint has its neck: leave --neck away"),
+        (Finetune, {"data": "a", "neck": "prn"}, "a checkpoint has its own neck: omit --neck"),
     ],
 )
 def test_switches_of_the_papers_network_are_checked(kind, change, message):

@@ -299,7 +299,7 @@ def test_the_command_trains(quick_scans, tmp_path, capsys):
     assert main(["train-detector", str(folder), "--scans", str(tmp_path)]) == 2
     assert "add --calibrate N" in capsys.readouterr().err
     assert main(["pretrain", str(folder), "--resume"]) == 2
-    assert "resume it by that command" in capsys.readouterr().err
+    assert "resume it with that command" in capsys.readouterr().err
 
 
 def test_people_missed_at_one_false_person_a_scan(quick_scans):

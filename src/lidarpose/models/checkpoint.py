@@ -61,7 +61,7 @@ class Header:
         candidates = [candidate for candidate in SKELETONS.values() if set(candidate.joints) <= set(names)]
         if not candidates:
             raise InputError(
-                f"the network {self.config.name} predicts {', '.join(names)}, which hold none of the skeletons "
+                f"the network {self.config.name} predicts {', '.join(names)}, which contain none of the skeletons "
                 f"{', '.join(SKELETONS)}: its joints cannot be drawn or named"
             )
         return max(candidates, key=len)
@@ -197,17 +197,17 @@ class SafetensorsFile:
 
         shapes = self.shapes
         if config.layers > len(shapes):
-            problem = f"has {len(shapes)} tensors, too few for {config.layers} layers by {source}: {remedy}"
+            problem = f"has {len(shapes)} tensors, too few for the {config.layers} layers of {source}: {remedy}"
             raise file_error(self.path, problem)
         with _float32(), torch.device("meta"):
             expected = build(config).state_dict()
         if missing_names := [name for name in expected if name not in shapes]:
-            raise file_error(self.path, f"tensor {missing_names[0]} is missing, which {source} has: {remedy}")
+            raise file_error(self.path, f"tensor {missing_names[0]} is missing, but {source} needs it: {remedy}")
         if unknown_names := sorted(shapes.keys() - expected.keys()):
-            raise file_error(self.path, f"unknown tensor {unknown_names[0]}, which {source} has not: {remedy}")
+            raise file_error(self.path, f"unknown tensor {unknown_names[0]}, not part of {source}: {remedy}")
         for name, value in expected.items():
             if shapes[name] != tuple(value.shape):
-                problem = f"tensor {name} should be {tuple(value.shape)} by {source}, got {shapes[name]}: {remedy}"
+                problem = f"tensor {name} should be {tuple(value.shape)} for {source}, got {shapes[name]}: {remedy}"
                 raise file_error(self.path, problem)
         state = self.load(expected)
         # building a network draws random weights: the fork leaves the global random state unchanged
@@ -232,7 +232,7 @@ class SafetensorsFile:
             tensors[name] = value.to(template.dtype)
             is_float = value.is_floating_point() or not template.is_floating_point()
             if not is_float or not tensors[name].isfinite().all():
-                raise file_error(self.path, f"tensor {name} holds numbers that are not finite or no floats: {_AGAIN}")
+                raise file_error(self.path, f"tensor {name} holds values that are not finite or not floats: {_AGAIN}")
         return tensors
 
 
@@ -245,7 +245,7 @@ def _parse_safetensors(path: str | os.PathLike, content: bytes) -> dict:
         raise file_error(path, f"expected {_EXPECTED}, but the file ends at byte {size}: {remedy}")
     length = struct.unpack("<Q", content[:8])[0]
     if content[8:9] not in (b"", b"{") or not 0 < length <= _MOST_HEADER:
-        raise file_error(path, f"expected {_EXPECTED}, but the file is something else: name a checkpoint")
+        raise file_error(path, f"expected {_EXPECTED}, but the file is something else: give a checkpoint")
     if size < 8 + length:
         raise file_error(path, f"the file ends at byte {size:,}, within its header of {length:,} bytes: {remedy}")
     end = 0
@@ -253,7 +253,7 @@ def _parse_safetensors(path: str | os.PathLike, content: bytes) -> dict:
         header = json.loads(content[8 : 8 + length])
         metadata = header.get("__metadata__", {})
         if not all(isinstance(text, str) for text in metadata.values()):
-            raise TypeError("metadata that are no texts")
+            raise TypeError("metadata that are not text")
         for name, entry in header.items():
             if name != "__metadata__":
                 start, stop = entry["data_offsets"]
@@ -265,14 +265,14 @@ def _parse_safetensors(path: str | os.PathLike, content: bytes) -> dict:
     except (ValueError, AttributeError, KeyError, IndexError, TypeError, RecursionError) as error:
         raise file_error(path, f"its header is damaged ({error}): {_AGAIN}") from None
     if size != 8 + length + end:
-        problem = f"the file ends at byte {size:,} where its header says {8 + length + end:,}: {remedy}"
+        problem = f"the file ends at byte {size:,}, but its header says {8 + length + end:,}: {remedy}"
         raise file_error(path, problem)
     return header
 
 
 # ---- digests
 
-DAMAGED = "is damaged: its content does not fit the SHA-256 digest in its header: get the file again"
+DAMAGED = "is damaged: its content does not match the SHA-256 digest in its header: get the file again"
 
 
 def warn_without_digest(path: str | os.PathLike) -> None:
@@ -312,8 +312,8 @@ def parse_header(path: str | os.PathLike, entry: str | None) -> Header:
     if entry is None:
         raise file_error(
             path,
-            "not a checkpoint of lidarpose (its header has no entry for it): name one that `lidarpose pretrain` wrote; "
-            "weights of the released DAPT code come in by `lidarpose import`",
+            "not a checkpoint of lidarpose (its header has no entry for it): give one that `lidarpose pretrain` wrote, "
+            "or convert weights of the released DAPT code with `lidarpose import`",
         )
     try:
         header = json.loads(entry)

@@ -138,7 +138,7 @@ class NetworkConfig(Config):
             object.__setattr__(self, "convolution", 0)
         super().__post_init__()
         if any(width % self.head_channels for width in self.channels[1:]):
-            problem = "channels of the mid and coarse level must divide by head_channels"
+            problem = "channels of the mid and coarse level must be divisible by head_channels"
             raise InputError(f"{problem}, got {self.channels} and {self.head_channels}")
         check_name("heatmap", self.heatmap, HEATMAPS)
         skeleton(self.skeleton)

@@ -63,8 +63,8 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
         return
     if not isinstance(network, PoseNet):
         raise InputError(
-            f"{os.fspath(weights)}: the network {network.config.name} is not offered as {format}: "
-            "it runs with torch, and the package's own networks (tiny, small, base) are exported"
+            f"{os.fspath(weights)}: the network {network.config.name} cannot be exported as {format}: "
+            "run it with torch, or export one of the package's own networks (tiny, small, base)"
         )
     # before tracing, which takes a minute
     check_writable(out)

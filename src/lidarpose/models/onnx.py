@@ -127,10 +127,10 @@ def open_network(path: str | os.PathLike) -> tuple[Any, Header]:
     content = read_bytes(path, expected="an ONNX file (.onnx)")
     if _EXTERNAL in content:
         # those would be read from the current folder, whatever it contains
-        raise file_error(path, "keeps its weights in other files: make one file of it with `lidarpose export`")
+        raise file_error(path, "keeps its weights in other files: make a single file with `lidarpose export`")
     # a checkpoint begins with 8 bytes of length, followed by its JSON header
     if content[8:9] == b"{":
-        raise file_error(path, "expected an ONNX file, got a checkpoint: make one of it with `lidarpose export`")
+        raise file_error(path, "expected an ONNX file, got a checkpoint: convert it with `lidarpose export`")
     has_digest = check_digest(path, content)
     # outside the try: if ONNX Runtime cannot be loaded, the file is not at fault
     runtime()

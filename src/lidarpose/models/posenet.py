@@ -295,8 +295,8 @@ def expand_weights(network: PoseNet, config: NetworkConfig) -> PoseNet:
         is_smaller = name not in fixed_settings and any(b < a for a, b in zip(old_value, new_value, strict=True))
         if is_smaller or name in fixed_settings and new_value != old_value:
             raise InputError(
-                f"a {config.size} network cannot begin as this {old_config.size} one: {name} is {new_value!r}, "
-                f"there {old_value!r}{', and none may shrink' if is_smaller else ''}"
+                f"a {config.size} network cannot start from this {old_config.size} network: {name} is {new_value!r} "
+                f"instead of {old_value!r}{', and must not shrink' if is_smaller else ''}"
             )
     new_network = PoseNet(config)
     old_state = network.state_dict()

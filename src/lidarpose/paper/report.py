@@ -36,14 +36,14 @@ SCHEMA = "lidarpose.paper/1"
 # a network whose error is not lower than the mean pose's by this share has not been trained enough to compare
 _UNDERTRAINED = 0.2
 _LEGEND = (
-    "MPJPE in mm, the mean over seeds; in brackets the 95 % interval over people, of several seeds the least and the "
-    "greatest. *undertrained*: not 20 % better than the mean pose about the protocol's center; nothing can be "
-    "concluded from it. *Against* a row: the mean difference over the same people, where both rows' poses are there."
+    "MPJPE in mm, the mean over seeds; in brackets the 95 % interval over people, or for several seeds the lowest and "
+    "highest value. *undertrained*: not 20 % better than the mean pose at the protocol's center; nothing can be "
+    "concluded from it. *Against* a row: the mean difference over the same people, where both rows have poses."
 )
 # appended if the paper's printed values are shown
 _PRINTED = (
-    " In parentheses what the paper prints, not run here: LiDARCap's and NE's figures are of poses about the root "
-    "without shapes, LPFormer's of detected boxes."
+    " In parentheses the paper's values, not run here: those of LiDARCap and NE are for poses relative to the root, "
+    "without shapes; those of LPFormer are for detected boxes."
 )
 # maximum number of people that the mean pose is computed from
 _MEAN_POSE = 5_000
@@ -122,7 +122,7 @@ def _entry(table: Table, cell: Cell, out: Path, failure: str) -> dict[str, Any]:
     if path.is_file():
         return entry | json.loads(path.read_text())
     if not is_done(cell.evaluation, out):
-        return entry | {"state": "not run", "reason": "its command was not run, or not to its end"}
+        return entry | {"state": "not run", "reason": "its command was not run, or did not finish"}
     figures = {"state": "done"} | _figures(cell, cell.evaluation, out)
     write_atomic(path, json.dumps(figures, indent=1) + "\n")
     return entry | figures

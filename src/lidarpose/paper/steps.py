@@ -125,7 +125,7 @@ def run_steps(step: Step, out: Path, execute: Execute, tell: Callable[[str], Non
     for part in step.all():
         if is_done(part, out):
             continue
-        waiting = f"{part.name}: another process is at it, waiting for its end"
+        waiting = f"{part.name}: another process is running it, waiting for its end"
         (out / RUNS).mkdir(parents=True, exist_ok=True)
         with exclusive_lock(out / RUNS / f".{part.name}.lock", partial(tell, waiting)):
             if not is_done(part, out):
@@ -272,4 +272,4 @@ def check_out(out: Path) -> None:
     """Raises InputError if the folder holds other files than those of lidarpose paper."""
     is_paper_folder = any((out / name).is_dir() for name in (RUNS, CELLS))
     if out.is_file() or out.is_dir() and any(out.iterdir()) and not is_paper_folder:
-        raise InputError(f"{out}: expected a new or empty folder, or one of lidarpose paper: name another by --out")
+        raise InputError(f"{out}: expected a new or empty folder, or one of lidarpose paper: give another by --out")

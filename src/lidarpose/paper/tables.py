@@ -73,7 +73,7 @@ class Options:
             if name not in (*POSES, SMPL):
                 _check_prepared(name, folder)
         if (self.subjects or self.held_out) and not self.motion:
-            raise InputError("--subjects and --held-out are of captured motion: name its file by --motion")
+            raise InputError("--subjects and --held-out select captured motion: give its file by --motion")
         if self.data and not self.real:
             raise InputError(f"--data needs a dataset to score on, one of {', '.join(REAL)}")
 
@@ -159,10 +159,10 @@ class Row:
 def _check_prepared(name: str, folder: str) -> None:
     """Raises InputError unless the folder holds this dataset in prepared form."""
     if not (Path(folder) / CARD).is_file():
-        raise InputError(f"{name}={folder} is no prepared dataset: run lidarpose prepare first")
+        raise InputError(f"{name}={folder} is not a prepared dataset: run lidarpose prepare first")
     content = read_card(folder).settings.get("dataset", "synthetic people")
     if content != name:
-        raise InputError(f"--data {name}={folder}: expected {name} as prepared, got {content}: name its own folder")
+        raise InputError(f"--data {name}={folder}: expected {name} as prepared, got {content}: give its own folder")
 
 
 def row_key(name: str) -> str:
@@ -210,7 +210,7 @@ def _targets(table: Table, options: Options) -> list[Target]:
     if options.real:
         targets = [_real(name, options.data[name]) for name in options.real if name in table.columns]
         if not targets:
-            raise InputError(f"{table.name} scores on {' or '.join(table.columns)}: name one by --data")
+            raise InputError(f"{table.name} is scored on {' or '.join(table.columns)}: give one by --data")
         return targets
     targets = [_stand_in("people", "synthesized people", options)]
     if not table.single and {"lidarhuman26m", "sloper4d"} <= set(table.columns):
@@ -388,7 +388,7 @@ def _augmentations(options: Options) -> list[Row]:
     pretrain_recorded, pretrain_sampled = (
         _pretrained(options, *words) for words in (("--set", "recorded=1,keep=1"), ("--keep", "1"))
     )
-    why = "" if motion else "places as recorded need captured motion: --motion FILE"
+    why = "" if motion else "recorded positions need captured motion: give --motion FILE"
     rows = [
         Row(name="scratch", finetune=_random(options), published={"waymo": 59.2}),
         Row(name="+ pre-training", finetune=finetune, pretrain=pretrain_recorded, why=why, published={"waymo": 52.9}),

@@ -78,7 +78,7 @@ class PoseBank:
         """All poses of a motion whose clip continues for `FRAME_TIME` s. Raises InputError if there is none."""
         rotations, moved, step = motion.pairs(FRAME_TIME)
         if not len(rotations):
-            raise InputError(f"{motion.source}: no clip goes on for {FRAME_TIME:g} s")
+            raise InputError(f"{motion.source}: no clip lasts {FRAME_TIME:g} s")
         places = motion.places(FRAME_TIME)
         if not _SENSED[0] <= np.median(np.hypot(places[:, 0], places[:, 1])) <= _SENSED[1]:
             places[:, :2] += np.array([_AHEAD, 0.0], np.float32) - np.median(places[:, :2], 0)

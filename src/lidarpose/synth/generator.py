@@ -84,12 +84,12 @@ class Generator:
         if not 0 <= self.captured <= 1:
             raise InputError(f"Generator.captured must be a share in [0, 1], got {self.captured}")
         if self.config.recorded and not self.captured:
-            raise InputError("recorded=1 keeps the places of captured motion: name its file by --motion")
+            raise InputError("recorded=1 keeps the positions of captured motion: give its file by --motion")
         multi_frame_fields = [name for name in ("accumulated", "integration") if getattr(self.config, name)]
         if self.config.recorded and multi_frame_fields:
             settings = " and ".join(f"{name}=0" for name in multi_frame_fields)
             raise InputError(
-                f"recorded=1 keeps the places of single frames, several together have none: set {settings}"
+                f"recorded=1 keeps the positions of single frames, and combined frames have none: set {settings}"
             )
         # an unknown sensor raises here rather than at the first person
         self._bodies  # noqa: B018
@@ -162,7 +162,7 @@ class Generator:
         Frames in which the person has no returns have samples without points. Samples have the fields that clip
         networks need: the pose's rotations, the pelvis position, and the two clouds around the person."""
         if self.config.recorded:
-            raise InputError("clips have no recorded places: set recorded=0")
+            raise InputError("clips have no recorded positions: set recorded=0")
         frames = check_int("a clip's frames", frames, least=1)
         seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
         rng = np.random.default_rng([seed, RandomStream.CLIP, index])
@@ -203,8 +203,8 @@ class Generator:
                 break
         if best_draw is None:
             raise InputError(
-                f"scene {config.name}: no draw of {_TRIES} left a point on a person, with sensors such as "
-                f"{scene.sensor.name}: does its range hold people at {config.distance[0]:g} to "
+                f"scene {config.name}: none of {_TRIES} draws left a point on a person, with sensors such as "
+                f"{scene.sensor.name}: does its range include people at {config.distance[0]:g} to "
                 f"{config.distance[1]:g} m?"
             )
         scene, samples = best_draw

@@ -66,8 +66,8 @@ def draw_object(
         if len(sample.points) >= LEAST_POINTS:
             return sample, name
     raise InputError(
-        f"scene {config.name}: no draw of {_TRIES} left {LEAST_POINTS} points on an object; does the range of its "
-        f"sensors hold {config.distance[0]:g} to {config.distance[1]:g} m?"
+        f"scene {config.name}: none of {_TRIES} draws left {LEAST_POINTS} points on an object; does the range of its "
+        f"sensors include {config.distance[0]:g} to {config.distance[1]:g} m?"
     )
 
 

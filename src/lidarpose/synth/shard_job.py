@@ -69,20 +69,20 @@ class SynthesisJob:
                 "--set or --keep": self.set,
             }
             if names := ", ".join(name for name, is_set in not_theirs.items() if is_set):
-                raise InputError(f"streets have scene, difficulty and walkers of their own: leave {names} out")
+                raise InputError(f"streets have their own scene, difficulty and walkers: omit {names}")
         if -(-self.count // self.shard_size) > _MOST_SHARDS:
             raise InputError(
                 f"{self.count:,} {self.what} would take more than {_MOST_SHARDS:,} shards: give a larger --per-shard"
             )
         if self.motion is None and (self.subjects is not None or self.captured is not None):
-            raise InputError("--subjects and --captured are of captured clips: name their file with --motion too")
+            raise InputError("--subjects and --captured need captured clips: give their file with --motion too")
         if self.subjects is not None and not self.subjects:
-            raise InputError("expected the subjects of clips, got none: leave --subjects away for all of them")
+            raise InputError("expected the subjects of clips, got none: omit --subjects for all of them")
         if self.captured is not None and not 0 <= self.captured <= 1:
             raise InputError(f"expected a share of captured poses between 0 and 1, got {self.captured}")
         scene = scene_config(self.scene).eased(self.hard).changed(self.set)
         if scene.recorded and self.what == "clips":
-            raise InputError("recorded=1 keeps the places of single poses: leave it or --clips away")
+            raise InputError("recorded=1 keeps the positions of single poses: omit it or --clips")
         for name in self.sensors or ():
             sensor(name)
         if self.sensors is not None and not self.sensors:
@@ -109,7 +109,7 @@ class SynthesisJob:
         bank = PoseBank.from_clips(self.motion, self.subjects) if self.motion is not None else None
         if self.what == "clips" and self.share and bank is not None and not len(bank.clips.windows(CLIP_FRAMES + 1)):
             raise file_error(
-                self.motion, f"no clip lasts {CLIP_FRAMES / CLIP_HZ:g} s: give longer motion, or leave --clips away"
+                self.motion, f"no clip lasts {CLIP_FRAMES / CLIP_HZ:g} s: give longer motion, or omit --clips"
             )
         rig = None if self.body is None else smpl_rig(self.body, self.motion)
         return Generator(scene=scene, bank=bank, captured=self.share, rig=rig)

@@ -112,12 +112,12 @@ def train(
     elif folder is not None:
         run_dir.check_new(Path(folder))
     elif int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        raise InputError("several processes need to know the run's folder: name it")
+        raise InputError("several processes need the run's folder: give it")
     on_cpu = device == "cpu" or not torch.cuda.is_available()
     setup = setup or job or make_setup(recipe, on_cpu=on_cpu)
     accelerator = _accelerator(recipe, on_cpu, tracker)
     if recipe.batch % setup.frames:
-        raise InputError(f"batch counts frames, so a clip counts {setup.frames}: give a multiple, got {recipe.batch}")
+        raise InputError(f"batch counts frames, and a clip has {setup.frames}: give a multiple, got {recipe.batch}")
     lanes_of(recipe.batch // setup.frames, accelerator.num_processes)
     # every process must have checked the folder before the first one writes
     accelerator.wait_for_everyone()
@@ -154,7 +154,7 @@ def _accelerator(recipe: Recipe, on_cpu: bool, tracker: str | None) -> Accelerat
     except ValueError as error:
         # the machine has no bf16, or the launcher asks for something that is not available
         reason = str(error).partition("\n")[0]
-        raise InputError(f"cannot train so ({reason}): choose another --precision or --device") from None
+        raise InputError(f"cannot train like this ({reason}): choose another --precision or --device") from None
 
 
 def _check(device: str | None, tracker: str | None) -> None:
@@ -206,14 +206,15 @@ class _Run:
             if steps > self.steps:
                 people_seen = steps * self.recipe.batch
                 raise InputError(
-                    f"{self.folder}: the run has seen {people_seen:,} people already, got {self.setup.people:,} in all"
+                    f"{self.folder}: the run has seen {people_seen:,} people already, got a total of "
+                    f"{self.setup.people:,}"
                 )
             # a longer run repeats the last, partial chunk of a shorter one as a whole chunk
             self.chunk = self.chunks if steps == self.steps else steps // BATCHES
             self.best = float("inf") if progress["best"] is None else progress["best"]
             self.error = progress["validation"]
         elif self.is_main:
-            _warn(f"{self.folder} has no {STATE}, it was stopped before its first was saved: the run starts over")
+            _warn(f"{self.folder} has no {STATE}, it was stopped before the first one was saved: the run starts over")
         if self.is_main:
             run_dir.cut_log(self.folder, self.seen)
         entries = run_dir.read_log(self.folder) if (self.folder / LOG).is_file() else []
@@ -299,8 +300,8 @@ class _Run:
         if bad_batches:
             state = f"{STATE} is kept" if (self.folder / STATE).is_file() else "nothing was saved before"
             raise InputError(
-                f"the loss or its gradient is not finite in batch {bad_batches[0]} of the {len(batches)} from person "
-                f"{self.seen} on: start in another folder with a lower --rate; {state}"
+                f"the loss or its gradient is not finite in batch {bad_batches[0]} of the {len(batches)} that start at "
+                f"person {self.seen}: start in another folder with a lower --rate; {state}"
             )
         self.chunk += 1
         means = {name: round(value, 5) for name, value in zip(names, values.mean(0).tolist(), strict=True)}
@@ -418,6 +419,5 @@ def _dead_worker_named() -> Iterator[None]:
         if "DataLoader worker" not in str(error):
             raise
         raise InputError(
-            "a process that makes people was killed, perhaps for want of memory: go on with --resume and fewer "
-            "--workers"
+            "a data loader process was killed, perhaps because memory ran out: go on with --resume and fewer --workers"
         ) from None

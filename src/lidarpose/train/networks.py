@@ -75,16 +75,14 @@ def pretraining_network(recipe: Pretrain) -> tuple[Any, Skeleton]:
     if recipe.objects:
         if not isinstance(config, NetworkConfig):
             raise InputError(
-                f"objects are for the package's own networks, of which {recipe.size} is none: leave them away"
+                f"objects are for the package's own networks, and {recipe.size} is not one of them: omit objects"
             )
         config = replace(config, person=True)
         if recipe.shards:
-            raise InputError("objects are made during training, shards have none: leave either away")
+            raise InputError("objects are made during training, and shards have none: omit objects or shards")
     if recipe.whole_scans and (recipe.shards or not isinstance(config, NetworkConfig)):
         reason = "are made during training" if recipe.shards else "are for the package's own networks"
-        raise InputError(
-            f"whole_scans {reason}: leave whole_scans or {'shards' if recipe.shards else recipe.size} away"
-        )
+        raise InputError(f"whole_scans {reason}: omit whole_scans or {'shards' if recipe.shards else recipe.size}")
     if (recipe.neck, recipe.head, recipe.drop_path) != ("mde", "coordinates", None):
         config = _with_neck_and_head(recipe, config)
     return _with_options(config, recipe.options), joints
@@ -93,12 +91,12 @@ def pretraining_network(recipe: Pretrain) -> tuple[Any, Skeleton]:
 def expanded_network(init: str, config: Config) -> tuple[Callable[[], nn.Module], dict]:
     """A factory for networks of `config` initialized with the weights `init`, and the card of these weights."""
     if not isinstance(config, NetworkConfig):
-        raise InputError(f"init is for the package's own networks: {config.kind} begins at random")
+        raise InputError(f"init is for the package's own networks: {config.kind} starts from random weights")
     path = weights_path(init)
     small_network, header = load_checkpoint(path)
     if not isinstance(small_network, PoseNet) or not header.config.poses:
         raise file_error(
-            path, f"holds the network {header.config.name}: --init names one of the package's own that poses"
+            path, f"contains the network {header.config.name}: --init needs one of the package's own pose networks"
         )
     # tried now, so that an error is raised before a run folder is made
     expand_weights(small_network, config)
@@ -113,9 +111,11 @@ def initial_network(recipe: Finetune) -> tuple[Any, dict]:
     path = weights_path(recipe.init)
     trained, header = load_checkpoint(path)
     if not header.config.poses:
-        raise file_error(path, f"holds the network {header.config.name}, which poses nobody: name another's checkpoint")
+        raise file_error(
+            path, f"contains the network {header.config.name}, which predicts no poses: give weights of a pose network"
+        )
     if recipe.model and header.network != PRETRAINED[MODELS[recipe.model][0]][0].kind:
-        raise file_error(path, f"holds the network {header.config.name}, not {recipe.model}: name a checkpoint of it")
+        raise file_error(path, f"contains the network {header.config.name}, not {recipe.model}: give another one")
     return trained, {"init": path.name, "init_card": header.card}
 
 
@@ -131,25 +131,23 @@ def finetuned_network(
     dapt_settings = ("neck", "head", "keep_anchors") if isinstance(base_config, BaselineConfig) else ("neck", "head")
     for name in () if isinstance(base_config, DaptConfig) else dapt_settings:
         if getattr(recipe, name) != getattr(Finetune, name):
-            raise InputError(f"{name} is of the paper's network, {base_config.name} has none: leave it away")
+            raise InputError(f"{name} is an option of the paper's network, {base_config.name} has none: omit it")
     if isinstance(base_config, BaselineConfig):
         baseline = (
             base_config if isinstance(base_config, LidarcapConfig) else replace(base_config, joints=joints.joints)
         )
         config = _with_options(baseline, recipe.options)
         if trained is not None and config.width_divisor != base_config.width_divisor:
-            raise InputError(
-                f"--init has weights for width_divisor={base_config.width_divisor}: leave that option away"
-            )
+            raise InputError(f"--init has weights for width_divisor={base_config.width_divisor}: omit that option")
         return config, partial(build, config) if trained is None else partial(with_joints, trained, config)
     base_config = _with_options(base_config, recipe.options)
     if trained is not None and base_config != trained.config:
-        raise InputError("--init has weights that were trained without these options: leave --options away")
+        raise InputError("--init has weights that were trained without these options: omit --options")
     if isinstance(base_config, NetworkConfig):
         if not recipe.keep_anchors and trained is not None:
             raise InputError(
-                "keep_anchors=false is for the paper's network, and --init names one of the package's own: name a "
-                "checkpoint of pretrain --recipe paper, or leave --recipe paper and --keep-anchors away"
+                "keep_anchors=false is for the paper's network, and --init gives one of the package's own: give a "
+                "checkpoint of pretrain --recipe paper, or omit --recipe paper and --keep-anchors"
             )
         return base_config, partial(PoseNet, base_config) if trained is None else lambda: trained
     if not dataset:
@@ -184,7 +182,7 @@ def _with_options(config: Any, options: tuple[str, ...]) -> Any:
     if not options:
         return config
     if isinstance(config, NetworkConfig):
-        raise InputError(f"options are of the paper's networks, {config.name} has none: leave --options away")
+        raise InputError(f"options are for the paper's networks, {config.name} has none: omit --options")
     is_baseline = isinstance(config, BaselineConfig)
     option_names = [field.name for field in fields(config) if field.name != "joints"] if is_baseline else list(FAULTS)
     changes: dict[str, Any] = {}
@@ -201,11 +199,11 @@ def _with_neck_and_head(recipe: Pretrain, config: NetworkConfig | DaptConfig) ->
     """The paper's network with the recipe's neck, head and drop_path."""
     if not isinstance(config, DaptConfig):
         raise InputError(
-            f"neck, head and drop_path are of the paper's network: add --size {' or '.join(MODELS['dapt'])}"
+            f"neck, head and drop_path are options of the paper's network: add --size {' or '.join(MODELS['dapt'])}"
         )
     if recipe.head == "heatmaps":
         if recipe.neck == "prn":
-            raise InputError("the neck prn has coordinates and no heatmaps: leave --head away")
+            raise InputError("the neck prn has coordinates and no heatmaps: omit --head")
         heatmaps = finetuning_config("humanm3")
         config = REDUCED[recipe.size](heatmaps) if recipe.size in REDUCED else heatmaps
     drop_path = config.drop_path if recipe.drop_path is None else recipe.drop_path

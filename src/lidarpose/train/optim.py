@@ -111,7 +111,7 @@ class Muon(torch.optim.Optimizer):
         matrices = list(matrices)
         for matrix in matrices:
             if matrix.ndim != 2:
-                raise ValueError(f"Muon steps matrices, got a parameter of shape {tuple(matrix.shape)}")
+                raise ValueError(f"Muon updates matrices, got a parameter of shape {tuple(matrix.shape)}")
         super().__init__(matrices, {"lr": lr, "weight_decay": weight_decay, "momentum": momentum})
 
     @torch.no_grad()

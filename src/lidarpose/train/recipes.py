@@ -117,7 +117,9 @@ class Recipe:
             raise InputError(f"betas must be two numbers from 0 to below 1, got {self.betas}")
         check_name("schedule", self.schedule, SCHEDULES)
         if self.schedule == "reduce-on-plateau" and self.kind != "finetune":
-            raise InputError(f"{self.schedule} goes by epochs, which fine-tuning alone has: choose another --schedule")
+            raise InputError(
+                f"{self.schedule} needs epochs, and only fine-tuning has epochs: choose another --schedule"
+            )
         check_name("precision", self.precision, PRECISIONS)
 
     def to_dict(self) -> dict:
@@ -196,7 +198,7 @@ class Pretrain(PoseRecipe):
         object.__setattr__(self, "size", self.size or "tiny" if not self.model else _size_of(self.model, self.size))
         check_name("head", self.head, HEADS)
         if self.subjects and not self.motion:
-            raise InputError("subjects are of captured clips: name their file by motion too")
+            raise InputError("subjects select captured clips: give their file by motion too")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -236,18 +238,18 @@ class Finetune(PoseRecipe):
         elif self.model:
             check_name("model", self.model, MODELS)
         if not self.data:
-            raise InputError("fine-tuning needs a dataset: name a folder that lidarpose prepare wrote")
+            raise InputError("fine-tuning needs a dataset: give a folder that lidarpose prepare wrote")
         if not self.epochs > 0 or self.interval < 1:
             raise InputError(f"epochs must be above 0 and interval at least 1, got {self.epochs} and {self.interval}")
         if self.neck != "mde" and self.init != RANDOM:
-            raise InputError(f"a checkpoint has its neck: leave --neck away, or give --init {RANDOM}")
+            raise InputError(f"a checkpoint has its own neck: omit --neck, or give --init {RANDOM}")
         if (self.init == RANDOM) != bool(self.size):
             raise InputError(
-                f"random weights need a size, and others have theirs: give --init {RANDOM} --size NAME, or no --size"
+                f"random weights need a size, a checkpoint has its own: give --init {RANDOM} --size NAME, or no --size"
             )
         if not self.init:
             raise InputError(
-                "the paper's fine-tuning goes on from a checkpoint of pretrain --recipe paper: name it by --init"
+                "the paper's fine-tuning starts from a checkpoint of pretrain --recipe paper: give it by --init"
             )
 
 

@@ -60,7 +60,7 @@ def numbered(kind: str) -> Path:
         except FileExistsError:
             continue
         except OSError as error:
-            raise file_error(folder, f"cannot be made ({error.strerror}); name a folder for the run") from None
+            raise file_error(folder, f"cannot be created ({error.strerror}); give a folder for the run") from None
 
 
 def latest(kind: str) -> Path:
@@ -68,7 +68,7 @@ def latest(kind: str) -> Path:
     folders = [RUNS / f"{kind}-{number:03d}" for number in sorted(_numbers(kind))]
     runs = [folder for folder in folders if (folder / CONFIG).is_file()]
     if not runs:
-        raise InputError(f"{RUNS} has no run {kind}-... to resume: name its folder")
+        raise InputError(f"{RUNS} has no run {kind}-... to resume: give its folder")
     return runs[-1]
 
 
@@ -80,7 +80,7 @@ def _numbers(kind: str) -> list[int]:
 def check_new(folder: Path) -> None:
     """Raises InputError if the folder holds anything but partly written files of a killed run."""
     if not is_unused(folder, _NAMES):
-        hint = "; add --resume to go on with what is there" if (folder / CONFIG).is_file() else ""
+        hint = "; add --resume to continue the run there" if (folder / CONFIG).is_file() else ""
         raise InputError(f"{folder}: expected a new or empty folder for the run{hint}")
 
 
@@ -100,16 +100,16 @@ def read_config(folder: Path, kind: type[AnyRecipe]) -> tuple[AnyRecipe, str]:
     """The recipe of a run and the command that started it. Raises InputError if the folder is no run of this kind."""
     path = folder / CONFIG
     if not path.is_file():
-        raise InputError(f"{folder}: nothing to resume, it has no {CONFIG}: leave --resume away to start a run")
+        raise InputError(f"{folder}: nothing to resume, it has no {CONFIG}: omit --resume to start a run")
     # as bytes: json then detects the Unicode encoding
     content = read_bytes(path, expected="the configuration of a run")
     try:
         config = json.loads(content)
         if config["schema"] != SCHEMA:
-            problem = f"is of {config['schema']}, this lidarpose goes on with {SCHEMA}"
+            problem = f"has the schema {config['schema']}, and this lidarpose resumes {SCHEMA}"
             raise InputError(f"{problem}: use lidarpose {config['version']}")
         if config["kind"] != kind.kind:
-            raise InputError(f"is of a run of `lidarpose {config['kind']}`: resume it by that command")
+            raise InputError(f"belongs to a run of `lidarpose {config['kind']}`: resume it with that command")
         return kind(**config["recipe"]), str(config.get("command", ""))
     except InputError as error:
         raise file_error(path, error) from None
@@ -191,7 +191,7 @@ def load_state(
             value = progress[entry]
             if type(value) not in types or value is not None and not 0 <= value < inf:
                 raise ValueError(f"its {entry} is {value!r}")
-        problem = "the state is not of this network"
+        problem = "the state belongs to another network"
         network.load_state_dict(_part(tensors, "network."))
         stored_mean = _part(tensors, "mean.")
         for name, value in mean.items():

@@ -47,7 +47,7 @@ from lidarpose.train.validation import validate
 VALIDATION = 256
 _VALIDATION_SEED = 2**31 - 7
 _NO_VALIDATION = (
-    "nobody is left to validate on: no split val, and no sequence is held out (--hold-out, or too few of them)"
+    "no validation people: there is no split val, and no sequence is held out (--hold-out 0, or too few sequences)"
 )
 # no sequence is held out from fewer sequences than this
 _LEAST_SEQUENCES = 3
@@ -107,7 +107,7 @@ def objective_of(config: Config, recipe: PoseRecipe, layout: str = "ragged") -> 
     settings_by_kind: dict[str, dict] = {"pose": bone_weights, "dapt": {"stage": stage, "layout": layout}}
     settings = settings_by_kind.get(config.kind, {})
     if "prn" in (config.kind, getattr(config, "neck", "")) and recipe.batch < 2:
-        raise InputError("batch must be at least 2 for prn, whose batch norms see a few points a person, got 1")
+        raise InputError("batch must be at least 2 for prn (its batch norms see a few points per person), got 1")
     if settings is not bone_weights and any(bone_weights.values()):
         raise InputError("bone and symmetry are terms of the package's own networks: leave them at 0")
     return NETWORKS[config.kind].part("objective")(config=config, **settings)
@@ -162,7 +162,7 @@ _OF_POSES = ("part.", "level_joints.", "joint.heatmap.", "vote.residual.", "vote
 def _verification(recipe: TrainVerifier) -> TrainSetup:
     trained, header = load_checkpoint(weights_path(recipe.init))
     if not isinstance(trained, PoseNet):
-        problem = f"expected one of the package's own networks, which the verifier is, got a network {header.network}"
+        problem = f"expected one of the package's own networks for the verifier, got a network {header.network}"
         raise file_error(recipe.init, problem)
     config = replace(trained.config, size="verifier", person=True)
 
@@ -233,9 +233,9 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     )
     is_clip = isinstance(config, LidarcapConfig)
     if is_clip and not recipe.shards:
-        raise InputError(f"{config.name} learns from clips: name a folder of lidarpose synth --clips by --shards")
+        raise InputError(f"{config.name} learns from clips: give a folder of lidarpose synth --clips by --shards")
     if is_clip and scene_config(recipe.scene).changed(recipe.set).recorded:
-        raise InputError(f"{config.name} is validated on clips, which have no recorded places: leave recorded=1 away")
+        raise InputError(f"{config.name} is validated on clips, and clips have no recorded positions: omit recorded=1")
     if not recipe.shards:
         return setup
     for folder in recipe.shards:
@@ -257,8 +257,8 @@ def _check_no_test(folder: str) -> None:
     if settings.get("split_by") and settings.get("split") != "train":
         raise file_error(
             folder,
-            f"has people for testing, by the split {settings['split_by']}, and pre-training takes everybody: "
-            "prepare it with --split train, or learn from it by lidarpose finetune",
+            f"contains test people, by the split {settings['split_by']}, and pre-training uses all people: "
+            "prepare it with --split train, or train on it with lidarpose finetune",
         )
 
 
@@ -277,7 +277,7 @@ def _no_parts(dataset: InMemoryDataset) -> tuple[str, ...]:
     names = ", ".join(folder_names(folder for folder in folders if folder not in with_parts))
     if not names:
         return ()
-    return (f"no point of {names} has a body part: the loss of parts (the paper's L_seg) is absent there",)
+    return (f"no point of {names} has a body part: the loss of parts (the paper's L_seg) is not used there",)
 
 
 def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
@@ -319,7 +319,7 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
     )
     if not isinstance(config, LidarcapConfig):
         if recipe.shift_windows:
-            raise InputError(f"shift_windows is of networks of clips, {config.name} reads single frames: leave it away")
+            raise InputError(f"shift_windows is for clip networks, {config.name} reads single frames: omit it")
         return setup
     if recipe.mix or recipe.augment not in ("none", "turn"):
         raise InputError(f"{config.name} learns from clips: leave --mix at 0, and --augment at none or turn")
@@ -341,7 +341,7 @@ def _clips(dataset: InMemoryDataset, config: LidarcapConfig, recipe: Pretrain | 
         reasons = "; ".join(f"{count:,} {reason}" for reason, count in skipped.items())
         raise InputError(
             f"{config.name} needs {config.frames} consecutive frames of a person with rotations, got none: {reasons}; "
-            "lidarpose synth --clips writes some, and prepare of LiDARHuman26M and SLOPER4D"
+            "use lidarpose synth --clips, or lidarpose prepare of LiDARHuman26M or SLOPER4D"
         )
     return ClipSource(
         dataset=dataset,
@@ -359,7 +359,7 @@ def _of_clips(setup: TrainSetup, source: ClipSource) -> TrainSetup:
     warnings = [f"left out {count:,} {reason}" for reason, count in source.skipped.items()]
     parts = source.dataset.parts
     if len(config.clouds) > 1 and all(rows["background"].null_count == rows.num_rows for _, rows, _ in parts):
-        warnings.append(f"nothing is known of what stands about these people: {config.name} sees them alone")
+        warnings.append(f"the surroundings of these people are not known: {config.name} sees only the people")
     return replace(setup, source=source, frames=config.frames, warnings=(*setup.warnings, *warnings))
 
 
@@ -375,5 +375,5 @@ def _held_out(
         return (), None
     count = max(round(recipe.hold_out * len(dataset.sequences)), 1)
     if count == len(dataset.sequences):
-        raise InputError(f"hold_out = {recipe.hold_out} leaves nobody to learn from: lower it")
+        raise InputError(f"hold_out = {recipe.hold_out} leaves no people for training: lower it")
     return dataset.sequences[-count:], dataset.without(dataset.sequences[:-count])

@@ -62,7 +62,7 @@ class InMemoryDataset:
         damaged: list[str] = []
         for dataset in datasets:
             if split is not None and dataset.card.people != "labelled":
-                problem = f"holds synthetic people, which have no split {split!r}: say --split all"
+                problem = f"contains synthetic people, which have no split {split!r}: give --split all"
                 raise file_error(dataset.folder, problem)
             shards = list(_shards(dataset, split, interval, damaged))
             has_hidden = any(hidden for _, _, hidden in shards)
@@ -70,7 +70,7 @@ class InMemoryDataset:
             names += chain.from_iterable(shard_names for _, shard_names, _ in shards)
         skeletons = sorted({dataset.card.skeleton for dataset in datasets})
         if len(skeletons) > 1:
-            raise InputError(f"datasets that are learned together need one skeleton, got {', '.join(skeletons)}")
+            raise InputError(f"datasets of one training need the same skeleton, got {', '.join(skeletons)}")
         if not names:
             paths = ", ".join(str(dataset.folder) for dataset in datasets)
             damage = f" ({len(damaged)} shards cannot be read: {damaged[0]})" if damaged else ""

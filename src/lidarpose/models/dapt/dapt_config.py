@@ -92,12 +92,14 @@ class DaptConfig(Config):
             counts = check_counts(name, getattr(self, name), length, levels=f" (encoder_depths has {levels})")
             object.__setattr__(self, name, counts)
         if not set(self.strides) <= {2, 4, 8} or np.prod(self.strides, dtype=float) > 1 << CELL_BITS:
-            raise InputError(f"strides must be 2, 4 or 8 each and {1 << CELL_BITS} in all at most, got {self.strides}")
+            raise InputError(
+                f"strides must be 2, 4 or 8 each, and their product at most {1 << CELL_BITS}, got {self.strides}"
+            )
         for module, head_module in (("encoder", "encoder"), ("decoder", "decoder"), ("decoder", "anchor")):
             channels, heads = f"{module}_channels", f"{head_module}_heads"
             if np.any(np.array(getattr(self, channels)) % getattr(self, heads)):
                 raise InputError(
-                    f"{channels} must divide by {heads}, got {getattr(self, channels)} and {getattr(self, heads)}"
+                    f"{channels} must be divisible by {heads}, got {getattr(self, channels)} and {getattr(self, heads)}"
                 )
         if not self.orders:
             raise InputError(f"orders must name at least one curve of {', '.join(CURVES)}, got none")
@@ -113,7 +115,9 @@ class DaptConfig(Config):
             if not isinstance(self.ranges, tuple) or len(self.ranges) != 3 or not all(map(_is_range, self.ranges)):
                 raise InputError(f"ranges must be three pairs (low, high) of meters, or none, got {self.ranges!r}")
         elif not self.coordinates:
-            raise InputError("a network needs heatmaps (bins and ranges) or coordinates=True: it would predict nothing")
+            raise InputError(
+                "a network needs heatmaps (bins and ranges) or coordinates=True: without them it predicts nothing"
+            )
         if self.parts == 1:
             raise InputError(f"parts must be 0 (no part head) or from 2 to {MOST}, got 1")
         if self.neck == "prn" and (self.bins or self.parts or not self.coordinates):

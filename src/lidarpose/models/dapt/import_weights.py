@@ -42,15 +42,15 @@ def import_dapt(path: str | os.PathLike, config: DaptConfig | dict | str | None 
         )
     file = SafetensorsFile.open(path, prefix=_PREFIX)
     config = _config(path, file.metadata, config)
-    remedy = f"name the configuration that it was trained with ({', '.join(CONFIGS)})"
+    remedy = f"give the configuration that it was trained with ({', '.join(CONFIGS)})"
     network = file.network(config, source=f"the configuration {config.name}", remedy=remedy)
     # the released heatmap head stores its ranges: they must equal those with which its logits will be decoded
     ranges = network.state_dict().get("heads.query.coord_range")
     if ranges is not None and not torch.allclose(ranges, torch.tensor(config.ranges), atol=1e-4):
         raise file_error(
             path,
-            f"tensor heads.query.coord_range says {ranges.double().round(decimals=4).tolist()} m, the configuration "
-            f"{config.name} {[list(bounds) for bounds in config.ranges]}: {remedy}",
+            f"tensor heads.query.coord_range says {ranges.double().round(decimals=4).tolist()} m, but the "
+            f"configuration {config.name} says {[list(bounds) for bounds in config.ranges]}: {remedy}",
         )
     return network
 
@@ -77,7 +77,7 @@ def _config(path: Path, metadata: dict[str, str], config: DaptConfig | dict | st
         return config
     if isinstance(config, str):
         return named_config(config)
-    source, remedy = "the configuration given", f"name one of {', '.join(CONFIGS)}"
+    source, remedy = "the configuration given", f"give one of {', '.join(CONFIGS)}"
     if config is None:
         source = "its header's configuration"
         try:

@@ -253,6 +253,6 @@ def open_detector(path: str | os.PathLike | None = None) -> tuple[Any, dict]:
     path = detector_path() if path is None else path
     session, header = open_network(path)
     if not isinstance(header.config, DetectorConfig):
-        raise file_error(path, f"expected a detector, got a network of the kind {header.network}: leave it away")
+        raise file_error(path, f"expected a detector, got a network of the kind {header.network}: give a detector")
     check_names(path, session, INPUTS, (OUTPUT,))
     return session, {"version": header.version, **header.card}

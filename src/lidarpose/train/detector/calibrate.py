@@ -46,7 +46,7 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
     check_int("--calibrate", scans, least=1)
     path = Path(folder) / MODEL
     if not path.is_file():
-        raise InputError(f"{path} is not there: name the folder of a run of lidarpose train-detector")
+        raise InputError(f"{path} does not exist: give the folder of a run of lidarpose train-detector")
     network, header = load_checkpoint(path)
     if not isinstance(network, DetectorNet):
         raise InputError(f"{path}: expected a detector, got a network of the kind {header.network}")
