@@ -631,7 +631,7 @@ def test_a_table_never_replaces_its_scores(written, capsys):
     before = path.read_bytes()
     for named in (written[1], path):
         assert main(["table", str(named), "--out", str(path)]) == 2
-        assert "is itself what is read" in capsys.readouterr().err
+        assert "is also an input file" in capsys.readouterr().err
     assert path.read_bytes() == before
 
 

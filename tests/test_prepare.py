@@ -294,7 +294,7 @@ def test_own_lists_may_leave_out_the_first_folder(copied, encoding):
         ("basketball1\n", "plaza\n", "expected names such as 'test/c', got 'basketball1'"),
         ("train/a\n".encode("utf-16"), "plaza\n", "train.txt: expected text in UTF-8, got UTF-16"),
         ("train/a\n".encode("utf-16-le"), "plaza\n", "train.txt: expected text, got zero bytes"),
-        ("stra\xdfe\n".encode("latin-1"), "plaza\n", "train.txt: expected text in UTF-8, got other bytes at 4"),
+        ("stra\xdfe\n".encode("latin-1"), "plaza\n", "train.txt: expected text in UTF-8, got an invalid byte at 4"),
         ("c\nb/seg0\n", "test/c\n", "test.txt: names test/c, which is in train.txt too"),
         ("train/a\n", "\n", "test.txt: names no sequence"),
     ],

@@ -240,7 +240,7 @@ def test_lidarhuman26m_one_bad_file_costs_one_frame(tmp_path, smpl):
         "empty cloud": 1, "labels cannot be read": 1, "several files of one frame": 1,
     }  # fmt: skip
     told = " | ".join(one.where for one in skipped)
-    for words in ("it is a link to what is not there", "got a folder", "000008.json: expected beta, pose and trans, "):
+    for words in ("it is a link to a missing file", "got a folder", "000008.json: expected beta, pose and trans, "):
         assert words in told
 
 
