@@ -181,8 +181,8 @@ def test_kitti_labels_come_in_the_frame_of_the_lidar(tmp_path, tracking):
     assert [fields(box) for box in read_boxes(label, calib=calib)] == [fields(box) for box in boxes]
 
     for text, words in (
-        (texts[0], ["expected Tr_velo_to_cam: and 12 numbers, got R"]),
-        (texts[0].replace("e", "x") + "\n" + texts[1], ["expected R0_rect: and 9 numbers"]),
+        (texts[0], ["expected Tr_velo_to_cam: with 12 numbers, got R"]),
+        (texts[0].replace("e", "x") + "\n" + texts[1], ["expected R0_rect: with 9 numbers"]),
         (texts[1] + "\n" + names[0] + " 1 1 0 0 1 0 0 0 1", ["expected a rotation as R0_rect"]),
     ):
         calib.write_text(text)
@@ -216,7 +216,7 @@ BAD = {
     "a number": (changed(size=1), ["people[1].size", "got 1"]),
     "null": (changed(size=None), ["people[1].size", "null"]),
     "object": (changed(center={"x": 1, "y": 2, "z": 3}), ["people[1].center", '"x"']),
-    "pose of a crop": ({"people": [{"id": 0, "box": None}]}, ["people[0].box", "got null", "has none"]),
+    "pose of a crop": ({"people": [{"id": 0, "box": None}]}, ["people[0].box", "got null", "has no box"]),
     "pose, id": ({"people": [{"id": 1.5, "box": PERSON}]}, ["people[0].id", "whole number"]),
     "pose": ({"people": [{"id": 0, "box": {"center": [0, 0]}}]}, ["people[0].box.center", "three finite numbers"]),
     "nested": (changed(center=[[1, 2, 3]]), ["people[1].center"]),
@@ -229,7 +229,7 @@ BAD = {
     "boolean yaw": (changed(yaw=False), ["people[1].yaw", "false"]),
     "nan yaw": (changed(yaw=math.nan), ["people[1].yaw", "NaN"]),
     "degrees": (changed(yaw=90), ["people[1].yaw", "got 90", "pi / 180"]),
-    "id twice": (changed(), ["people[1].id", 'got "a", which people[0] has too']),
+    "id twice": (changed(), ["people[1].id", 'got "a", which people[0] also has']),
     "ids of one text": ([{**PERSON, "id": 1}, {**PERSON, "id": "1"}], ["people[1].id", 'got "1", which people[0]']),
     "seven with text": ([ROW, [1, 2, 3, 4, 5, "6", 7]], ["people[1].size"]),
     "six numbers": ([ROW[:6]], ["people[0]", "[x, y, z, l, w, h, yaw]"]),
@@ -260,7 +260,7 @@ def test_bad_structure(case):
             ['expected JSON {"people": [{"center": [x, y, z], "size"', "got text: write the boxes"],
         ),
         (b"Pedestrian 0 0 -0.2 712 143 810 307 1.89 0.48 1.2 1.84 1.47 8.41\n", ["got text"]),
-        (KITTI, ["is a KITTI label: expected its calibration at", "calib/boxes.json", "put it there or name it"]),
+        (KITTI, ["is a KITTI label: expected its calibration at", "calib/boxes.json", "put it there or give its path"]),
         (KITTI.replace(b" 8.41", b" nan"), ["got text"]),
         (KITTI + KITTI.replace(b" 8.41", b" far"), ["15 values on line 2, got 'Pedestrian 0 0 -0.2"]),
         (npy(np.zeros((2, 8))), ["people[0]", "[x, y, z, l, w, h, yaw]"]),
@@ -310,9 +310,9 @@ def test_boxes_picked_from_found_ones_say_what_is_up():
         Boxes(list(tilted)),
     ):
         assert read_boxes(some).up == "-y"
-    with pytest.raises(InputError, match=r"boxes of scans with one up axis, got -y, x: give those of one scan"):
+    with pytest.raises(InputError, match=r"boxes with the same up axis, got -y, x: give the boxes of one scan"):
         read_boxes([*tilted, Box(center=[9, 0, 0], size=[1, 1, 2], up="x")])
-    with pytest.raises(InputError, match="boxes of scans with one up axis"):
+    with pytest.raises(InputError, match="expected boxes with the same up axis"):
         Boxes([*tilted, Box(center=[9, 0, 0], size=[1, 1, 2], up="x")])
     assert Box(center=[9, 0, 0], size=[1, 1, 2], up=[0, 1, 0]).up == "0.0,1.0,0.0"
     with pytest.raises(InputError, match="up: expected z"):
@@ -345,5 +345,5 @@ def test_a_box_alone_says_what_is_up_and_a_document_says_it_once(tmp_path):
     assert "up" not in Box(center=[0, 0, 0], size=[1, 1, 2]).to_dict()
     # other tools' keys are ignored
     assert read_boxes([box.to_dict() | {"up": True}]).up == "z"
-    with pytest.raises(InputError, match="b.txt: is to hold JSON"):
+    with pytest.raises(InputError, match="b.txt: is written as JSON"):
         boxes.save(tmp_path / "b.txt")

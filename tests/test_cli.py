@@ -294,7 +294,7 @@ def test_what_is_read_is_never_written_over(crop, boxes, tmp_path, capsys):
         files = [Path(word) for word in words if isinstance(word, Path) and word.is_file()]
         before = [path.read_bytes() for path in files]
         assert run(*words) == 2
-        assert "is itself what is read" in one_line(capsys)
+        assert "is also an input file" in one_line(capsys)
         assert [path.read_bytes() for path in files] == before
     # printed, the result harms nobody
     assert run("predict", crop, "--boxes", default, "--out", "-") == 0
@@ -397,7 +397,7 @@ BAD_FILES = {
 }
 
 BAD_COMMANDS = {
-    "a recording": ("detect DIR/a.pcap", "got a recording (.pcap): lidarpose predict reads it"),
+    "a recording": ("detect DIR/a.pcap", "got a recording (.pcap): read it with lidarpose predict"),
     "the standard input": ("predict -", "the standard input is not read"),
     "unknown suffix": ("predict DIR/a.obj --crop", ".pcd .ply"),
     "truncated": ("predict DIR/cut.ply --crop", "cut off"),

@@ -248,8 +248,8 @@ def test_a_frame_that_was_leveled_is_noted_where_it_is_compared_with_the_release
         ("humanm3", {"seed": -1}, "seed must be a whole number of at least 0, got -1"),
         ("humanm3", {"tta": 4}, "are for weights by name or path: give them to load instead"),
         ("lidarhuman26m", {}, "two datasets are called lidarhuman26m"),
-        ("nowhere", {}, "is no dataset"),
-        ("a", {}, "is no dataset"),
+        ("nowhere", {}, "is not a dataset"),
+        ("a", {}, "is not a dataset"),
     ],
 )
 def test_what_does_not_fit_is_an_error_before_anybody_is_predicted(sets, name, options, words):
@@ -631,7 +631,7 @@ def test_a_table_never_replaces_its_scores(written, capsys):
     before = path.read_bytes()
     for named in (written[1], path):
         assert main(["table", str(named), "--out", str(path)]) == 2
-        assert "is itself what is read" in capsys.readouterr().err
+        assert "is also an input file" in capsys.readouterr().err
     assert path.read_bytes() == before
 
 

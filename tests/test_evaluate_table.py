@@ -140,7 +140,7 @@ def test_evaluate_and_table_from_the_command_line(tmp_path, monkeypatch, capsys)
 @pytest.mark.parametrize(
     "arguments, words",
     [
-        (("evaluate", "tiny", "nowhere"), "is no dataset"),
+        (("evaluate", "tiny", "nowhere"), "is not a dataset"),
         (("evaluate", "nix", "bench"), "known are tiny"),
         (("evaluate", "nix.safetensors", "bench"), "nix.safetensors"),
         (("evaluate", "tiny", "bench", "--skeleton", "human51"), "did you mean human15"),

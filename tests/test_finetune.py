@@ -493,7 +493,7 @@ def test_a_run_on_a_dataset_is_taken_up(datasets, tmp_path):
 @pytest.mark.parametrize(
     "words, told",
     [
-        (["nowhere"], "is no dataset"),
+        (["nowhere"], "is not a dataset"),
         (["{humanm3}", "--split", "morning"], "expected labeled people in the split 'morning'"),
         (["{humanm3}", "--init", "huge"], "unknown bundled weights 'huge'"),
         (["{humanm3}", "--init", "none.safetensors"], "does not exist"),

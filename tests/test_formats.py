@@ -380,7 +380,8 @@ def test_bin_columns_that_nothing_tells(folder):
         found = read(folder, "a.bin", rows.tobytes())
         same(found, rows)
         warned += len(found.warnings)
-        assert all("rows of 4 float32 (KITTI), since nothing speaks clearly for" in line for line in found.warnings)
+        doubt = "rows of 4 float32 (KITTI), since nothing clearly indicates rows of"
+        assert all(doubt in line for line in found.warnings)
     assert 0 < warned < 30
 
 
@@ -551,7 +552,7 @@ BAD = {
     "ply odd count": ("a.ply", ply_header("many") + ROWS, ["'many'"]),
     "bin odd size": ("a.bin", ROWS[:-1], ["47 bytes", "cut off"]),
     "bin of three": ("a.bin", np.ones((7, 3), "f4").tobytes(), ["84 bytes", "columns 3"]),
-    "bin of three or six": ("a.bin", np.ones((102, 3), "f4").tobytes(), ["values a row has (--columns 3 or 6)"]),
+    "bin of three or six": ("a.bin", np.ones((102, 3), "f4").tobytes(), ["values per row (--columns 3 or 6)"]),
     "bin garbage": ("a.bin", np.random.default_rng(0).bytes(4000), ["beyond"]),
     "npy objects": ("a.npy", OBJECTS, ["dtype object"]),
     "npz objects": ("a.npz", npz(points=np.array([[1, 2, "a"]], dtype=object)), ["dtype object"]),
@@ -575,7 +576,7 @@ BAD = {
     "npz of none": ("a.npz", npz(a=np.ones(3)), ["'points'", "got a"]),
     "npz of 10^12": ("a.npz", zipped("points.npy", npy_header((HUGE, 3))), ["cut off"]),
     "txt of words": ("a.txt", "hello world this is\nsome text\n", ["'hello world this is'", "line 1"]),
-    "txt transposed": ("a.txt", "\n".join(["1.5 " * 60] * 3), ["got 3 of 60", "transpose"]),
+    "txt transposed": ("a.txt", "\n".join(["1.5 " * 60] * 3), ["got 3 lines of 60", "transpose"]),
     "txt of two columns": ("a.txt", "1 2\n3 4\n", ["got 2 on line 1"]),
     "txt of comments": ("a.txt", "# nothing\n\n# here\n", ["has no points"]),
     "csv header alone": ("a.csv", "x,y,z\n", ["has no points"]),
@@ -643,7 +644,7 @@ def test_unreadable_file(tmp_path):
     path = tmp_path / "a.pcd"
     path.write_bytes(b"x")
     path.chmod(0)
-    with pytest.raises(InputError, match="cannot be read.*rights"):
+    with pytest.raises(InputError, match="cannot be read.*permissions"):
         read_points(path)
 
 
@@ -667,7 +668,7 @@ def test_more_values_than_the_header_names_are_refused(tmp_path, text):
     """Row numbers, as of R or pandas: all would move by a column."""
     path = tmp_path / "r.txt"
     path.write_text(text)
-    with pytest.raises(InputError, match=r"expected 3 values a row, as its header names, got 4 on line \d"):
+    with pytest.raises(InputError, match=r"expected 3 values per row, as its header says, got 4 on line \d"):
         read_points(path)
     path.write_text("x,y,z\n0.1,0.2,0.3,\n")
     np.testing.assert_allclose(read_points(path).points, [[0.1, 0.2, 0.3]])

@@ -60,7 +60,7 @@ def test_a_known_pose_comes_back_in_the_level_frame_and_unchecked_frames_do_not(
         assert labels.pop("left_hand") == HIDDEN and set(labels.values()) == {SEEN}
         assert person.sensor_known and person.source == f"itop/{person.sequence[:-3]}"
     skipped = [record for record in records if isinstance(record, Skipped)]
-    assert [record.reason for record in skipped] == ["labels that no human checked"] * 4
+    assert [record.reason for record in skipped] == ["labels not checked by a human"] * 4
     assert skipped[0].where == "side/test/00_00008"
 
 
@@ -107,7 +107,7 @@ def test_whoever_has_one_split_alone_is_not_told_that_the_other_is_missing(tmp_p
         split: prepare("itop", tmp_path / "raw", tmp_path / f"{split}", split=split)["warnings"]
         for split in ("test", None)
     }
-    assert warnings == {"test": [], None: ["of train by side side/train are not there"]}
+    assert warnings == {"test": [], None: ["side/train of train by side are missing"]}
 
 
 def test_a_split_that_is_still_being_loaded_stops_no_other(tmp_path, smpl):
@@ -170,10 +170,10 @@ def replaced(path, name, values):
         (lambda root: cut_off(root / LABELS), f"{LABELS}: cannot be read as HDF5"),
         (lambda root: cut_off(root / CLOUDS), f"{CLOUDS}: cannot be read as HDF5"),
         (lambda root: (root / CLOUDS).write_bytes(b"\x1f\x8b"), f"{CLOUDS}: cannot be read as HDF5"),
-        (lambda root: (root / CLOUDS).unlink(), f"{CLOUDS}: is missing: get it .* unpack it by gunzip"),
+        (lambda root: (root / CLOUDS).unlink(), f"{CLOUDS}: is missing: get it .* unpack it with gunzip"),
         (lambda root: without(root / LABELS, "is_valid"), r"expected is_valid of shape \(1,\), got None"),
         (lambda root: replaced(root / CLOUDS, "data", np.zeros((1, 9, 3))), r"expected data of shape \(1, 76800, 3\)"),
-        (lambda root: replaced(root / CLOUDS, "id", np.array(["00_00009"], "S8")), "is of other frames than"),
+        (lambda root: replaced(root / CLOUDS, "id", np.array(["00_00009"], "S8")), "has other frames than"),
         (lambda root: replaced(root / LABELS, "id", 5), "cannot be read as HDF5"),
         (lambda root: (root / LABELS).unlink() or (root / CLOUDS).unlink(), "is not the root of ITOP"),
     ],
@@ -200,8 +200,8 @@ def test_frames_that_cannot_be_used_are_counted(tmp_path, smpl):
     people, records = everything(tmp_path)
     assert [person.frame for person in people] == [10, 10]
     assert [record.reason for record in records if isinstance(record, Skipped)] == [
-        "nobody stands out of the room", "id of another form", "no joint is labelled",
-        "no points in the box", "id of another form", "no joint is labelled",
+        "no person stands out from the room", "id in another format", "no joint is labelled",
+        "no points in the box", "id in another format", "no joint is labelled",
     ]  # fmt: skip
 
 

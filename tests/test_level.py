@@ -86,8 +86,8 @@ def test_the_release_s_own_frame_can_be_had(raw, tmp_path):
     root, smpl, _ = raw
     found = prepare("lidarhuman26m", root, tmp_path / "own", smpl=smpl, level=False)
     assert list(found["sources"]) == ["lidarhuman26m"]
-    with pytest.raises(InputError, match="level false there, true asked for"):
+    with pytest.raises(InputError, match="level is false, requested is true"):
         prepare("lidarhuman26m", root, tmp_path / "own", smpl=smpl)
     assert json.loads((tmp_path / "own" / "dataset.json").read_text())["frame"].startswith("the LiDAR's own")
-    with pytest.raises(InputError, match="leave --no-level away"):
+    with pytest.raises(InputError, match="omit --no-level"):
         reader("sloper4d", smpl, level=False)

@@ -280,7 +280,7 @@ def test_packets_of_other_sensors_are_left_out(tmp_path):
     assert source.warnings == ("8 lidar packets of another sensor are left out",)
     source = ouster(tmp_path / "b.pcap", [ip4(payload)[0] for payload in packets_of([0], serial=5)])
     list(source)
-    assert "of the sensor 5" in source.warnings[0] and "123456789" in source.warnings[0]
+    assert "from the sensor 5" in source.warnings[0] and "123456789" in source.warnings[0]
 
 
 def test_a_column_window_expects_only_its_columns(tmp_path):
@@ -316,7 +316,7 @@ def test_what_is_missing_or_wrong_is_one_line(tmp_path):
     with pytest.raises(InputError, match="no UDP packets"):
         open_source(write(tmp_path / "empty.pcap", []))
     (tmp_path / "no.pcap").write_bytes(b"no capture")
-    with pytest.raises(InputError, match="no packet capture"):
+    with pytest.raises(InputError, match="not a packet capture"):
         open_source(tmp_path / "no.pcap")
     with pytest.raises(InputError, match="link type"):
         LINKS["usb"] = (189, lambda ip: ip)
@@ -398,9 +398,9 @@ def test_velodyne_packets_are_turns(tmp_path):
 
     broken = [*ip4(bytes(1206)), *ips[:5]]
     source = open_source(write(tmp_path / "b.pcap", broken, period=1330))
-    assert len(list(source)) == 1 and source.warnings == ("1 packets are not of the sensor's model, and are left out",)
+    assert len(list(source)) == 1 and source.warnings == ("1 packets are not from the sensor's model and are left out",)
     hdl64 = [ip4(vlp16(0, k, model=k * 11))[0] for k in range(9)]
-    with pytest.raises(InputError, match="HDL-64E whose calibration is not in it"):
+    with pytest.raises(InputError, match="HDL-64E, but has no calibration in it"):
         open_source(write(tmp_path / "d.pcap", hdl64))
     with pytest.raises(InputError, match="Velodyne model that can be decoded"):
         open_source(write(tmp_path / "c.pcap", [ip4(bytes(1206))[0]] * 9))

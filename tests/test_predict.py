@@ -740,7 +740,7 @@ def test_the_boxes_of_poses_are_taken(model, sweep):
     again = lidarpose.read_boxes(people)
     assert [box.id for box in again] == ["a", 7] and again.up == people.up
     np.testing.assert_array_equal(lidarpose.predict(path, boxes=people, model=model)[1].joints, people[1].joints)
-    with pytest.raises(InputError, match="a cloud of one person has none"):
+    with pytest.raises(InputError, match="a cloud of one person has no box"):
         lidarpose.read_boxes(lidarpose.predict(path, crop=True, model=model))
 
 

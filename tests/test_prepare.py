@@ -104,7 +104,7 @@ def test_datasets_of_smpl_have_its_trans_and_distances(tmp_path, smpl):
     assert summary["skipped"] == {"labels without a cloud": 2}
     assert summary["trunk"][2] > 0.7 and summary["joints"] == {"seen": 144, "hidden": 0, "unlabelled": 0}
     # the list names sequences that are not in this release
-    assert any("of train by lidar-hmr seq003_street_002" in line for line in summary["warnings"])
+    assert any("seq003_street_002 of train by lidar-hmr" in line for line in summary["warnings"])
     lines = summary_lines(summary)
     assert lines[0] == "6 people in 6 frames (test 3, train 3)" and lines[1].startswith("skipped 2: labels without")
     shutil.copy(smpl, tmp_path / "SMPL_MALE.npz")
@@ -155,7 +155,7 @@ def test_any_item_comes_back_as_it_was(tmp_path_factory, seed, count, boxed, rin
 
 def test_only_columns_that_have_a_place_are_written(raw):
     item = next(HumanM3().read(raw[0], "train/a"))
-    with pytest.raises(InputError, match="names trans, box, joints_box, got mean"):
+    with pytest.raises(InputError, match="names of centers must be trans, box, joints_box, got mean"):
         labeled_row(replace(item, centers={"mean": np.zeros(3)}), index=0)
 
 
@@ -185,7 +185,7 @@ def test_what_is_whole_is_not_read_again(raw, prepared, tmp_path, monkeypatch):
     column = pa.nulls(len(table), table.schema.field("joints").type)
     place = table.schema.get_field_index("joints")
     parquet.write_table(table.set_column(place, "joints", column), out / "labelled-00001.parquet")
-    refused("labelled-00001.parquet: has a row that is no sample; delete it", "humanm3", raw[0], out)
+    refused("labelled-00001.parquet: has a row that is not a sample; delete it", "humanm3", raw[0], out)
 
 
 def _gone():
@@ -294,8 +294,8 @@ def test_own_lists_may_leave_out_the_first_folder(copied, encoding):
         ("basketball1\n", "plaza\n", "expected names such as 'test/c', got 'basketball1'"),
         ("train/a\n".encode("utf-16"), "plaza\n", "train.txt: expected text in UTF-8, got UTF-16"),
         ("train/a\n".encode("utf-16-le"), "plaza\n", "train.txt: expected text, got zero bytes"),
-        ("stra\xdfe\n".encode("latin-1"), "plaza\n", "train.txt: expected text in UTF-8, got other bytes at 4"),
-        ("c\nb/seg0\n", "test/c\n", "test.txt: names test/c, which is in train.txt too"),
+        ("stra\xdfe\n".encode("latin-1"), "plaza\n", "train.txt: expected text in UTF-8, got an invalid byte at 4"),
+        ("c\nb/seg0\n", "test/c\n", "test.txt: names test/c, which is also in train.txt"),
         ("train/a\n", "\n", "test.txt: names no sequence"),
     ],
 )
@@ -307,7 +307,7 @@ def test_own_lists_that_are_wrong_are_refused(copied, tmp_path, train, test, mes
 def test_one_split_alone(raw, tmp_path):
     summary = prepare("humanm3", raw[0], tmp_path / "out", split="test")
     assert summary["splits"] == {"test": 6} and [part["part"] for part in summary["parts"]] == ["test/c"]
-    refused("other settings: count 1 there, 2 asked for", "humanm3", raw[0], tmp_path / "out", split="train")
+    refused("other settings: count is 1, requested is 2", "humanm3", raw[0], tmp_path / "out", split="train")
 
 
 def test_the_split_in_chunks_leaks_and_says_so(tmp_path, smpl):
@@ -359,7 +359,7 @@ def test_wrong_calls_are_one_line_and_write_nothing(raw, tmp_path, smpl):
     out, mine = tmp_path / "out", tmp_path / "mine.txt"
     mine.write_text("x")
     for arguments, options, message in (
-        (("humanm3", tmp_path / "none", out), {}, "none: is no folder; expected the raw files of humanm3"),
+        (("humanm3", tmp_path / "none", out), {}, "none: is not a folder; expected the raw files of humanm3"),
         (("humanm3", raw[0], out), {"workers": 0}, "workers must be a whole number of at least 1, got 0"),
         (("human3m", raw[0], out), {}, "unknown dataset 'human3m': did you mean humanm3"),
         (("lidarhuman26m", raw[0], out), {"smpl": smpl}, "is not the root of LiDARHuman26M"),
@@ -383,7 +383,7 @@ def test_a_corrupted_part_is_counted_and_the_rest_goes_on(tmp_path, smpl):
     summary = prepare("sloper4d", root, tmp_path / "out", smpl=smpl)
     assert summary["people"] == 3 and summary["skipped"]["the rest of a part cannot be read"] == 1
     assert "seq002_football_001_labels.pkl" in summary["skipped_first"]["the rest of a part cannot be read"]
-    assert any(line == "nobody in seq002_football_001" for line in summary["warnings"])
+    assert any(line == "no people in seq002_football_001" for line in summary["warnings"])
     assert any("skipped 1: the rest of a part" in line for line in summary_lines(summary))
     # repaired: without its shards it is read again
     path.write_bytes(whole)
@@ -430,7 +430,7 @@ def test_people_who_do_not_stand_and_labels_of_others_are_told(tmp_path, smpl):
         path.write_text(json.dumps(found))
     warnings = prepare("lidarhuman26m", root, tmp_path / "out", smpl=smpl)["warnings"]
     assert any("people stand along" in line for line in warnings)
-    assert any("labels and clouds of different releases" in line for line in warnings)
+    assert any("labels and clouds from different releases" in line for line in warnings)
 
 
 def test_nobody_at_all_is_told(tmp_path, smpl):
@@ -440,5 +440,5 @@ def test_nobody_at_all_is_told(tmp_path, smpl):
         path.unlink()
     summary = prepare("humanm3", root, tmp_path / "out")
     assert summary["people"] == 0 and summary["skipped"] == {"labels without a cloud": 4}
-    assert any("nobody in it" in line for line in summary["warnings"])
+    assert any("it has no people" in line for line in summary["warnings"])
     assert list(open_dataset(tmp_path / "out")) == []

@@ -139,19 +139,21 @@ def test_humanm3_s_database_tells_who_is_visible(tmp_path, smpl):
     # one camera that sees a joint is enough
     assert [int((item.joint_labels == UNLABELED).sum()) for item in items] == [1, 0, 0, 0]
     assert np.isnan(items[0].joints[5]).all()
-    assert reasons(found[len(items) :]) == {"entry of another form": 1, "labels without a cloud": 1}
+    assert reasons(found[len(items) :]) == {"entry in another format": 1, "labels without a cloud": 1}
 
 
 def test_humanm3_says_which_folder_is_incomplete_or_above_the_root(tmp_path, smpl):
     files.write_humanm3(tmp_path / "HumanM3", smpl, sequences=("train/a", "train/plaza/p1", "test/c"), frames=1)
-    with pytest.raises(InputError, match="is a folder above HumanM3's root, which is likely .*HumanM3: name that"):
+    with pytest.raises(
+        InputError, match="is a folder above HumanM3's root, which is likely .*HumanM3: give that folder"
+    ):
         made("humanm3", smpl).parts(tmp_path)
     assert made("humanm3", smpl).parts(tmp_path / "HumanM3") == ["test/c", "train/a", "train/plaza/p1"]
     shutil.rmtree(tmp_path / "HumanM3/train/a/pose_calib")
     # its body is no database of people; nor is the database read where a sequence is complete
     for name in ("SMPL_NEUTRAL.pkl", "train.pkl"):
         (tmp_path / "HumanM3" / name).write_bytes(pickle.dumps({}))
-        with pytest.raises(InputError, match="has .*train/a without pose_calib: get what is missing"):
+        with pytest.raises(InputError, match="has .*train/a without pose_calib: add what is missing"):
             made("humanm3", smpl).parts(tmp_path / "HumanM3")
 
 
@@ -160,14 +162,14 @@ def test_humanm3_s_root_named_too_deep_is_said(tmp_path, smpl, too_deep):
     root = tmp_path / "train/HumanM3"
     files.write_humanm3(root, smpl, sequences=("train/a", "test/c"), frames=1)
     assert made("humanm3", smpl).parts(root) == ["test/c", "train/a"]
-    with pytest.raises(InputError, match=f"lies in HumanM3's root, which is likely {root}: name that"):
+    with pytest.raises(InputError, match=f"lies in HumanM3's root, which is likely {root}: give that folder"):
         made("humanm3", smpl).parts(root / too_deep)
 
 
 def test_a_sequence_of_humanm3_that_lacks_clouds_and_labels_is_named(tmp_path, smpl):
     files.write_humanm3(tmp_path, smpl, sequences=("train/a", "test/c"), frames=1)
     (tmp_path / "test/intersection/smpl_estimated").mkdir(parents=True)
-    with pytest.raises(InputError, match="intersection without pointcloud and pose_calib: get what is missing"):
+    with pytest.raises(InputError, match="intersection without pointcloud and pose_calib: add what is missing"):
         made("humanm3", smpl).parts(tmp_path)
 
 
@@ -204,7 +206,7 @@ def test_humanm3_skips_are_counted_and_named(tmp_path, smpl):
     assert reasons(skipped) == {
         "cloud cannot be read": 2, "labels without a cloud": 2, "cloud without labels": 1, "labels cannot be read": 1,
         "several files of one frame": 1, "not 15 joints": 1, "no points in the box": 1, "frame without people": 1,
-        "joints out of reach": 1,
+        "joints out of range": 1,
     }  # fmt: skip
     assert any("000000.pcd" in one.where and "cut off" in one.where for one in skipped)
     assert all("\n" not in one.where for one in skipped)
@@ -236,11 +238,11 @@ def test_lidarhuman26m_one_bad_file_costs_one_frame(tmp_path, smpl):
     items, skipped = everything("lidarhuman26m", tmp_path, smpl)
     check(items, {key: joints for key, joints in truth.items() if key[1] > 9})
     assert reasons(skipped) == {
-        "cloud cannot be read": 3, "joints out of reach": 1, "cloud without labels": 1, "labels without a cloud": 1,
+        "cloud cannot be read": 3, "joints out of range": 1, "cloud without labels": 1, "labels without a cloud": 1,
         "empty cloud": 1, "labels cannot be read": 1, "several files of one frame": 1,
     }  # fmt: skip
     told = " | ".join(one.where for one in skipped)
-    for words in ("it is a link to what is not there", "got a folder", "000008.json: expected beta, pose and trans, "):
+    for words in ("it is a link to a missing file", "got a folder", "000008.json: expected beta, pose and trans, "):
         assert words in told
 
 
@@ -355,7 +357,7 @@ def test_sloper4d_skips_are_counted(tmp_path, smpl):
     # nine points are kept: protocols leave them out later
     assert [(item.frame, len(item.points)) for item in items] == [(125, 9)]
     assert reasons(skipped) == {
-        "empty cloud": 2, "cloud cannot be read": 2, "cloud without a pose": 1, "cloud without the LiDAR's place": 1,
+        "empty cloud": 2, "cloud cannot be read": 2, "cloud without a pose": 1, "cloud without the LiDAR's position": 1,
         "cloud of a frame without labels": 1,
     }  # fmt: skip
 
@@ -374,10 +376,10 @@ def test_sloper4d_skips_are_counted(tmp_path, smpl):
         ({"opt_trans": np.zeros((2, 3))}, "4 frames and opt_tra"),
         ({"beta": "tall"}, "beta must be numbers"),
         ({"beta": [[1], [1, 2]]}, "beta must be numbers"),
-        ({"point_frame": [1]}, "3 point_clouds of 1 frames"),
-        ({"point_frame": 5}, "3 point_clouds of 1 frames"),
+        ({"point_frame": [1]}, "3 point_clouds for 1 frames"),
+        ({"point_frame": 5}, "3 point_clouds for 1 frames"),
         ({"point_frame": ["a", "b", "c"]}, "point_frame must be numbers"),
-        ({"point_frame": [1, 2, float("nan")]}, "point_frame has values that are no numbers"),
+        ({"point_frame": [1, 2, float("nan")]}, "point_frame has values that are not finite"),
         ({"point_clouds": None}, "another release"),
         ({"point_clouds": 5}, "point_clouds should be a list"),
         ({"point_clouds": np.array(5.0)}, "should be a list"),
@@ -405,7 +407,7 @@ def test_lipd_places_joints_by_the_points_and_says_how(tmp_path, smpl):
     assert [item.source for item in items] == [
         "lipd/gt_joint + trans", "lipd/gt_joint + trans + mean", "lipd/gt_joint"
     ]  # fmt: skip
-    assert reasons(skipped) == {"joints are not where the points are": 1}
+    assert reasons(skipped) == {"joints are far from the points": 1}
 
 
 def test_entries_of_another_form_cost_one_entry(tmp_path, smpl):
@@ -417,7 +419,7 @@ def test_entries_of_another_form_cost_one_entry(tmp_path, smpl):
     entries[4]["gt"] = np.zeros(71)
     path.write_bytes(pickle.dumps(entries))
     items, skipped = everything("freemotion", tmp_path, smpl)
-    assert reasons(skipped) == {"no shape": 1, "no T_2": 1, "entry of another form": 2} and len(items) == 4
+    assert reasons(skipped) == {"no shape": 1, "no T_2": 1, "entry in another format": 2} and len(items) == 4
     path.unlink()
     files.write_lipd(tmp_path, smpl)
     path = tmp_path / "LIPD_train.pkl"
@@ -426,13 +428,13 @@ def test_entries_of_another_form_cost_one_entry(tmp_path, smpl):
     broken = [entries[0] | {"pc": cloud} for cloud in clouds]
     path.write_bytes(pickle.dumps([*broken, {"gt_joint": np.zeros((24, 3))}, *entries]))
     items, skipped = everything("lipd", tmp_path, smpl)
-    assert len(items) == 3 and reasons(skipped) == {"entry of another form": 5, "no pc": 1}
+    assert len(items) == 3 and reasons(skipped) == {"entry in another format": 5, "no pc": 1}
     assert "y.bin is not in" in skipped[0].where
 
 
 def test_noisemotion_without_poses_says_how_they_are_made(tmp_path, smpl):
     (tmp_path / "pc_1/train/run1").mkdir(parents=True)
-    with pytest.raises(InputError, match="SURREAL's: run the authors' dataloader_NoiseMotion.py") as caught:
+    with pytest.raises(InputError, match="SURREAL: run the authors' dataloader_NoiseMotion.py") as caught:
         made("noisemotion", smpl).parts(tmp_path)
     assert "\n" not in str(caught.value)
 
@@ -458,9 +460,9 @@ def test_smpl_where_it_is_needed(tmp_path, smpl):
     for name in ("lidarhuman26m", "sloper4d", "freemotion"):
         with pytest.raises(InputError, match=f"{name} has SMPL poses.*register at smpl.is.tue.mpg.de"):
             reader(name)
-    with pytest.raises(InputError, match="no such file; expected SMPL's own"):
+    with pytest.raises(InputError, match="no such file; expected an SMPL model"):
         reader("sloper4d", tmp_path / "none.pkl")
-    with pytest.raises(InputError, match="leave the SMPL model out"):
+    with pytest.raises(InputError, match="omit the SMPL model"):
         reader("humanm3", smpl)
     with pytest.raises(InputError, match="unknown dataset 'humanm4': did you mean humanm3"):
         reader("humanm4")
@@ -468,7 +470,7 @@ def test_smpl_where_it_is_needed(tmp_path, smpl):
     with pytest.raises(InputError, match="24 joints, got 52"):
         SmplJoints(tmp_path / "x.npz", "x")(np.zeros((1, 10)), np.zeros((1, 72)), np.zeros((1, 3)))
     np.savez(tmp_path / "y.npz", **files.synthetic(24, 4))
-    with pytest.raises(InputError, match="has 4 shapes, the labels 10"):
+    with pytest.raises(InputError, match="has 4 shape coefficients, the labels 10"):
         SmplJoints(tmp_path / "y.npz", "x")(np.zeros((1, 10)), np.zeros((1, 72)), np.zeros((1, 3)))
 
 

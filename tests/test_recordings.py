@@ -612,7 +612,7 @@ def test_of_a_long_recording_the_page_shows_some_frames(drive, tmp_path, monkeyp
         (["DRIVE", "--every", "0"], "every must be"),
         (["DRIVE", "--start", "9"], "has no frames between start and end"),
         (["DRIVE", "--start", "9", "--out", "-"], "has no frames between start and end"),
-        (["no*.pcd"], "no file has such a name"),
+        (["no*.pcd"], "no file matches the pattern"),
         (["DRIVE", "--calib", "c.txt"], "calib is for boxes"),
         (["DRIVE", "--format", "csv", "--out", "-"], "--out - prints lines of JSON, not csv"),
     ],
@@ -687,7 +687,7 @@ def test_a_pose_of_the_sensor_that_cannot_be_costs_its_frame(clouds, model):
 
 @pytest.mark.parametrize("source", [None, 5, np.zeros((9, 3)), [np.zeros((9, 3))]])
 def test_what_is_no_source_is_refused(source, model):
-    with pytest.raises(InputError, match="expected (a path|paths)"):
+    with pytest.raises(InputError, match="expected (one or more paths|paths)"):
         lidarpose.predict_recording(source, model=model)
 
 

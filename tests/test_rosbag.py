@@ -221,7 +221,7 @@ def test_returns_that_are_none_are_left_out_with_their_rings(tmp_path):
     rest = np.delete(np.arange(len(points)), [3, 7])
     assert np.array_equal(frame.points, points[rest]) and np.array_equal(frame.ring, rest)
     # without a stamp, the time when it was recorded
-    assert frame.time == START / 1e9 and "recorded" in source.warnings[0]
+    assert frame.time == START / 1e9 and "their recording times" in source.warnings[0]
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".db3", ".bag"])
@@ -234,7 +234,7 @@ def test_topics_are_chosen_and_named(tmp_path, suffix):
     assert "/points (6)" in source.warnings[0] and "/rear/points (1)" in source.warnings[0]
     source = open_source(path, topic="/rear/points")
     assert np.array_equal(next(iter(source)).points, points_of(9)) and not source.warnings
-    with pytest.raises(InputError, match=r"'/front'; those with clouds are .*/points \(6\)"):
+    with pytest.raises(InputError, match=r"'/front'; topics with clouds: .*/points \(6\)"):
         open_source(path, topic="/front")
 
     text = store.types["std_msgs/msg/String"](data="hello")

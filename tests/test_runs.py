@@ -489,7 +489,7 @@ def test_runs_without_a_name_are_numbered(tmp_path, monkeypatch, capsys):
         ("--rate fast", "rate must be a number, got 'fast'"),
         ("--recipe best", "unknown recipe 'best'"),
         ("--schedule steps", "unknown schedule 'steps'"),
-        ("--shards nowhere", "is no dataset"),
+        ("--shards nowhere", "is not a dataset"),
         ("--cool 1.5", "cool must be a share"),
         ("--rate inf", "rate must be a finite number"),
         ("--size paper --bone 1", "bone and symmetry are terms of the package's own networks"),

@@ -59,7 +59,7 @@ def test_samples_come_back_as_they_were(folder, people):
         assert (a.box.yaw, a.source, a.frame_id) == (b.box.yaw, b.source, b.frame_id)
     assert [row["index"] for row in rows] == [0, 1, 2, 3] and rows[0]["distance"] is None
     assert (samples[2].info.kind, samples[2].distance, samples[2].info.upright) == ("walk", 7.5, True)
-    refused(lambda: list(dataset.samples("test")), "holds synthetic people, which have no split 'test'")
+    refused(lambda: list(dataset.samples("test")), "has synthetic people, which have no split 'test'")
 
 
 def test_pandas_reads_them(folder, people):
@@ -84,7 +84,7 @@ def test_whole_turns_come_back(tmp_path):
     assert stored["index"] == 5 and stored["person"].dtype == np.int16
     for name in ("points", "box", "joints"):
         np.testing.assert_array_equal(stored[name].reshape(row[name].shape), row[name])
-    refused(lambda: list(read_rows(path, "people")), "no shard of people: the columns center")
+    refused(lambda: list(read_rows(path, "people")), "not a shard of people: the columns center")
     for name, value, problem in (
         ("person", None, "column person has nulls"),
         ("ring", [1], "column ring has 1 values, expected 10: int32.n. with n = 10"),
@@ -116,10 +116,10 @@ def test_damaged_and_missing_shards_are_named(folder):
         (None, "dataset.json is missing"),
         ("{", "not a dataset's card"),
         ("[]", "not a dataset's card"),
-        ({"schema": 2}, "is of schema 2, this lidarpose reads 1: install lidarpose [0-9]"),
-        ({"count": 0}, "make no sense"),
-        ({"tables": ["cars"]}, "make no sense"),
-        ({"tables": [["people"]]}, "make no sense"),
+        ({"schema": 2}, "has schema 2, this lidarpose reads 1: install lidarpose [0-9]"),
+        ({"count": 0}, "are invalid"),
+        ({"tables": ["cars"]}, "are invalid"),
+        ({"tables": [["people"]]}, "are invalid"),
         ({"count": float("inf")}, "not a dataset's card"),
         ({"skeleton": "cat"}, "unknown skeleton"),
     ],
@@ -135,7 +135,7 @@ def test_settings_that_differ_are_named(folder):
     card = read_card(folder)
     check_settings(folder, card, card)
     other = replace(card, count=9, settings=card.settings | {"seed": 3})
-    problem = "count 4 there, 9 asked for; seed null there, 3 asked for"
+    problem = "count is 4, requested is 9; seed is null, requested is 3"
     refused(lambda: check_settings(folder, card, other), problem)
 
 
@@ -212,7 +212,7 @@ def test_a_column_of_another_type_is_one_line(folder, column, values, message):
         ("center", [1.0], "column center has 1 values, expected 3"),
         ("part", [1], "column part has 1 values, expected 30"),
         ("part", [25] * 30, "column part has values above 24"),
-        ("points", [float("nan")] * 90, "column points has values that are no finite numbers"),
+        ("points", [float("nan")] * 90, "column points has values that are not finite numbers"),
         ("points", [1e30] * 90, r"column points has values beyond 1e\+09 m"),
         ("joints", [1e30] * 78, r"column joints has values beyond 1e\+09 m"),
         ("box_size", [1.0, 2.0], "column box_size has 2 values, expected 3"),
@@ -224,7 +224,9 @@ def test_a_null_or_a_short_list_is_one_line(folder, column, value, message):
     table = parquet.read_table(path)
     with_column(path, column, pa.array([value, *table[column].to_pylist()[1:]], table[column].type))
     place = folder if column == "index" else path
-    refused(lambda: list(open_dataset(folder)), f"{place}: row of index .* is no sample: {message}.*; write it again")
+    refused(
+        lambda: list(open_dataset(folder)), f"{place}: row with index .* is not a sample: {message}.*; write it again"
+    )
 
 
 def test_damaged_columns_are_one_line_wherever_shards_are_read(folder, capsys, monkeypatch):
@@ -233,7 +235,7 @@ def test_damaged_columns_are_one_line_wherever_shards_are_read(folder, capsys, m
     for words in (["view", "."], ["view", ".", "--html"], ["pretrain", "--shards", "."]):
         assert main(words) == 2
         captured = capsys.readouterr()
-        assert "people-00000.parquet: row of index 0 is no sample: column points is null" in captured.err
+        assert "people-00000.parquet: row with index 0 is not a sample: column points is null" in captured.err
         assert captured.err.count("\n") == 1
 
 

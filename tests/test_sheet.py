@@ -75,11 +75,11 @@ def test_people_are_spread_over_the_dataset(dataset):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["none"], "is no dataset: dataset.json is missing"),
+        (["none"], "is not a dataset: dataset.json is missing"),
         (["streetlife", "-n", "0"], "expected 1 to"),
         (["streetlife", "--out", "streetlife/dataset.json/x.png"], "is a file"),
-        (["streetlife", "--out", "sheet.jpg"], "sheet.jpg: is to hold PNG: give a name that ends in .png"),
-        (["streetlife", "--html", "--out", "page.png"], "page.png: is to hold HTML: give a name that ends in .html"),
+        (["streetlife", "--out", "sheet.jpg"], "sheet.jpg: is written as PNG: give a name that ends in .png"),
+        (["streetlife", "--html", "--out", "page.png"], "page.png: is written as HTML: give a name that ends in .html"),
     ],
 )
 def test_what_cannot_be_drawn_is_told_in_one_line(dataset, capsys, arguments, message):
@@ -124,7 +124,7 @@ def test_a_sheet_never_replaces_the_dataset(dataset):
     folder = dataset / "streetlife"
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     for name in before:
-        with pytest.raises(InputError, match="is itself what is read"):
+        with pytest.raises(InputError, match="is also an input file"):
             draw_dataset(folder, out=folder / name)
     assert before == {path.name: path.read_bytes() for path in folder.iterdir()}
     # a sheet beside them, and again

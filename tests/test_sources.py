@@ -54,7 +54,7 @@ def test_a_folder_is_read_by_the_numbers_of_its_names(tmp_path):
     assert [frame.index for frame in frames] == [0, 1, 2] and np.allclose([f.time for f in frames], [0, 0.1, 0.2])
     assert np.array_equal(frames[1].points, POINTS * 2.0) and frames[1].points.dtype == np.float64
     assert source.warnings == (
-        "has no times: taken as 10 frames a second (rate, on the command line --rate, for another)",
+        "has no times: read as 10 frames per second (change it with rate, on the command line --rate)",
     )
     assert not open_source(tmp_path, rate=20).warnings
 
@@ -143,7 +143,7 @@ def test_which_files_of_a_folder_of_many_kinds_are_read(tmp_path):
         (tmp_path / name).write_text("1 2 3\n")
     source = open_source(tmp_path, rate=10)
     assert ids(source) == ["1", "2", "10"] and source.warnings == (
-        "only its 3 .npy files are read, not 1 .mcap: name those by a pattern",
+        "only its 3 .npy files are read, not 1 .mcap: give a pattern to read those",
     )
     (tmp_path / "a.mcap").unlink()
     assert open_source(tmp_path, rate=10).warnings == ()
@@ -214,12 +214,12 @@ def test_one_plain_file_is_a_single_scan(tmp_path):
     "make, words",
     {
         "missing": (lambda folder: folder / "no", ["no such file or folder"]),
-        "no match": (lambda folder: folder / "*.pcd", ["no file has such a name"]),
+        "no match": (lambda folder: folder / "*.pcd", ["no file matches the pattern"]),
         "nothing": (lambda folder: [], ["got none"]),
         "empty": (lambda folder: folder, ["an empty folder", ".pcd", ".mcap"]),
         "pictures": (
             lambda folder: (folder / "a.png").touch() or (folder / "b").mkdir() or folder,
-            ["1 .png", "1 folders (b)"],
+            ["1 .png", "1 folders (b; give one of them)"],
         ),
         "hidden": (lambda folder: (folder / ".a.pcd").touch() or folder, ["an empty folder"]),
     }.values(),
@@ -580,7 +580,7 @@ def test_of_nuscenes_what_is_on_the_disk_is_read(tmp_path):
     os.rename(root / "samples", root / "gone")
     refusal(open_source, root, words=["holds none of the 10 sweeps"])
     (root / "v1.0-mini" / "sample.json").write_text("[{}]")
-    refusal(open_source, root, words=["tables are not nuScenes'"])
+    refusal(open_source, root, words=["not nuScenes tables"])
     (root / "v1.0-test").mkdir()
     (root / "v1.0-test" / "sample_data.json").write_text("[]")
     refusal(open_source, root, words=["v1.0-mini, v1.0-test"])

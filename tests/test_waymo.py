@@ -263,7 +263,7 @@ def without_people(root):
         (
             lambda root: files.write_v1(root, split="validation", frames=files.scene()[:1]),
             "",
-            f"mixes versions of Waymo: {TFRECORD.replace('training', 'validation')} is of version 1, training/",
+            f"mixes versions of Waymo: {TFRECORD.replace('training', 'validation')} is version 1, training/",
         ),
         (lambda root: (root / "empty").mkdir(), "empty", "is not the root of Waymo: expected "),
         (lambda root: (root / "empty").mkdir(), "empty", "got nothing; get it at waymo.com"),
@@ -344,13 +344,13 @@ _SHAPE, _POSE_SHAPE = (f"[{name}Component].range_image_return1.shape" for name i
         ("lidar", {_SHAPE: [1, 2, 3]}, "range image cannot be read", 2),
         ("lidar", {_SHAPE: [1, None, 3]}, "range image cannot be read", 2),
         ("lidar_pose", {_POSE_SHAPE: [600, 40, 6]}, "range image cannot be read", 2),
-        ("lidar_hkp", {_TIME: None}, "label of another form", 1),
-        ("lidar_hkp", {"key.laser_object_id": None}, "label of another form", 1),
-        ("lidar_hkp", {f"{_KEYPOINT}.keypoint_3d.location_m.y": [1.0]}, "label of another form", 1),
+        ("lidar_hkp", {_TIME: None}, "label in another format", 1),
+        ("lidar_hkp", {"key.laser_object_id": None}, "label in another format", 1),
+        ("lidar_hkp", {f"{_KEYPOINT}.keypoint_3d.location_m.y": [1.0]}, "label in another format", 1),
         ("lidar_hkp", {f"{_KEYPOINT}.keypoint_3d.location_m.y": [np.nan] * 16}, "no joint is labelled", 1),
         ("lidar_hkp", {f"{_KEYPOINT}.keypoint_3d.location_m.y": [1e300] * 16}, "no joint is labelled", 1),
-        ("lidar_box", {"[LiDARBoxComponent].box.center.x": 1e10}, "label of another form", 1),
-        ("lidar_box", {"[LiDARBoxComponent].box.size.z": 0.0}, "label of another form", 1),
+        ("lidar_box", {"[LiDARBoxComponent].box.center.x": 1e10}, "label in another format", 1),
+        ("lidar_box", {"[LiDARBoxComponent].box.size.z": 0.0}, "label in another format", 1),
     ],
 )
 def test_one_bad_value_costs_one_frame_or_person(copy, name, change, reason, lost):
@@ -374,7 +374,7 @@ def test_text_for_numbers_is_skipped(copy, name, column):
     values = ["a" if not isinstance(v, list) else ["a"] * len(v) for v in table[column].to_pylist()]
     pq.write_table(table.set_column(table.schema.get_field_index(column), column, pa.array(values)), path)
     items, skipped = everything(copy)
-    assert not items and Counter(one.reason for one in skipped)["label of another form"] >= 4
+    assert not items and Counter(one.reason for one in skipped)["label in another format"] >= 4
 
 
 def test_a_missing_second_return_is_none(copy):
@@ -429,7 +429,7 @@ def test_a_corrupted_record_ends_a_file_by_name(v1, tmp_path):
         (flipped(first + 3), 2, "is damaged at record 1"),
         (data[: first + 500], 2, "is cut off in record 1"),
         (data[: first + 5], 2, "is cut off in record 1"),
-        (b"\x1f\x8b gzip, or anything else", 0, "is no TFRecord file"),
+        (b"\x1f\x8b gzip, or anything else", 0, "is not a TFRecord file"),
     ):
         (tmp_path / TFRECORD).write_bytes(damaged)
         items, skipped = everything(tmp_path)
@@ -468,11 +468,15 @@ def test_a_range_image_that_cannot_be_inflated_skips_its_frame(tmp_path, damage,
 @pytest.mark.parametrize(
     "values, shape, told",
     [
-        (10, files.number(1, 3), "a range image of 10 values says it is [3]"),
+        (10, files.number(1, 3), "a range image has 10 values, its stated shape is [3]"),
         # whose product is 0 in 64 bits
-        (0, files.number(1, 1 << 32) * 2 + files.number(1, 1), "0 values says it is [4294967296, 4294967296, 1]"),
+        (
+            0,
+            files.number(1, 1 << 32) * 2 + files.number(1, 1),
+            "0 values, its stated shape is [4294967296, 4294967296, 1]",
+        ),
         # however many there are
-        (1, files.number(1, 1) * 1000, "a range image of 1 values says it is [1, 1, 1, 1, 1, 1, ...]"),
+        (1, files.number(1, 1) * 1000, "a range image has 1 values, its stated shape is [1, 1, 1, 1, 1, 1, ...]"),
         (1, files.block(1, b"\1" * 65536), "message Shape has 65,540 bytes, more than 65,536: damaged"),
         (None, b"", "no pixel poses of the top laser"),
     ],

@@ -81,12 +81,12 @@ def read_card(folder: str | Path) -> DatasetCard:
     """The card of a dataset's folder. Raises InputError if it is missing, damaged or of another schema."""
     path = Path(folder) / CARD
     if not path.is_file():
-        raise file_error(folder, f"is no dataset: {CARD} is missing; write one with lidarpose synth or prepare")
+        raise file_error(folder, f"is not a dataset: {CARD} is missing; write one with lidarpose synth or prepare")
     try:
         content = json.loads(read_bytes(path, expected="a dataset's card"))
         if content["schema"] != SCHEMA:
             version = content.get("version", "of the version that wrote it")
-            problem = f"is of schema {content['schema']!r}, this lidarpose reads {SCHEMA}: install lidarpose {version}"
+            problem = f"has schema {content['schema']!r}, this lidarpose reads {SCHEMA}: install lidarpose {version}"
             raise file_error(path, problem)
         names = [name for name in _CARD_TYPES if name in content or name not in _OPTIONAL]
         card = DatasetCard(**{name: _CARD_TYPES[name](content[name]) for name in names})
@@ -96,7 +96,7 @@ def read_card(folder: str | Path) -> DatasetCard:
         problem = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise file_error(path, f"is not a dataset's card ({problem})") from None
     if card.count < 1 or card.per_shard < 1 or not set(card.tables) <= set(TABLES):
-        raise file_error(path, "is not a dataset's card: count, per_shard or tables make no sense")
+        raise file_error(path, "is not a dataset's card: count, per_shard or tables are invalid")
     skeleton(card.skeleton)
     return card
 

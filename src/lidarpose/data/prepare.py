@@ -62,9 +62,9 @@ def reader(name: str, smpl: str | Path | None = None, *, level: bool = True) -> 
     check_name("dataset", name, READERS)
     module, kind, takes_smpl = READERS[name]
     if not level and name not in _LEVELED:
-        raise InputError(f"{name} is not turned level, only {', '.join(_LEVELED)} is: leave --no-level away")
+        raise InputError(f"{name} is not turned level, only {', '.join(_LEVELED)} is: omit --no-level")
     if smpl is not None and not takes_smpl:
-        raise InputError(f"{name} has joints of its own: leave the SMPL model out")
+        raise InputError(f"{name} has its own joints: omit the SMPL model")
     options: dict[str, Any] = {"smpl": smpl} if takes_smpl else {}
     options |= {"level": level} if name in _LEVELED else {}
     return getattr(import_module(f"lidarpose.data.readers.{module}"), kind)(**options)
@@ -98,7 +98,7 @@ def prepare(
     root, out = Path(root), Path(out)
     source = reader(name, smpl, level=level)
     if not root.is_dir():
-        raise file_error(root, f"is no folder; expected the raw files of {name}")
+        raise file_error(root, f"is not a folder; expected the raw files of {name}")
     parts = list(source.parts(root))
     rule = split_rule(name, root, split_by, parts)
     absent_names = rule.absent(parts) if rule is not None else {}
@@ -230,7 +230,7 @@ def _summarize(
         for row in read_rows(dataset.path(shard), "labelled", _SUMMARIZED):
             is_incomplete = any(row[name] is None for name in _SUMMARIZED if name != "split")
             if is_incomplete or len(row["joints"]) != 3 * len(names):
-                problem = "has a row that is no sample; delete it and run the same command again"
+                problem = "has a row that is not a sample; delete it and run the same command again"
                 raise file_error(dataset.path(shard), problem)
             people += 1
             frames.add((row["sequence"], row["frame"]))
@@ -266,18 +266,18 @@ def _summarize(
 def _warnings(summary: dict[str, Any], absent_names: dict[str, list[str]], rule: SplitRule | None) -> list[str]:
     lines, trunk, offset = [], summary["trunk"], summary["joints_from_center_m"]
     if not summary["people"]:
-        lines.append("there is nobody in it; see what was skipped")
+        lines.append("it has no people; see what was skipped")
     if trunk is not None and trunk[2] < _LEAST_UP:
         lines.append(f"people stand along {trunk} on average, expected z up: turn the dataset first")
     if offset is not None and offset > _FAR:
-        problem = f"joints are {offset:.2f} m from the points in the median"
-        lines.append(f"{problem}: labels and clouds of different releases?")
+        problem = f"the median distance from joints to points is {offset:.2f} m"
+        lines.append(f"{problem}: are labels and clouds from different releases?")
     empty_parts = [part["part"] for part in summary["parts"] if not part["people"]]
     if empty_parts and summary["people"]:
-        lines.append(f"nobody in {first_names(empty_parts, 5)}")
+        lines.append(f"no people in {first_names(empty_parts, 5)}")
     if rule is not None:
         lines += [
-            f"of {split} by {rule.name} {first_names(names, 5)} are not there" for split, names in absent_names.items()
+            f"{first_names(names, 5)} of {split} by {rule.name} are missing" for split, names in absent_names.items()
         ]
         if rule.leaks:
             lines.append(f"the split {rule.name} leaks: {rule.leaks}")

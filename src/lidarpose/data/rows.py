@@ -103,7 +103,7 @@ def labeled_row(sample: LabeledSample, *, index: int) -> dict[str, Any]:
     column."""
     unknown_names = sorted(sample.centers.keys() - set(CENTERS))
     if unknown_names:
-        raise InputError(f"centers have the names {', '.join(CENTERS)}, got {', '.join(unknown_names)}")
+        raise InputError(f"names of centers must be {', '.join(CENTERS)}, got {', '.join(unknown_names)}")
     centers = {f"center_{name}": center for name, center in sample.centers.items()}
     distance = sample.distance if sample.sensor_known else None
     return _sample_columns(sample, "labelled") | centers | {"index": index, "distance": distance}
@@ -155,7 +155,7 @@ def _check_row(row: dict[str, Any], table: str, joints: int) -> None:
     clip_columns = [name for name in _CLIP_COLUMNS if row[name] is not None]
     for name in ("points", "center", *clip_columns):
         if not np.isfinite(row[name]).all():
-            raise InputError(f"column {name} has values that are no finite numbers")
+            raise InputError(f"column {name} has values that are not finite numbers")
     # a joint may be NaN
     for name in ("points", "center", "joints", *clip_columns):
         if (np.abs(row[name]) > FARTHEST).any():

@@ -144,7 +144,7 @@ def read_rows(path: str | Path, table: str, columns: tuple[str, ...] | None = No
         names = file.schema_arrow.names
         missing_columns = [name for name, column in TABLES[table].items() if name not in names and not column.optional]
         if missing_columns:
-            raise InputError(f"is no shard of {table}: the columns {', '.join(missing_columns)} are missing")
+            raise InputError(f"is not a shard of {table}: the columns {', '.join(missing_columns)} are missing")
         column_names = [name for name in TABLES[table] if name in names and (columns is None or name in columns)]
         for batch in file.iter_batches(batch_size=_ROW_GROUP[table], columns=column_names):
             yield from _rows_of(pa, batch, table)
@@ -197,14 +197,14 @@ class DatasetReader:
         Raises InputError for a split of synthetic people, and for an empty split.
         """
         if split is not None and self.card.people != "labelled":
-            raise file_error(self.folder, f"holds synthetic people, which have no split {split!r}: leave it out")
+            raise file_error(self.folder, f"has synthetic people, which have no split {split!r}: omit the split")
         is_empty = True
         for row in self.rows():
             if split is None or row["split"] == split:
                 is_empty = False
                 yield self.sample(row)
         if is_empty and split is not None:
-            raise file_error(self.folder, f"has nobody in the split {split!r}; prepare says which splits it has")
+            raise file_error(self.folder, f"has no people in the split {split!r}; lidarpose prepare lists its splits")
 
     # the method's name until 0.2
     items = samples
@@ -216,7 +216,7 @@ class DatasetReader:
         except (ValueError, TypeError, AttributeError, KeyError) as error:
             number = row.get("index")
             path = self.folder if number is None else self.path(number // self.card.per_shard)
-            raise file_error(path, f"row of index {number} is no sample: {error}; write it again") from None
+            raise file_error(path, f"row with index {number} is not a sample: {error}; write it again") from None
 
 
 def open_dataset(folder: str | Path) -> DatasetReader:

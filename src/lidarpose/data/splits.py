@@ -99,7 +99,7 @@ def _own(root: Path, parts: Sequence[str]) -> SplitRule | None:
     missing_files = [_LISTS[split] for split in _NEEDED if split not in paths]
     if missing_files:
         present_file = next(iter(paths.values())).name
-        raise file_error(root, f"has {present_file} and no {missing_files[0]}: add it, or take the other away")
+        raise file_error(root, f"has {present_file} and no {missing_files[0]}: add it, or remove the other")
     # names without their first folder, if only one part has that name
     short_name_counts = Counter(part.partition("/")[2] for part in parts)
     full_names = {name: part for part in parts if short_name_counts[name := part.partition("/")[2]] == 1} | {
@@ -109,21 +109,21 @@ def _own(root: Path, parts: Sequence[str]) -> SplitRule | None:
     split_of: dict[str, str] = {}
     for split, path in paths.items():
         try:
-            lines = decode(read_bytes(path, expected="names of sequences, one a line")).splitlines()
+            lines = decode(read_bytes(path, expected="names of sequences, one per line")).splitlines()
         except FormatError as problem:
             raise file_error(path, problem) from None
         # empty lines, such as at the end of the file, are not sequences
         names = [line.strip() for line in lines if line.strip()]
         if not names:
-            raise file_error(path, "names no sequence; expected one a line")
+            raise file_error(path, "names no sequence; expected one per line")
         sets[split] = tuple(full_names.get(name, name) for name in names)
         for name in sorted(sets[split]):
             if split_of.setdefault(name, split) != split:
-                raise file_error(path, f"names {name}, which is in {_LISTS[split_of[name]]} too: leave it out of one")
+                raise file_error(path, f"names {name}, which is also in {_LISTS[split_of[name]]}: remove it from one")
     source = ", ".join(path.name for path in paths.values())
     if parts and not full_names.keys() & split_of.keys():
         example = sets[next(iter(sets))][0]
-        raise file_error(root, f"has nothing that {source} name: expected names such as {parts[0]!r}, got {example!r}")
+        raise file_error(root, f"has nothing named in {source}: expected names such as {parts[0]!r}, got {example!r}")
     return SplitRule(name="own", source=f"{source} beside the data", rule="sequences", sets=sets)
 
 

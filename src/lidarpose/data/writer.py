@@ -64,7 +64,7 @@ def check_settings(folder: str | Path, present: DatasetCard, wanted: DatasetCard
         for name in sorted(old_settings | new_settings)
     }
     differences = {
-        name: f"{name} {present_value} there, {wanted_value} asked for"
+        name: f"{name} is {present_value}, requested is {wanted_value}"
         for name, (present_value, wanted_value) in pairs.items()
         if present_value != wanted_value
     }
@@ -72,7 +72,7 @@ def check_settings(folder: str | Path, present: DatasetCard, wanted: DatasetCard
         # a digest, which adds nothing to the other differences
         differences.pop("parts", None)
     if differences:
-        problem = f"{folder} holds a dataset of other settings: {'; '.join(differences.values())}"
+        problem = f"{folder} has a dataset with other settings: {'; '.join(differences.values())}"
         raise InputError(f"{problem}; give another folder or the same settings")
 
 
@@ -118,8 +118,8 @@ def _by_processes(make: Make, shards: list[int], workers: int) -> Iterator[tuple
                 reported_count = current_count
         except BrokenProcessPool:
             raise InputError(
-                f"a worker process died, of {workers}: give fewer --workers if memory ran out; "
-                "the same command goes on where it stopped"
+                f"one of {workers} worker processes died: give fewer --workers if memory ran out; "
+                "the same command continues where it stopped"
             ) from None
         finally:
             stop.set()

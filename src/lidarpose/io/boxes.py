@@ -135,10 +135,8 @@ def read_boxes(source: "str | os.PathLike | _Content | Poses", *, calib: str | o
         for i, box in enumerate(boxes):
             # tables and `poses["1"]` do not distinguish 1 from "1"
             if box.id is not None and first_index.setdefault(str(box.id), i) != i:
-                actual = f"{_show(box.id)}, which people[{first_index[str(box.id)]}] has too"
-                raise FormatError(
-                    f"people[{i}].id: expected an id of its own, got {actual}: rename one or leave it out"
-                )
+                actual = f"{_show(box.id)}, which people[{first_index[str(box.id)]}] also has"
+                raise FormatError(f"people[{i}].id: expected a unique id, got {actual}: change or omit one of the two")
         up = _up(content)
     except FormatError as problem:
         raise file_error("boxes" if isinstance(source, _Content) else source, problem) from None
@@ -166,7 +164,7 @@ def _common_up(boxes: Sequence[Box]) -> str:
     directions = sorted({box.up for box in boxes if box.up is not None})
     if len(directions) > 1:
         names = ", ".join(directions)
-        raise file_error("boxes", f"expected boxes of scans with one up axis, got {names}: give those of one scan")
+        raise file_error("boxes", f"expected boxes with the same up axis, got {names}: give the boxes of one scan")
     return directions[0] if directions else "z"
 
 
@@ -181,7 +179,7 @@ def _entries(content: object) -> list | tuple:
         content = content["people"]
     content = content.tolist() if isinstance(content, np.ndarray) else content
     if not isinstance(content, list | tuple):
-        raise FormatError('{"people": [...]} or a list of people', _show(content), "write the boxes so")
+        raise FormatError('{"people": [...]} or a list of people', _show(content), "write the boxes in this form")
     return content
 
 
@@ -199,11 +197,11 @@ def _load_file(path: str | os.PathLike, calib: str | os.PathLike | None) -> obje
         start = error.doc.lstrip()[:1]
         if start and start not in "{[":
             # a table from another tool, e.g. CSV
-            raise FormatError(f"JSON {_FORM} or a KITTI label", "text", "write the boxes so") from None
+            raise FormatError(f"JSON {_FORM} or a KITTI label", "text", "write the boxes in this form") from None
         where = f"line {error.lineno}, column {error.colno}"
         raise FormatError(f"is not JSON: {error.msg} at {where}; correct it there") from None
     except UnicodeDecodeError as error:
-        raise FormatError("JSON in UTF-8", f"byte {error.start} that is not", "save it as UTF-8") from None
+        raise FormatError("JSON in UTF-8", f"an invalid byte at {error.start}", "save it as UTF-8") from None
     except (ValueError, RecursionError) as error:
         raise FormatError(f"cannot be read as JSON ({error}); expected a list of boxes") from None
 
@@ -237,7 +235,8 @@ def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | N
         calib = Path(os.path.abspath(os.fsdecode(path))).parents[1] / "calib" / Path(os.fsdecode(path)).name
         if not calib.is_file():
             raise FormatError(
-                f"is a KITTI label: expected its calibration at {calib}, got none: put it there or name it (calib)"
+                f"is a KITTI label: expected its calibration at {calib}, got none: "
+                "put it there or give its path (calib)"
             )
     R_rect_velo, t_rect_velo = _read_calibration(calib)
     rows = []
@@ -258,10 +257,10 @@ def _read_calibration(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:
         values = _parse_numbers([word for key in keys for word in lines.get(key, ())], math.prod(shape))
         if values is None:
             actual = shorten(", ".join(lines)) or "nothing"
-            raise file_error(path, f"expected {keys[0]}: and {math.prod(shape)} numbers, got {actual}: copy it again")
+            raise file_error(path, f"expected {keys[0]}: with {math.prod(shape)} numbers, got {actual}: copy it again")
         matrix = np.array(values).reshape(shape)
         if np.abs(matrix[:, :3] @ matrix[:, :3].T - np.eye(3)).max() > _ROTATION_TOLERANCE:
-            raise file_error(path, f"expected a rotation as {keys[0]}, got a matrix that is none: copy it again")
+            raise file_error(path, f"expected a rotation as {keys[0]}, got another matrix: copy it again")
         matrices.append(matrix)
     R_rect_cam, T_cam_velo = matrices
     return R_rect_cam @ T_cam_velo[:, :3], R_rect_cam @ T_cam_velo[:, 3]
@@ -291,7 +290,9 @@ def _box(entry: object, where: str) -> Box:
     if "box" in entry and "center" not in entry:
         # an entry of a pose result, whose box is nested
         if not isinstance(entry["box"], dict):
-            raise FormatError(f"{where}.box: expected a box, got {_show(entry['box'])}: a cloud of one person has none")
+            raise FormatError(
+                f"{where}.box: expected a box, got {_show(entry['box'])}: a cloud of one person has no box"
+            )
         entry, where = entry | entry["box"], f"{where}.box"
     center = _triple(entry, "center", where, meaning="[x, y, z]")
     size = _triple(entry, "size", where, meaning="[length, width, height]")

@@ -78,13 +78,13 @@ def file_error(path: object, problem: object) -> InputError:
 
 def unreadable(path: object, error: OSError) -> InputError:
     """The error for a file that the operating system refuses to read."""
-    return file_error(path, f"cannot be read ({error.strerror or error}); check the path and its rights")
+    return file_error(path, f"cannot be read ({error.strerror or error}); check the path and its permissions")
 
 
 def listed(paths: str | os.PathLike | Iterable[str | os.PathLike]) -> list[str | os.PathLike]:
     """Paths or names as a list; a single string is one path, not a list of letters. Raises InputError otherwise."""
     if isinstance(paths, bytes) or not isinstance(paths, str | os.PathLike | Iterable):
-        raise InputError(f"expected a path, or several, got {type(paths).__name__}: name a file or folder")
+        raise InputError(f"expected one or more paths, got {type(paths).__name__}: give a file or folder")
     return [paths] if isinstance(paths, str | os.PathLike) else list(paths)
 
 
@@ -97,7 +97,7 @@ def check_not_input(out: str | os.PathLike, *inputs: object) -> None:
         with suppress(OSError, TypeError, ValueError):
             is_same = os.path.samefile(out, os.fspath(source))  # type: ignore[call-overload]
         if is_same:
-            raise file_error(out, "is itself what is read, and would be lost: name another file to write")
+            raise file_error(out, "is also an input file and would be overwritten: give another file to write")
 
 
 def content_digest(path: str | os.PathLike, *, expected: str) -> str:
@@ -117,11 +117,11 @@ def read_bytes(path: str | os.PathLike, *, expected: str, most: int | None = Non
         path = os.fspath(path)
         mode, size = os.stat(path).st_mode, os.stat(path).st_size
         if stat.S_ISDIR(mode):
-            raise file_error(path, f"expected {expected}, got a folder; name one file in it")
+            raise file_error(path, f"expected {expected}, got a folder; give a file in it")
         if not stat.S_ISREG(mode):
             raise file_error(path, f"expected {expected}, got a device or pipe; save it as a file first")
         if most is not None and size > most:
-            limit = f"{most / 2**30:g} GiB are read at most: split it first"
+            limit = f"expected at most {most / 2**30:g} GiB: split it first"
             raise file_error(path, f"has {size / 2**30:.1f} GiB, {limit}")
         with open(path, "rb") as file:
             data = file.read()
@@ -190,7 +190,7 @@ def _nearest(path: str | os.PathLike) -> str:
     except OSError:
         return f"; the folder {folder} does not exist either"
     if name in names:
-        return "; it is a link to what is not there"
+        return "; it is a link to a missing file"
     matches = difflib.get_close_matches(name, names, n=1, cutoff=0.7)
     return f"; did you mean {matches[0]}?" if matches else "; check the path"
 
@@ -212,7 +212,7 @@ def check_suffix(path: str | os.PathLike, *suffixes: str) -> None:
     except TypeError as error:
         raise file_error(repr(path), f"expected the path of a file to write ({error})") from None
     if not name.endswith(suffixes):
-        raise file_error(path, f"is to hold {suffixes[0][1:].upper()}: give a name that ends in {suffixes[0]}")
+        raise file_error(path, f"is written as {suffixes[0][1:].upper()}: give a name that ends in {suffixes[0]}")
 
 
 @contextmanager

@@ -25,7 +25,7 @@ _WITH_TIME, _WITH_COLOR = (1, 3, 4, 5, 6, 7, 8, 9, 10), (2, 3, 5, 7, 8, 10)
 def parse_las(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
     """x y z (n, 3) float64 in the file's unit, the column names, and an empty tuple of warnings; raises FormatError."""
     if len(data) < _HEADER or data[:4] != b"LASF":
-        raise FormatError("a LAS header", f"another or a damaged one of {len(data)} bytes", "copy it again")
+        raise FormatError("a LAS header", f"an unknown or damaged one in {len(data)} bytes", "copy it again")
     version = tuple(data[24:26])
     start, _, kind, size, num_points = struct.unpack_from("<IIBHI", data, 96)
     scale, shift = np.split(np.frombuffer(data, "<f8", 6, 131), 2)
@@ -81,4 +81,4 @@ def _unpack(data: bytes, start: int, size: int, num_points: int) -> bytes:
                     raise
                 raise FormatError("is damaged or cut off: copy it again") from None
             return bytes(points)
-    raise FormatError("is packed but does not say how: was it written completely?")
+    raise FormatError("is compressed, but has no LASzip record: was it written completely?")

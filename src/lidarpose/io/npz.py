@@ -99,7 +99,7 @@ def array_header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype, Literal["C
         return shape, dtype, "F" if is_fortran else "C"
     except Exception as error:
         reason = shorten(str(error))
-        raise FormatError("a NumPy .npy header", f"another or a damaged one ({reason})", "save it again") from None
+        raise FormatError("a NumPy .npy header", f"an unknown or damaged one ({reason})", "save it again") from None
 
 
 def load_array(data: bytes) -> np.ndarray:

@@ -84,7 +84,7 @@ def _decompress(data: bytes, start: int, size: int, num_points: int) -> bytes:
     packed_size, unpacked_size = (int(n) for n in np.frombuffer(data, "<u4", 2, start))
     check_bytes(data, start + 8, packed_size, num_points)
     if unpacked_size != size:
-        actual = f"a compressed part of {packed_size} bytes for {unpacked_size}"
+        actual = f"{packed_size} compressed bytes that announce {unpacked_size}"
         raise FormatError(f"{size} bytes for {num_points} points of the header", actual, "export it again")
     check_unpacked(packed_size, unpacked_size)
     try:

@@ -39,7 +39,7 @@ _FREE_COPIES, _COPIES = 4096, 8
 # types of values without parts
 _PLAIN = frozenset({type(None), bool, int, float, complex, str, bytes})
 _CONTAINERS = (list, tuple, set, frozenset, dict)
-_REMEDY = "copy it again, or ask for npz"
+_REMEDY = "copy it again, or get it as npz"
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def load_pickle(path: str | os.PathLike) -> Any:
     """
     data = read_bytes(path, expected="a pickle", most=MAX_BYTES)
     if data.startswith(b"PK\x03\x04"):
-        raise file_error(path, "expected a pickle, got a zip archive: an npz, if so name it .npz")
+        raise file_error(path, "expected a pickle, got a zip archive: if it is an npz, rename it to .npz")
     try:
         content = _DataUnpickler(data).load()
         _check_levels(content, {})
@@ -69,13 +69,13 @@ def load_pickle(path: str | os.PathLike) -> Any:
     except FormatError as problem:
         raise file_error(path, problem) from None
     except MemoryError:
-        raise file_error(path, "does not fit in memory: ask for npz, or split it") from None
+        raise file_error(path, "does not fit in memory: get it as npz, or split it") from None
     except (EOFError, struct.error):
         raise file_error(path, f"is cut off: the pickle has no end; {_REMEDY}") from None
     # a damaged file can make the unpickler and numpy raise any exception
     except Exception as error:
         reason = shorten(str(error)) or type(error).__name__
-        raise file_error(path, f"is damaged or no pickle ({reason}): {_REMEDY}") from None
+        raise file_error(path, f"is damaged or not a pickle ({reason}): {_REMEDY}") from None
 
 
 @dataclass(frozen=True)
@@ -135,13 +135,13 @@ class _DataUnpickler(pickle._Unpickler):
         name = f"{_MODULES.get(module, module)}.{name}"
         if name not in _KNOWN and not name.startswith("chumpy.") and not _SPARSE.fullmatch(name):
             raise FormatError(
-                f"its pickle wants {shorten(name)}, which is not on the list of plain data (arrays, lists, dicts, "
-                "chumpy, scipy.sparse): nothing was run; ask for npz"
+                f"its pickle needs {shorten(name)}, which is not on the list of plain data (arrays, lists, dicts, "
+                "chumpy, scipy.sparse): nothing was run; get it as npz"
             )
         return _Name(name, self.call)
 
     def get_extension(self, code: int) -> None:
-        raise FormatError("its pickle wants a class by a registered number, which only its maker has: ask for npz")
+        raise FormatError("its pickle needs a class by a number that only its author's program knows: get it as npz")
 
     def call(self, name: str, args: tuple) -> object:
         """What the named function or class would return, or a stub if the result still needs its state."""
@@ -186,7 +186,7 @@ class _DataUnpickler(pickle._Unpickler):
         """Returns the value; raises FormatError if all values together exceed the limit for the file's size."""
         self.copies_left -= getattr(value, "nbytes", None) or (len(value) if hasattr(value, "__len__") else 0)
         if self.copies_left < 0:
-            raise FormatError(f"has arrays of more than {_COPIES} times its size: ask for npz")
+            raise FormatError(f"has arrays larger than {_COPIES} times the file: get it as npz")
         return value
 
     def dict_of(self, items: list) -> dict:
@@ -229,7 +229,9 @@ class _DataUnpickler(pickle._Unpickler):
                 continue
             self.key_share += 1 / (MAX_TUPLE_KEYS if parts is item else MAX_NUMBER_KEYS)
             if self.key_share > 1:
-                raise FormatError(f"has over {MAX_NUMBER_KEYS} numbers or {MAX_TUPLE_KEYS} tuples as keys: ask for npz")
+                raise FormatError(
+                    f"has over {MAX_NUMBER_KEYS} numbers or {MAX_TUPLE_KEYS} tuples as keys: get it as npz"
+                )
         return items
 
 
@@ -266,9 +268,9 @@ def _check_levels(value: Any, levels: dict[int, int | None], depth: int = 0) -> 
         levels[id(value)] = 1 + max(child_levels, default=0)
     count = levels[id(value)]
     if count is None:
-        raise FormatError("holds a list or dict that contains itself: ask for npz")
+        raise FormatError("holds a list or dict that contains itself: get it as npz")
     if depth + count > MAX_DEPTH:
-        raise FormatError(f"is nested more than {MAX_DEPTH} levels deep: ask for npz")
+        raise FormatError(f"is nested more than {MAX_DEPTH} levels deep: get it as npz")
     return count
 
 
@@ -292,7 +294,7 @@ _DTYPE = re.compile(r"[|<>=]?(b1|[iu][1248]|f(2|4|8|16)|c(8|16|32)|[SU][1-9]\d{0
 
 def _dtype(code: object, order: object) -> np.dtype:
     if not isinstance(code, str) or not _DTYPE.fullmatch(code):
-        raise FormatError(f"has arrays of type {shorten(repr(code))}; numbers and text are read: ask for npz")
+        raise FormatError(f"has arrays of type {shorten(repr(code))}, expected numbers or text: get it as npz")
     if "O" in code:
         return np.dtype(object)
     return np.dtype((order if order in ("<", ">", "|", "=") else "") + code.lstrip("|<>="))
@@ -326,7 +328,7 @@ def _encode(text: object = b"", encoding: object = "latin1") -> bytes:
     if isinstance(text, bytes):
         return text
     if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
-        raise FormatError(f"makes bytes of something else than latin-1 text: {_REMEDY}")
+        raise FormatError(f"makes bytes from something other than latin-1 text: {_REMEDY}")
     return text.encode("latin1")
 
 
@@ -364,8 +366,8 @@ def _dense(name: str, state: Any, max_numbers: int) -> np.ndarray:
         rows, columns = map(operator.index, state.get("_shape", state.get("shape")))
         starts, indices, data = (state[part] for part in ("indptr", "indices", "data"))
         if rows * columns > max_numbers:
-            actual = f"{rows} x {columns}; up to {MAX_DENSE} numbers are read in all"
-            raise FormatError(f"has a {name} of {actual}: ask for npz")
+            actual = f"{rows} x {columns}; up to {MAX_DENSE} numbers are read in total"
+            raise FormatError(f"has a {name} of {actual}: get it as npz")
         matrix = np.zeros((columns, rows) if "csc" in name else (rows, columns), data.dtype)
         counts = np.diff(starts.astype(np.int64))
         is_consistent = starts[0] == 0 and indices.shape == data.shape == (starts[-1],) and (counts >= 0).all()

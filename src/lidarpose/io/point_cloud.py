@@ -50,10 +50,10 @@ _FOREIGN = {
     rb"BZh[1-9]1AY&SY": "is bzip2-compressed: unpack it first (bunzip2)",
     rb"\xfd7zXZ\x00": "is xz-compressed: unpack it first (unxz)",
     rb"\x28\xb5\x2f\xfd": "is zstd-compressed: unpack it first (unzstd)",
-    rb"\x89PNG\r\n\x1a\n": "is a PNG picture: expected a point cloud; name the cloud's own file",
-    rb"\xff\xd8\xff[\xdb\xe0\xe1\xee]": "is a JPEG picture: expected a point cloud; name the cloud's own file",
+    rb"\x89PNG\r\n\x1a\n": "is a PNG picture: expected a point cloud; give the point cloud's file",
+    rb"\xff\xd8\xff[\xdb\xe0\xe1\xee]": "is a JPEG picture: expected a point cloud; give the point cloud's file",
     rb"\x89HDF\r\n\x1a\n": "is an HDF5 file: save the points as .npy first",
-    rb"(?i)\s*<(!doctype html|html|\?xml)": "is a web page or XML: expected a point cloud; download it anew",
+    rb"(?i)\s*<(!doctype html|html|\?xml)": "is a web page or XML: expected a point cloud; download it again",
     rb"version https://git-lfs": "is a Git LFS pointer, not the data: run `git lfs pull`",
 }
 _MAGIC = {
@@ -156,7 +156,7 @@ def _refuse_foreign(data: bytes, suffix: str) -> None:
             raise FormatError(problem)
     if suffix in RECORDINGS:
         raise FormatError(
-            "one scan", f"a recording ({suffix})", "lidarpose predict reads it, in Python predict_recording"
+            "one scan", f"a recording ({suffix})", "read it with lidarpose predict, in Python with predict_recording"
         )
     if suffix not in SUFFIXES:
         raise FormatError(f"one of {' '.join(SUFFIXES)}", f"the suffix {suffix!r}", "convert or rename the file")
@@ -175,18 +175,18 @@ def _parse_bin(data: bytes, columns: int | None):
     if len(data) % (4 * columns):
         fitting_columns = [str(c) for c in range(3, 9) if len(data) % (4 * c) == 0]
         remedy = (
-            f"say how many values a row has (--columns {' or '.join(fitting_columns)})"
+            f"give the number of values per row (--columns {' or '.join(fitting_columns)})"
             if fitting_columns
             else "it is cut off or not raw float32, copy it again"
         )
-        actual = f"{len(data)} bytes, which do not divide by {4 * columns}"
+        actual = f"{len(data)} bytes, which is not a multiple of {4 * columns}"
         raise FormatError(f"rows of {columns} float32 (x y z first)", actual, remedy)
     points = np.frombuffer(data, "<f4").reshape(-1, columns)[:, :3].astype(np.float64)
     share = float((np.isfinite(points) & (np.abs(points) > _MAX_PLAUSIBLE)).any(axis=1).mean())
     if share > _MAX_IMPLAUSIBLE_SHARE:
         actual = f"{share:.0%} of rows beyond {_MAX_PLAUSIBLE:g} m"
         raise FormatError(
-            f"rows of {columns} float32 in meters", actual, "another format, or another number of columns?"
+            f"rows of {columns} float32 in meters", actual, "is it another format, or another number of columns?"
         )
     return points, {4: KITTI_FIELDS, 5: NUSCENES_FIELDS}.get(columns) or numbered(columns), notes
 
@@ -198,7 +198,7 @@ def _guess_columns(data: bytes) -> tuple[int, tuple[str, ...]]:
     if len(data) % (4 * _SIX) == 0 and len(data) >= 4 * _SIX * _FEWEST_ROWS:
         candidates.append(_SIX)
     guess = four if four in candidates or five not in candidates else five
-    reason, alternative = "the size divides by 5 values and not by 4" if guess == five else "", four
+    reason, alternative = "the size is a multiple of 5 values and not of 4" if guess == five else "", four
     values = np.frombuffer(data[: len(data) // 4 * 4], "<f4")
     if five in candidates:
         # a fifth value that is always a beam number is not a coincidence: misaligned meters are not whole numbers
@@ -214,11 +214,11 @@ def _guess_columns(data: bytes) -> tuple[int, tuple[str, ...]]:
         if guess not in candidates:
             # neither 4 nor 5 divides the size
             if narrowest == _SIX:
-                guess, reason, alternative = _SIX, "rows of 3 would mix its columns up", 3
+                guess, reason, alternative = _SIX, "rows of 3 would mix up its columns", 3
         elif widths[narrowest] < widths[guess] - _NARROWER:
-            guess, reason = narrowest, f"rows of {guess} would mix its columns up"
+            guess, reason = narrowest, f"rows of {guess} would mix up its columns"
         elif narrowest != guess:
-            reason, alternative = f"nothing speaks clearly for rows of {narrowest}", narrowest
+            reason, alternative = f"nothing clearly indicates rows of {narrowest}", narrowest
     if not reason:
         return guess, ()
     names = {four: " (KITTI)", five: " (nuScenes)"}
@@ -250,7 +250,7 @@ def _parse_npz(data: bytes):
                 keys.append(key)
         if not keys or len(keys) > 1 and keys[0] not in ("points", "xyz"):
             actual = shorten(", ".join(members)) or "no array"
-            raise FormatError("'points', 'xyz' or one (n, 3+) array alone", actual, "save it with points=")
+            raise FormatError("'points', 'xyz' or a single (n, 3+) array", actual, "save it with points=")
         (content,) = unpack(archive, [members[keys[0]]], len(data))
         return _points_of(load_array(content), f"the array {shorten(keys[0])!r}")
 
@@ -269,7 +269,7 @@ def _points_of(array: np.ndarray, label: str):
         if array.ndim == 2 and 3 <= array.shape[0] <= FEW_ROWS:
             remedy = "save its transpose, points.T"
         elif is_image(array.shape):
-            remedy = "of a depth image save the points that its pixels are"
+            remedy = "convert the pixels of a depth image to points"
         elif array.ndim > 2 and array.shape[-1] >= 3:
             remedy = f"save points.reshape(-1, {array.shape[-1]})"
         raise FormatError(f"{label} to have the shape (n, 3+)", array.shape, remedy)

@@ -83,7 +83,7 @@ def parse_rows(text: str, num_rows: int, columns: list[int], num_cells: int, *, 
     for number, row in enumerate(rows, 1):
         if row.count(" ") + 1 != num_cells:
             actual = f"{row.count(' ') + 1} in {shorten(row)!r} on line {number} of the points"
-            raise FormatError(f"{num_cells} values a row, as the header says", actual, "export it again")
+            raise FormatError(f"{num_cells} values per row, as the header says", actual, "export it again")
     try:
         return np.loadtxt(rows, np.float64, comments=None, usecols=columns, ndmin=2)
     except ValueError as error:
@@ -111,7 +111,7 @@ def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...
         _check_width(body, names, separator, num_skipped)
     points = _read_csv(body, pick_xyz(names), separator=separator, decimal=decimal, num_skipped=num_skipped)
     if not has_header and is_transposed((len(points), len(names))):
-        actual = f"{len(points)} of {len(names)}"
+        actual = f"{len(points)} lines of {len(names)} values"
         raise FormatError("a line of x y z for each point", actual, "save its transpose")
     return points, tuple(names), ()
 
@@ -133,7 +133,7 @@ def _find_columns(text: str) -> tuple[Sequence[str], int, bool, str | None, str]
     where = f"on line {num_skipped + 1}, {shorten(first_line)!r}"
     if not all(_is_number(cell, decimal) for cell in cells):
         if not has_xyz(cells):
-            raise FormatError("numbers, or a header with x, y and z", f"others {where}", "export or rename x, y, z")
+            raise FormatError("numbers, or a header with x, y and z", f"neither {where}", "export or rename x, y, z")
         return cells, num_skipped + 1, True, separator, decimal
     if len(cells) < 3:
         raise FormatError("at least 3 columns x y z", f"{len(cells)} {where}", "export x, y and z")
@@ -151,9 +151,9 @@ def _check_width(body: str, names: Sequence[str], separator: str | None, num_ski
             cells = _split(line.strip(), separator)
             if any(cells[len(names) :]):
                 raise FormatError(
-                    f"{len(names)} values a row, as its header names",
+                    f"{len(names)} values per row, as its header says",
                     f"{len(cells)} on line {number}, {shorten(line)!r}",
-                    "name every column, row numbers too, or leave them away",
+                    "name every column, also row numbers, or omit them",
                 )
             return
 
@@ -165,7 +165,7 @@ def decode(data: bytes) -> str:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise FormatError("text in UTF-8", f"other bytes at {error.start}", "save it as UTF-8") from None
+        raise FormatError("text in UTF-8", f"an invalid byte at {error.start}", "save it as UTF-8") from None
     if "\x00" in text:
         raise FormatError("text", "zero bytes", "is it another format?")
     return text.replace("\r\n", "\n").replace("\r", "\n")

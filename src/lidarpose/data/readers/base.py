@@ -138,11 +138,11 @@ def numbers(path: object, value: object, shape: tuple[int, ...], what: str, *, f
         array = np.asarray(value, float)
         array = array if array.ndim == len(shape) else array.reshape(shape)
     except (TypeError, ValueError, OverflowError):
-        raise file_error(path, f"{what} must be numbers {shape}, got other things or rows of unequal length") from None
+        raise file_error(path, f"{what} must be numbers {shape}, got other data or rows of unequal length") from None
     if any(n not in (-1, m) for n, m in zip(shape, array.shape, strict=True)):
         raise file_error(path, f"{what} must be {shape}, got {array.shape}")
     if finite and not np.isfinite(array).all():
-        raise file_error(path, f"{what} has values that are no numbers")
+        raise file_error(path, f"{what} has values that are not finite")
     return array
 
 
@@ -200,14 +200,14 @@ class SmplJoints:
 
     def __init__(self, path: str | Path | None, dataset: str):
         if path is None:
-            raise InputError(f"{dataset} has SMPL poses and no joints, so it needs SMPL's own file: {_GET}")
+            raise InputError(f"{dataset} has SMPL poses and no joints, so it needs an SMPL model: {_GET}")
         path = Path(path)
         if path.is_dir():
             self.files = _in_folder(path)
             if "neutral" not in self.files:
                 raise file_error(path, f"expected SMPL_NEUTRAL.pkl or .npz, got {entries(path)}: {_GET}")
         elif not path.is_file():
-            raise file_error(path, f"no such file; expected SMPL's own: {_GET}")
+            raise file_error(path, f"no such file; expected an SMPL model: {_GET}")
         else:
             self.files = {"any": path}
         # by kind, joints at rest: of the mean body (24, 3), and their shape directions (24, 3, betas)
@@ -234,7 +234,9 @@ class SmplJoints:
         mean, shapes = self._model(self.kind(gender))
         if (count := betas.shape[-1]) > shapes.shape[-1]:
             path = self.files[self.kind(gender)]
-            raise file_error(path, f"has {shapes.shape[-1]} shapes, the labels {count}: give the full model")
+            raise file_error(
+                path, f"has {shapes.shape[-1]} shape coefficients, the labels {count}: give the full model"
+            )
         rest_joints = mean + np.moveaxis(shapes[..., :count] @ betas.T, -1, 0)
         rotations = axis_angle_to_matrix(pose.reshape(len(pose), -1, 3))
         return forward_kinematics(SMPL24.parents, rest_joints, rotations, rest_joints[:, 0] + trans)[1]
@@ -302,7 +304,7 @@ def labeled_sample(
     labels.setdefault("frame_id", f"{labels['sequence']}/{labels['frame']}")
     is_labeled = ~np.isnan(joints).any(-1)
     if not within_reach(joints[is_labeled]).all():
-        return Skipped("joints out of reach", f"{labels['frame_id']}/{labels['track']}: beyond {FARTHEST:g} m")
+        return Skipped("joints out of range", f"{labels['frame_id']}/{labels['track']}: beyond {FARTHEST:g} m")
     points = points.astype(np.float32)
     labels.setdefault("joint_labels", np.where(is_labeled, SEEN, UNLABELED).astype(np.uint8))
     pose = Pose(joints=joints.astype(np.float32), skeleton=tree, frame="sensor")

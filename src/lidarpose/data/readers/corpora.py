@@ -64,7 +64,7 @@ class _Entry:
         if not len(points):
             return Skipped("empty cloud", self.where)
         if _apart(points, joints) > _NEAR:
-            return Skipped("joints are not where the points are", self.where)
+            return Skipped("joints are far from the points", self.where)
         frame_labels: dict[str, Any] = {"sequence": self.sequence, "frame": self.frame, "time": self.frame / _FPS}
         return base.labeled_sample(points, joints, **frame_labels, **labels)
 
@@ -90,7 +90,7 @@ class _Corpus(Reader):
         for number, entry in enumerate(content):
             where = f"{part}: entry {number}"
             if not isinstance(entry, dict):
-                yield Skipped("entry of another form", f"{where}: {type(entry).__name__}")
+                yield Skipped("entry in another format", f"{where}: {type(entry).__name__}")
                 continue
             sequence = str(entry.get("seq_path", entry.get("motion_id", part)))
             frame = counts[sequence] = counts.get(sequence, -1) + 1
@@ -99,7 +99,7 @@ class _Corpus(Reader):
             except KeyError as error:
                 yield Skipped(f"no {error.args[0]}", where)
             except InputError as error:
-                yield Skipped("entry of another form", str(error))
+                yield Skipped("entry in another format", str(error))
 
     @abstractmethod
     def _entry(self, entry: _Entry) -> Iterator[LabeledSample | Skipped]:
@@ -147,7 +147,7 @@ class FreeMotion(_Corpus):
             try:
                 points, pelvis = entry.points(cloud), entry.numbers(f"T_{view}", (3,))
             except InputError as error:
-                yield Skipped("entry of another form", str(error))
+                yield Skipped("entry in another format", str(error))
                 continue
             yield entry.sample(points, joints - joints[0] + pelvis, track=str(view), source=self.name)
 
@@ -162,7 +162,7 @@ class NoiseMotion(FreeMotion):
     def parts(self, root: Path) -> list[str]:
         """The pickles. Raises InputError if there are only raw clouds, which have no poses."""
         if not any(root.glob("*.pkl")) and any(root.glob("pc_[123]")):
-            problem = "has clouds without poses, those are SURREAL's: run the authors' dataloader_NoiseMotion.py over "
+            problem = "has clouds without poses, which are in SURREAL: run the authors' dataloader_NoiseMotion.py on "
             raise file_error(root, f"{problem}both and give the folder of its .pkl; get them at {self.about['get']}")
         return super().parts(root)
 

@@ -45,7 +45,9 @@ class HumanM3(Reader):
         databases = [f"{name}.pkl" for name in sorted(_SPLITS) if (root / f"{name}.pkl").is_file()]
         nested_folders = [path.parent for name in _SPLITS for path in sorted(root.glob(f"*/{name}")) if path.is_dir()]
         if nested_folders and not databases and not any((root / name).is_dir() for name in _SPLITS):
-            raise file_error(root, f"is a folder above HumanM3's root, which is likely {nested_folders[0]}: name that")
+            raise file_error(
+                root, f"is a folder above HumanM3's root, which is likely {nested_folders[0]}: give that folder"
+            )
         sequences, incomplete_sequence = [], ""
         for folder in sorted(_folders(root, _DEEPEST)):
             missing_folders = [name for name in _FOLDERS if not (folder / name).is_dir()]
@@ -58,9 +60,9 @@ class HumanM3(Reader):
         # if the root were below the folder of a split, the split would be unknown
         split_folder = root.parent if sequences == ["."] else root
         if sequences and split_folder.name in _SPLITS and not any((root / name).is_dir() for name in _SPLITS):
-            raise file_error(root, f"lies in HumanM3's root, which is likely {split_folder.parent}: name that")
+            raise file_error(root, f"lies in HumanM3's root, which is likely {split_folder.parent}: give that folder")
         if sequences and incomplete_sequence:
-            raise file_error(root, f"has {incomplete_sequence}: get what is missing, or move that sequence away")
+            raise file_error(root, f"has {incomplete_sequence}: add what is missing, or move that sequence elsewhere")
         if not sequences and not databases:
             raise self.wrong_root(root, f"got {incomplete_sequence or base.entries(root)}")
         return sequences or databases
@@ -119,7 +121,7 @@ def _read_database(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
             people = _without_copies(entry["info"], where)
             path = base.find_below(root, str(entry["pcd"]))
         except (InputError, TypeError, KeyError) as error:
-            yield Skipped("entry of another form", f"{where}: {error!r}")
+            yield Skipped("entry in another format", f"{where}: {error!r}")
             continue
         if path is None:
             yield Skipped("labels without a cloud", f"{where}: {entry['pcd']}")
@@ -167,7 +169,7 @@ def _people(
         try:
             box = base.box_of_joints(labeled_joints, track)
         except InputError as error:
-            yield Skipped("joints out of reach", f"{where}: {error}")
+            yield Skipped("joints out of range", f"{where}: {error}")
             continue
         points = cloud[box.contains(cloud, base.POINT_MARGIN)]
         if not len(points):

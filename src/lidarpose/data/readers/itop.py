@@ -94,9 +94,9 @@ class Itop(Reader):
                 where = f"{part}/{name}"
                 person, _, frame = name.partition("_")
                 if not is_valid[k]:
-                    yield Skipped("labels that no human checked", where)
+                    yield Skipped("labels not checked by a human", where)
                 elif not (person.isdecimal() and frame.isdecimal()):
-                    yield Skipped("id of another form", where)
+                    yield Skipped("id in another format", where)
                 else:
                     try:
                         cloud = base.as_cloud(clouds.filename, clouds["data"][k])
@@ -126,12 +126,12 @@ def _sample(
     if fields["sequence"].startswith("side"):
         points = person_of_room(cloud) @ R_level_camera.T
         if not len(points):
-            return Skipped("nobody stands out of the room", frame_id)
+            return Skipped("no person stands out from the room", frame_id)
     else:
         try:
             box = base.box_of_joints(joints[is_labeled], "0")
         except InputError as error:
-            return Skipped("joints out of reach", f"{frame_id}: {error}")
+            return Skipped("joints out of range", f"{frame_id}: {error}")
         points = cloud @ R_level_camera.T
         points = points[box.contains(points, base.POINT_MARGIN)]
         if not len(points):
@@ -180,7 +180,7 @@ def _opened(root: Path, part: str) -> Iterator[tuple[Any, Any]]:
         files, ids = [], []
         for path, shapes in zip(paths, _DATASETS.values(), strict=True):
             if not path.is_file():
-                raise file_error(path, "is missing: get it from zenodo.org/records/3932973 and unpack it by gunzip")
+                raise file_error(path, "is missing: get it from zenodo.org/records/3932973 and unpack it with gunzip")
             try:
                 files.append(stack.enter_context(h5py.File(path, "r")))
                 actual_shapes = {name: getattr(files[-1].get(name), "shape", None) for name in shapes}
@@ -197,7 +197,7 @@ def _opened(root: Path, part: str) -> Iterator[tuple[Any, Any]]:
                 if actual_shapes[name] != (expected_shape := (len(ids[-1]), *shape)):
                     raise file_error(path, f"expected {name} of shape {expected_shape}, got {actual_shapes[name]}")
         if ids[0] != ids[1]:
-            raise file_error(paths[1], f"is of other frames than {paths[0].name}: get both again")
+            raise file_error(paths[1], f"has other frames than {paths[0].name}: get both again")
         yield files[0], files[1]
 
 

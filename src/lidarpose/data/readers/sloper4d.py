@@ -60,7 +60,7 @@ class Sloper4D(Reader):
         if not names:
             raise self.wrong_root(root)
         if duplicates := [name for name in names if names.count(name) > 1]:
-            raise file_error(root, f"has {duplicates[0]}{_SUFFIX} twice: move one of them away")
+            raise file_error(root, f"has {duplicates[0]}{_SUFFIX} twice: move one of them elsewhere")
         return names
 
     def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
@@ -98,7 +98,7 @@ class Sloper4D(Reader):
             elif index >= len(pose) or not has_pose[index]:
                 yield Skipped("cloud without a pose", where)
             elif index >= len(trajectory) or not has_place[index]:
-                yield Skipped("cloud without the LiDAR's place", where)
+                yield Skipped("cloud without the LiDAR's position", where)
             else:
                 R_sensor_world = rotation_about("z", -heading[index])
                 points, sensor_joints, center = (
@@ -173,12 +173,12 @@ def _clouds(path: Path, person: dict) -> dict[int, np.ndarray | str]:
     """Frame -> its cloud (k, 3) m, or a description of the error."""
     clouds, frames = person.get("point_clouds"), person.get("point_frame")
     if clouds is None or frames is None:
-        raise file_error(path, "second_person has no point_clouds and point_frame: labels of another release?")
+        raise file_error(path, "second_person has no point_clouds and point_frame: labels from another release?")
     if not isinstance(clouds, list | tuple | np.ndarray) or isinstance(clouds, np.ndarray) and not clouds.ndim:
         raise file_error(path, f"point_clouds should be a list of clouds, got {type(clouds).__name__}")
     frames = numbers(path, frames, (-1,), "point_frame").astype(int).tolist()
     if len(clouds) != len(frames):
-        raise file_error(path, f"has {len(clouds)} point_clouds of {len(frames)} frames (point_frame)")
+        raise file_error(path, f"has {len(clouds)} point_clouds for {len(frames)} frames (point_frame)")
     by_frame: dict[int, np.ndarray | str] = {}
     for frame, cloud in zip(frames, clouds, strict=True):
         try:

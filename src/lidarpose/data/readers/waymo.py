@@ -74,8 +74,8 @@ class Waymo(Reader):
         files = waymo_v1.parts(root)
         folders = [f"{split}/{name}" for split in SPLITS for name in _components(root / split)]
         if files and folders:
-            versions = f"{files[0]} is of version 1, {folders[0]} of version 2"
-            raise file_error(root, f"mixes versions of Waymo: {versions}; keep each in a folder of its own")
+            versions = f"{files[0]} is version 1, {folders[0]} is version 2"
+            raise file_error(root, f"mixes versions of Waymo: {versions}; keep each in its own folder")
         if files or folders:
             return files or _segments(root)
         actual = f"got {entries(root)}"
@@ -119,11 +119,11 @@ def _segments(root: Path) -> list[str]:
                     f"gcloud storage cp {url}/{name}/{missing_segments[0]}.parquet {shlex.quote(f'{folder / name}/')}"
                 )
                 problem = f"lacks {len(missing_segments)} of the {len(segments)} segments with keypoints"
-                remedy = f"fetch the first with: {command} (or take what you do not want out of lidar_hkp)"
+                remedy = f"fetch the first with: {command} (or remove unwanted segments from lidar_hkp)"
                 raise file_error(folder / name, f"{problem}; {remedy}")
         parts += [f"{split}/{segment}" for segment in segments]
     if not parts:
-        raise file_error(root, "has no segment with laser keypoints: only some have any; fetch all of lidar_hkp")
+        raise file_error(root, "has no segment with laser keypoints: only some have them; fetch all of lidar_hkp")
     return sorted(parts)
 
 
@@ -133,7 +133,7 @@ def _read_segment(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
     labels = []
     for number, (key, row) in enumerate(table(files["lidar_hkp"], (SEGMENT, TIME, OBJECT), _KEYPOINT_COLUMNS)):
         if None in key:
-            where = f"{part}: row {number} of lidar_hkp lacks its segment, its time or whose it is"
+            where = f"{part}: row {number} of lidar_hkp lacks its segment, its time or its person"
             yield Skipped(frames.BAD_LABEL, where)
         else:
             labels.append((key, row))
@@ -282,4 +282,4 @@ def _image(values, shape) -> np.ndarray | None:
 def _check(file, columns: tuple[str, ...]) -> None:
     missing_columns = [name for name in columns if name not in file.schema_arrow.names]
     if missing_columns:
-        raise InputError(f"has no column {missing_columns[0]}: is it of this component of Waymo v2.0?")
+        raise InputError(f"has no column {missing_columns[0]}: is it from this component of Waymo v2.0?")

@@ -32,7 +32,7 @@ _JOINTS = {
 _KINDS = {1: "vehicle", 2: "pedestrian", 3: "sign", 4: "cyclist"}
 
 # reasons for skipping a person, in both versions of the dataset
-BAD_LABEL = "label of another form"
+BAD_LABEL = "label in another format"
 BAD_IMAGE = "range image cannot be read"
 BAD_FRAME = "frame cannot be read"
 
@@ -49,12 +49,12 @@ def transform(values: Iterable[float] | None, what: str) -> np.ndarray:
     try:
         matrix = np.array([] if values is None else values, float)
     except (TypeError, ValueError):
-        raise InputError(f"{what} must be 16 numbers, a 4 x 4 transform, got other things") from None
+        raise InputError(f"{what} must be 16 numbers, a 4 x 4 transform, got something else") from None
     if matrix.shape != (16,) or not np.isfinite(matrix).all():
         raise InputError(f"{what} must be 16 numbers, a 4 x 4 transform, got {np.isfinite(matrix).sum()}")
     matrix = matrix.reshape(4, 4)
     if not is_rotation(matrix[:3, :3]) or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise InputError(f"{what} must be a rotation and a shift, got a matrix that is none")
+        raise InputError(f"{what} must be a rotation and a translation, got another matrix")
     return matrix
 
 
@@ -105,7 +105,7 @@ def points_of_image(
     if pixel_poses is None:
         return points, row
     if pixel_poses.shape != (height, width, 6):
-        raise InputError(f"pixel poses are {pixel_poses.shape}, of a range image {height} x {width}")
+        raise InputError(f"pixel poses are {pixel_poses.shape}, the range image is {height} x {width}")
     roll, pitch, yaw, *shift = pixel_poses[row, column].astype(float).T
     x, y, z = points.T
     # about x, then y, then z

@@ -86,7 +86,7 @@ _CLASSES = _message_classes()
 def parse(message: str, data: bytes, largest: int) -> Any:
     """Parses a message of `_MESSAGES`. Raises InputError if it has over `largest` bytes, is truncated or damaged."""
     if len(data) > largest:
-        raise InputError(f"message {message} has {len(data):,} bytes, more than {largest:,}: damaged, or not Waymo's")
+        raise InputError(f"message {message} has {len(data):,} bytes, more than {largest:,}: damaged or not Waymo's")
     try:
         return _CLASSES[message].FromString(data)
     except DecodeError:
@@ -127,7 +127,7 @@ def records(path: Path) -> Iterator[bytes]:
                     raise file_error(path, f"is cut off in record {number}; copy it again")
                 length = int.from_bytes(head[:8], "little")
                 if _masked_checksum(head[:8]) != int.from_bytes(head[8:], "little"):
-                    problem = "is no TFRecord file" if number == 0 else f"is damaged at record {number}"
+                    problem = "is not a TFRecord file" if number == 0 else f"is damaged at record {number}"
                     raise file_error(path, f"{problem} (the checksum of a length is wrong); copy it again")
                 if file.tell() + length + 4 > size:
                     raise file_error(path, f"is cut off in record {number}; copy it again")
@@ -152,7 +152,7 @@ def _frame(message: Any, start: int | None) -> frames.Frame:
     """
     name = message.context.name.decode("utf-8", "replace")
     if not name or not message.HasField("timestamp_micros"):
-        raise InputError("is no frame of Waymo's perception dataset: it has no segment or no time")
+        raise InputError("is not a frame of Waymo's perception dataset: it has no segment or no time")
     frame = frames.Frame(
         sequence=name,
         timestamp=message.timestamp_micros,
@@ -213,10 +213,10 @@ def _matrix(compressed: bytes) -> np.ndarray | None:
     except zlib.error as error:
         raise InputError(f"a range image cannot be decompressed ({error})") from None
     if not inflate.eof:
-        raise InputError("a range image is cut off, or far larger than any")
+        raise InputError("a range image is cut off or too large")
     matrix = parse("MatrixFloat", content, _LARGEST_IMAGE)
     sizes = list(parse("Shape", matrix.shape, _LARGEST_SHAPE).dims)
     count, remainder = divmod(len(matrix.data), 4)
     if remainder or not frames.is_image(sizes, count):
-        raise InputError(f"a range image of {count} values says it is {reprlib.repr(sizes)}")
+        raise InputError(f"a range image has {count} values, its stated shape is {reprlib.repr(sizes)}")
     return np.frombuffer(matrix.data, "<f4").reshape(sizes)

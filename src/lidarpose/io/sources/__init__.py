@@ -96,13 +96,13 @@ def is_single_scan(paths: str | os.PathLike | Sequence[str | os.PathLike]) -> bo
 def _matches(path: str | os.PathLike) -> list[Path]:
     """The paths that match a path or pattern, in natural order."""
     if not isinstance(path, str | os.PathLike):
-        raise InputError(f"expected paths, got {type(path).__name__} among them: name files or folders")
+        raise InputError(f"expected paths, got {type(path).__name__} among them: give files or folders")
     if os.path.exists(path):
         return [Path(path)]
     pattern = os.fspath(path)
     paths = sorted(map(Path, glob.glob(pattern, recursive=True)), key=natural_key)
     if not paths:
-        problem = "no file has such a name" if glob.has_magic(pattern) else "no such file or folder"
+        problem = "no file matches the pattern" if glob.has_magic(pattern) else "no such file or folder"
         raise file_error(path, f"{problem}; expected point files, a folder of them or a recording: check the path")
     return paths
 

@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, NamedTuple
 from lidarpose.io.files import FormatError, check_unpacked, shorten
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
-_CUT_OFF = "is cut off: what was recorded up to there is read, if there is anything"
+_CUT_OFF = "is cut off: the part before the cut is read, if there is any"
 # maximum bytes of a message in SQLite, compressed or not
 _MAX_MESSAGE = 2**28
 
@@ -112,7 +112,7 @@ class RecordFile(ABC):
         self._schemas: dict[int, str] = {}
         with open(path, "rb") as file:
             if file.read(len(self.MAGIC)) != self.MAGIC:
-                raise FormatError(f"is no {path.suffix} file, though its name says so; convert or rename it")
+                raise FormatError(f"is not a {path.suffix} file, despite its name; convert or rename it")
             if self._has_index(file):
                 return
             try:
@@ -121,7 +121,7 @@ class RecordFile(ABC):
             except FormatError:
                 # ignored here: `messages` raises it again where the readable part ends
                 if not self.topics:
-                    raise FormatError("is cut off or damaged before its first message; record it anew") from None
+                    raise FormatError("is cut off or damaged before its first message; record it again") from None
 
     def _has_index(self, file: BinaryIO) -> bool:
         """Reads the topics from the index at the end of the file. Returns whether the file has one."""
@@ -156,7 +156,7 @@ class RecordFile(ABC):
                 elif channel in channels:
                     yield kind, channels[channel], *content
         except (struct.error, IndexError) as error:
-            raise FormatError(f"is damaged ({error}): what is before that is read") from None
+            raise FormatError(f"is damaged ({error}): the part before the damage is read") from None
 
     def _unpacked(self, stream: _Bytes, compression: str, size: int, unpacked_size: int) -> Iterator[tuple]:
         """The records of a compressed chunk. A chunk that cannot be unpacked is skipped."""
@@ -284,12 +284,12 @@ class SqliteFile:
             with closing(self._connect()) as connection:
                 self._read_topics(connection)
         except sqlite3.Error as error:
-            raise FormatError(f"is no recording of rosbag2 ({shorten(str(error))}); record it anew") from None
+            raise FormatError(f"is not a rosbag2 recording ({shorten(str(error))}); record it again") from None
 
     def _read_topics(self, connection: sqlite3.Connection) -> None:
         tables = connection.execute(_TABLES).fetchone()[0]
         if tables != 2:
-            raise FormatError("the tables messages and topics of rosbag2", f"{tables} of them", "record it anew")
+            raise FormatError("the tables messages and topics of rosbag2", f"{tables} of them", "record it again")
         for name, type_, encoding in connection.execute("SELECT name, type, serialization_format FROM topics"):
             self.topics[str(name)] = Topic(str(type_), str(encoding))
         counts = f"SELECT name, COUNT(*) FROM {_MESSAGES} GROUP BY name"
@@ -323,4 +323,4 @@ class SqliteFile:
                             data = unpack(data, "zstd", _MAX_MESSAGE)
                     yield Message(str(name), time if isinstance(time, int) else 0, data)
         except sqlite3.Error as error:
-            raise FormatError(f"is damaged ({shorten(str(error))}): what is before that is read") from None
+            raise FormatError(f"is damaged ({shorten(str(error))}): the part before the damage is read") from None

@@ -39,7 +39,7 @@ def list_folder(folder: Path) -> list[Path]:
     try:
         return sorted((path for path in folder.iterdir() if not path.name.startswith(".")), key=natural_key)
     except OSError as error:
-        raise file_error(folder, f"cannot be listed ({error.strerror or error}); check its rights") from None
+        raise file_error(folder, f"cannot be listed ({error.strerror or error}); check its permissions") from None
 
 
 def scan_files(folder: Path, other: Sequence[str] = ()) -> tuple[list[Path], list[str]]:
@@ -65,7 +65,7 @@ def scan_files(folder: Path, other: Sequence[str] = ()) -> tuple[list[Path], lis
     warnings = []
     if left_out:
         names, other_names = (" and ".join(f"{n} {suffix}" for suffix, n in each) for each in (counts, left_out))
-        warnings = [f"only its {names} files are read, not {other_names}: name those by a pattern"]
+        warnings = [f"only its {names} files are read, not {other_names}: give a pattern to read those"]
     suffixes_read = {suffix for suffix, _ in counts}
     return [path for path in files if suffixes[path] in suffixes_read], warnings
 
@@ -78,7 +78,7 @@ def describe(entries: Sequence[Path]) -> str:
     kinds = Counter(path.suffix.lower() or "without a suffix" for path in entries if path.name not in folders)
     parts = [f"{count} {kind}" for kind, count in kinds.most_common(5)]
     if folders:
-        parts.append(f"{len(folders)} folders ({shorten(', '.join(folders), 60)}), of which you may name one")
+        parts.append(f"{len(folders)} folders ({shorten(', '.join(folders), 60)}; give one of them)")
     return f"a folder with {', '.join(parts)}"
 
 
@@ -89,7 +89,7 @@ def open_files(name: str, paths: Sequence[Path], options: ReadingOptions) -> Ind
     suffixes = sorted({path.suffix.lower() for path in paths})
     warnings = [f"mixes {', '.join(suffixes)} files: one sensor is assumed"] if len(suffixes) > 1 else []
     if options.topic is not None or options.meta is not None:
-        warnings.append("topic and meta are for recordings: they say nothing of point files")
+        warnings.append("topic and meta are for recordings: they are ignored for point files")
     columns = options.columns
     if columns is None and ".bin" in suffixes:
         columns, notes = _columns_of([path for path in paths if path.suffix.lower() == ".bin"])

@@ -68,8 +68,8 @@ class Frame(Sweep):
         if not (is_finite and is_rotation(T[:3, :3]) and np.allclose(T[3], [0, 0, 0, 1])):
             actual = shorten(repr(np.round(T, 3).tolist()), 90)
             raise InputError(
-                f"Frame.T_world_sensor: expected (4, 4), a rotation and a place in meters over 0 0 0 1, got {actual}: "
-                "give None where the sensor's pose is not known"
+                "Frame.T_world_sensor: expected (4, 4), a rotation and a position in meters over 0 0 0 1, got "
+                f"{actual}: give None if the sensor's pose is not known"
             )
         object.__setattr__(self, "T_world_sensor", T)
 
@@ -230,9 +230,9 @@ class FrameSource:
             if value is not None:
                 check_finite(name, value)
         if rate is not None and rate <= 0:
-            raise InputError(f"rate must be positive, frames a second, got {rate!r}")
+            raise InputError(f"rate must be positive, in frames per second, got {rate!r}")
         if end is not None and end <= (start or 0):
-            raise InputError(f"end must be later than start, seconds from the first frame, got {start!r} to {end!r}")
+            raise InputError(f"end must be later than start, in seconds from the first frame, got {start!r} to {end!r}")
         self.name = recording.name
         self.recording = recording
         self.rate = rate or DEFAULT_RATE
@@ -244,8 +244,8 @@ class FrameSource:
         self._first_time = first_frame.time
         self._notes: list[str] = []
         if first_frame.time is None and recording.count != 1 and rate is None:
-            rate_hint = "rate, on the command line --rate, for another"
-            self._notes.append(f"has no times: taken as {DEFAULT_RATE:g} frames a second ({rate_hint})")
+            rate_hint = "change it with rate, on the command line --rate"
+            self._notes.append(f"has no times: read as {DEFAULT_RATE:g} frames per second ({rate_hint})")
         self._num_back = 0
 
     @property

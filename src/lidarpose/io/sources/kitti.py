@@ -187,6 +187,6 @@ def _transform(values: np.ndarray) -> np.ndarray:
 
 def _text(path: Path) -> str | None:
     try:
-        return read_bytes(path, expected="a file of KITTI").decode("utf-8", "replace")
+        return read_bytes(path, expected="a KITTI file").decode("utf-8", "replace")
     except LidarPoseError:
         return None

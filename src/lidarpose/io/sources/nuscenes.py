@@ -34,13 +34,13 @@ def open_nuscenes(folder: Path, options: ReadingOptions) -> IndexedRecording | N
         return None
     if len(versions) > 1:
         names = ", ".join(path.name for path in versions)
-        raise file_error(folder, f"expected one version of nuScenes, got {names}: name the folder of one")
+        raise file_error(folder, f"expected one version of nuScenes, got {names}: give the folder of one")
     try:
         sweeps = _sweeps(versions[0], options.topic)
     except InputError:
         raise
     except (LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
-        raise file_error(versions[0], f"its tables are not nuScenes' ({shorten(str(error))}): download again") from None
+        raise file_error(versions[0], f"not nuScenes tables ({shorten(str(error))}): download them again") from None
     file_names = {f"{part}/{_CHANNEL}": _names(root / part / _CHANNEL) for part in ("samples", "sweeps")}
     present_sweeps = [
         sweep for sweep in sweeps if sweep["file"].name in file_names.get(sweep["file"].parent.as_posix(), ())
@@ -65,9 +65,7 @@ def open_nuscenes(folder: Path, options: ReadingOptions) -> IndexedRecording | N
 
 def _sweeps(version: Path, scene: str | None) -> list[dict[str, Any]]:
     """The id, file, time in s and pose (None if damaged) of each sweep, in order."""
-    tables = {
-        name: json.loads(read_bytes(version / f"{name}.json", expected="a table of nuScenes")) for name in _TABLES
-    }
+    tables = {name: json.loads(read_bytes(version / f"{name}.json", expected="a nuScenes table")) for name in _TABLES}
     sample_data = tables.pop("sample_data")
     by_token = {name: {row["token"]: row for row in rows} for name, rows in tables.items()}
     if scene is not None:
@@ -108,10 +106,10 @@ def _pose(*rows: Any) -> np.ndarray | None:
 
 def _rows(path: Path) -> np.ndarray:
     """(n, 5) float32: x, y, z, intensity, ring."""
-    data = read_bytes(path, expected="a sweep of nuScenes")
+    data = read_bytes(path, expected="a nuScenes sweep")
     size = 4 * len(NUSCENES_FIELDS)
     if len(data) % size:
-        raise file_error(path, f"is cut off: {len(data)} bytes do not divide by {size}; copy it again")
+        raise file_error(path, f"is cut off: {len(data)} bytes is not a multiple of {size}; copy it again")
     return np.frombuffer(data, "<f4").reshape(-1, len(NUSCENES_FIELDS))
 
 

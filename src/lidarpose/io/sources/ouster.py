@@ -75,13 +75,13 @@ class OusterFormat:
         try:
             metadata = json.loads(data)
             if not isinstance(metadata, dict):
-                raise FormatError("an object", type(metadata).__name__, "save the sensor's metadata anew")
+                raise FormatError("an object", type(metadata).__name__, "save the sensor's metadata again")
             self._parse(_flat(metadata))
         except FormatError as problem:
             raise file_error(path, problem) from None
         except (ValueError, TypeError, OverflowError, RecursionError) as error:
             reason = shorten(str(error))
-            raise file_error(path, f"cannot be read as an Ouster sensor's metadata ({reason}); save it anew") from None
+            raise file_error(path, f"cannot be read as an Ouster sensor's metadata ({reason}); save it again") from None
 
     def _parse(self, metadata: dict[str, Any]) -> None:
         altitude, azimuth = (
@@ -94,7 +94,7 @@ class OusterFormat:
         pixels = _whole(metadata, "pixels_per_column", _MAX_BEAMS, self.beams)
         if not len(altitude) == len(azimuth) == pixels:
             actual = f"{len(altitude)} altitudes and {len(azimuth)} azimuths"
-            raise FormatError(f"beam angles of {pixels} beams", actual, "save the sensor's metadata anew")
+            raise FormatError(f"beam angles of {pixels} beams", actual, "save the sensor's metadata again")
         first, last = metadata.get("column_window") or (0, self.columns - 1)
         self.window = min(max(int(first), 0), self.columns - 1), min(max(int(last), 0), self.columns - 1)
         self.port, self.serial = metadata.get("udp_port_lidar"), metadata.get("prod_sn")
@@ -108,7 +108,7 @@ class OusterFormat:
         self.is_fusa = "FUSA" in (metadata.get("header_type"), self.profile[:4])
         self.packet = self._packet_type()
         if self.packet.itemsize > _MAX_PACKET:
-            raise FormatError("packets that fit a datagram", f"{self.packet.itemsize} bytes", "save the metadata anew")
+            raise FormatError("packets that fit a datagram", f"{self.packet.itemsize} bytes", "save the metadata again")
         self._aim(metadata, altitude, azimuth)
 
     def _packet_type(self) -> np.dtype:
@@ -212,7 +212,7 @@ class OusterRecording(PacketRecording):
                     break
         if flow is None:
             size = f"lidar packets of {self.packet_bytes} bytes"
-            expected = f"{size} ({self.format.profile}, {self.format.beams} beams, says {self.metadata})"
+            expected = f"{size} ({self.format.profile}, {self.format.beams} beams, according to {self.metadata})"
             actual = ", ".join(f"{count} of {size}" for size, count in sorted(sizes.items())[:5]) or "no UDP packets"
             raise file_error(self.name, f"expected {expected}, got {actual}: is that the metadata of this recording?")
         return flow
@@ -224,8 +224,8 @@ class OusterRecording(PacketRecording):
             lines.append(f"{self._num_lost} of {self._num_sent} lidar packets were lost")
         lines += super().warnings
         if self._serial and str(self.format.serial or self._serial) != str(self._serial):
-            serial = f"{self._serial}, {self.metadata} is of {self.format.serial}"
-            lines.append(f"the packets are of the sensor {serial}: its beams may point elsewhere")
+            serial = f"{self._serial}, {self.metadata} is from {self.format.serial}"
+            lines.append(f"the packets are from the sensor {serial}: its beam directions may differ")
         return lines
 
     def sweeps(self) -> Iterator[tuple[float, Callable[[], Sweep]]]:
@@ -278,12 +278,12 @@ def _numbers(metadata: dict[str, Any], key: str, default: Any = None) -> np.ndar
         raise FormatError(f"has no {key}: expected an Ouster sensor's metadata; save it from the sensor")
     values = np.asarray(metadata.get(key, default), dtype=np.float64)
     if not (np.abs(values) < _MAX_NUMBER).all():
-        raise FormatError(f"finite numbers in {key}", "others", "save the sensor's metadata anew")
+        raise FormatError(f"finite numbers in {key}", "others", "save the sensor's metadata again")
     return values
 
 
 def _whole(metadata: dict[str, Any], key: str, maximum: int, default: Any) -> int:
     value = int(metadata.get(key, default))
     if not 1 <= value <= maximum:
-        raise FormatError(f"{key} from 1 to {maximum}", value, "save the sensor's metadata anew")
+        raise FormatError(f"{key} from 1 to {maximum}", value, "save the sensor's metadata again")
     return value

@@ -56,7 +56,7 @@ class Capture:
         with self._open() as file:
             magic = file.read(4)
         if magic not in _MAGIC and magic != _PCAPNG:
-            raise file_error(path, "is no packet capture: expected pcap or pcapng, as tcpdump and Wireshark save it")
+            raise file_error(path, "is not a packet capture: expected pcap or pcapng, saved by tcpdump or Wireshark")
         self._read = _read_pcapng if magic == _PCAPNG else _read_pcap
 
     def _open(self) -> BinaryIO:
@@ -154,7 +154,7 @@ class PacketRecording(ABC):
     @property
     def warnings(self) -> list[str]:
         counts = {
-            "packets are captured in part only, and are left out": self.capture.num_cut,
+            "packets are captured only in part and are left out": self.capture.num_cut,
             "lidar packets of another sensor are left out": self.num_other,
         }
         return [f"{count} {problem}" for problem, count in counts.items() if count]
@@ -172,7 +172,7 @@ def _take(file: BinaryIO, size: int) -> bytes:
         raise FormatError(f"is damaged at byte {file.tell()}: a packet of {size} bytes")
     data = file.read(size)
     if len(data) < size:
-        raise FormatError("is cut off: what was captured up to there is read")
+        raise FormatError("is cut off: the part before the cut is read")
     return data
 
 
@@ -227,7 +227,7 @@ def _ticks(options: bytes, order: str) -> float:
 def _check_link(link: int) -> None:
     if link not in _LINKS:
         raise FormatError(
-            "a capture of Ethernet, Linux cooked or raw IP packets", f"link type {link}", "capture it anew"
+            "a capture of Ethernet, Linux cooked or raw IP packets", f"link type {link}", "capture it again"
         )
 
 

@@ -117,11 +117,13 @@ class BagRecording:
             raise file_error(self.name, f"{problem} {shorten(topics, 1000) or 'none'}")
         names = ", ".join(f"{key} ({count})" for key, count in clouds.items())
         if topic is not None and topic not in clouds:
-            raise file_error(self.name, f"has no point clouds in the topic {topic!r}; those with clouds are {names}")
+            raise file_error(self.name, f"has no point clouds in the topic {topic!r}; topics with clouds: {names}")
         if topic is None:
             topic = max(clouds, key=clouds.__getitem__)
             if len(clouds) > 1:
-                self._notes.append(f"read the topic {topic}, which has most clouds, of {names}: give topic for another")
+                self._notes.append(
+                    f"read the topic {topic}, which has the most clouds, of {names}: give topic to read another"
+                )
         return topic
 
     @property
@@ -132,7 +134,7 @@ class BagRecording:
     def warnings(self) -> list[str]:
         lines = list(self._notes)
         if not self._has_stamps:
-            lines.append("clouds without a time in their header: the times when they were recorded are taken")
+            lines.append("clouds without a time in their header: their recording times are used")
         if 0 < self._num_posed < self._num_frames:
             unposed_clouds = f"{self._num_frames - self._num_posed} of {self._num_frames} clouds"
             lines.append(f"{unposed_clouds} have no sensor pose in the frame {self._world}")
@@ -262,7 +264,7 @@ def decode_cloud(cloud: Any) -> tuple[np.ndarray, np.ndarray | None]:
         size = np.dtype(_DATATYPES.get(field.datatype, "f8")).itemsize
         if field.datatype not in _DATATYPES or field.offset + size > cloud.point_step:
             actual = f"datatype {field.datatype} at byte {field.offset} of {cloud.point_step}"
-            raise FormatError(f"the field {name} within a point", actual, "record it anew")
+            raise FormatError(f"the field {name} within a point", actual, "record it again")
     formats = [order + _DATATYPES[names[name].datatype] for name in field_names]
     offsets = [names[name].offset for name in field_names]
     point = np.dtype({"names": field_names, "formats": formats, "offsets": offsets, "itemsize": cloud.point_step})

@@ -38,8 +38,8 @@ def open_recording(path: Path, options: ReadingOptions) -> "VelodyneRecording":
     if PACKET_BYTES in sizes:
         return VelodyneRecording(path)
     if not sizes:
-        raise file_error(path, "has no UDP packets; expected those of an Ouster or Velodyne sensor")
-    problem = f"an Ouster recording needs its metadata {path.stem}.json beside it, or another file named (meta)"
+        raise file_error(path, "has no UDP packets; expected packets of an Ouster or Velodyne sensor")
+    problem = f"an Ouster recording needs its metadata {path.stem}.json beside it, or the path of another file (meta)"
     raise file_error(path, f"{problem} (a Velodyne's packets have {PACKET_BYTES} bytes, these have up to {max(sizes)})")
 
 
@@ -62,7 +62,7 @@ class VelodyneRecording(PacketRecording):
     @property
     def warnings(self) -> list[str]:
         counts = {
-            "packets are not of the sensor's model, and are left out": self._num_damaged,
+            "packets are not from the sensor's model and are left out": self._num_damaged,
             f"turns cannot be decoded: {self._reason}": self._num_lost,
         }
         return [f"{count} {problem}" for problem, count in counts.items() if count] + super().warnings
@@ -78,7 +78,7 @@ class VelodyneRecording(PacketRecording):
             config.model, config.calibration = self._library.hdl64e.detect_hdl64e(self.name)
         except Exception as error:
             reason = shorten(str(error))
-            problem = f"is of an HDL-64E whose calibration is not in it ({reason}); record it for longer"
+            problem = f"is from an HDL-64E, but has no calibration in it ({reason}); record it for longer"
             raise file_error(self.name, problem) from None
         return config, b""
 
