@@ -610,13 +610,13 @@ def test_other_files_are_no_scores(written, tmp_path):
     nameless["results"][0]["setting"]["dataset"] = []
     cases = [
         ({}, "'schema' is missing"),
-        ([1], "no scores.json"),
+        ([1], "not a scores.json"),
         ({"schema": "x/9"}, "x/9"),
-        (good | {"weights": good["weights"] | {"digest": -1}}, "no scores.json .*digest"),
-        (good | {"weights": good["weights"] | {"digest": float("nan")}}, "no scores.json .*digest"),
+        (good | {"weights": good["weights"] | {"digest": -1}}, "not a scores.json .*digest"),
+        (good | {"weights": good["weights"] | {"digest": float("nan")}}, "not a scores.json .*digest"),
         (nameless, "not a scores.json .*dataset is not text"),
     ]
-    for content, words in [*((json.dumps(content), words) for content, words in cases), ("a", "no s")]:
+    for content, words in [*((json.dumps(content), words) for content, words in cases), ("a", "not a scores.json")]:
         (tmp_path / "scores.json").write_text(content)
         for read in (evaluation.read_scores, evaluation.table):
             with pytest.raises(InputError, match=words):

@@ -504,7 +504,7 @@ def test_a_run_on_a_dataset_is_taken_up(datasets, tmp_path):
         (["{humanm3}", "--hold-out", "0.99"], "leaves no people for training"),
         (["{humanm3}", "--epochs", "0"], "epochs must be above 0"),
         (["{humanm3}", "--epochs", "inf"], "epochs must be a finite number"),
-        (["{humanm3}", "--recipe", "paper"], "name it by --init"),
+        (["{humanm3}", "--recipe", "paper"], "give it by --init"),
         (["{humanm3}", "--keep-anchors", "false"], "keep_anchors=false is for the paper's network"),
         (["{humanm3}", "--mix", "1"], "mix must be a share, below 1"),
         ([], "fine-tuning needs a dataset"),

@@ -261,7 +261,7 @@ def test_auroc_is_the_share_of_pairs_in_order(seed):
         (metrics.calibration_error, [np.nan], [1], {}, "confidence must hold numbers, got NaN"),
         (metrics.calibration_error, [95.0, 15.0], [1, 0], {}, "within 0 and 1, got 15 to 95"),
         (metrics.calibration_error, [0.5], [0.5], {}, "hit must be bool, or 0 and 1"),
-        (metrics.calibration_error, [0.5], [1, 0], {}, "one a confidence"),
+        (metrics.calibration_error, [0.5], [1, 0], {}, "one per confidence"),
         (metrics.calibration_error, [0.5], [1], {"bins": 0}, "bins must be a whole number"),
     ],
 )

@@ -116,7 +116,7 @@ def test_they_join_pretraining_as_a_share(monkeypatch):
     setup = make_setup(Pretrain(whole_scans=0.25, people=64))
     assert isinstance(setup.source, MixedSource) and setup.source.share == 0.25
     assert setup.source.other.load_scene is populated_scan
-    with pytest.raises(InputError, match="whole_scans are for the package's own networks: leave whole_scans or prn"):
+    with pytest.raises(InputError, match="whole_scans are for the package's own networks: omit whole_scans or prn"):
         make_setup(Pretrain(whole_scans=0.1, size="prn"))
     with pytest.raises(InputError, match="whole_scans are made during training: omit whole_scans or shards"):
         make_setup(Pretrain(whole_scans=0.1, shards=("somewhere",)))

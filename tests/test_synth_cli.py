@@ -138,7 +138,7 @@ def test_other_settings_are_refused_by_name(dataset, capsys):
     words = [*WORDS[:-2], "--seed", "6", "--hard", "0.5"]
     assert synth(dataset, *words) == 2
     line = one_line(capsys)
-    assert "hard 1.0 there, 0.5 asked for; seed 5 there, 6 asked for" in line and "count" not in line
+    assert "hard is 1.0, requested is 0.5; seed is 5, requested is 6" in line and "count" not in line
     assert content(dataset) == before
 
 

@@ -292,7 +292,7 @@ def test_the_command_trains(quick_scans, tmp_path, capsys):
     assert main(["train-detector", str(folder), "--resume", "--uses", "3"]) == 2
     assert "a run keeps its recipe" in capsys.readouterr().err
     assert main(["train-detector", str(tmp_path / "none"), "--calibrate", "5"]) == 2
-    assert "name the folder of a run" in capsys.readouterr().err
+    assert "give the folder of a run" in capsys.readouterr().err
     for words, other in (("--calibrate 3 --scenes 5", "--scenes"), ("--calibrate 3 --resume", "--resume")):
         assert main(["train-detector", str(folder), *words.split()]) == 2
         assert f"expected no other option than --scans, got {other}" in capsys.readouterr().err

@@ -72,6 +72,8 @@ def test_the_crops_are_those_that_are_verified(monkeypatch):
     shown = []
 
     class Backend:
+        batch = 64
+
         def run(self, clouds, view):
             shown.extend(clouds)
             return verification.Raw(
