@@ -141,7 +141,9 @@ class _DataUnpickler(pickle._Unpickler):
         return _Name(name, self.call)
 
     def get_extension(self, code: int) -> None:
-        raise FormatError("its pickle needs a class by a registered number that only its author's program knows: get it as npz")
+        raise FormatError(
+            "its pickle needs a class by a registered number, known to its own program alone: get it as npz"
+        )
 
     def call(self, name: str, args: tuple) -> object:
         """What the named function or class would return, or a stub if the result still needs its state."""
