@@ -201,7 +201,7 @@ def test_clips_are_chosen_and_joined():
     [
         (lambda m: m.resampled(0), "above 0, got 0"),
         (lambda m: m.resampled(np.nan), "above 0"),
-        (lambda m: motion.Motion(**{**vars(m), "fps": np.inf}), "frames a second"),
+        (lambda m: motion.Motion(**{**vars(m), "fps": np.inf}), "frames per second"),
         (lambda m: motion.Motion(**{**vars(m), "translation": m.translation[1:]}), re.escape("(21, 3)")),
         (lambda m: motion.Motion(**{**vars(m), "rotations": m.rotations * np.nan}), "finite"),
     ],

@@ -166,7 +166,7 @@ def test_rings_lag_at_one_origin_too():
     flat = replace(AV2, origin_heights=None)
     assert [share for _, share, _, _ in flat.origins] == [0.0, 1.0] and flat.lag == 0.5
     assert sum(len(rings) for _, _, _, rings in flat.origins) == flat.rows
-    with pytest.raises(InputError, match="moved must hold the vertices once more"):
+    with pytest.raises(InputError, match="moved must have the shape of the vertices"):
         scan(body.vertices, body.faces, flat, moved=np.zeros((3, 3)))
 
 

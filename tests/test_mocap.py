@@ -155,10 +155,10 @@ ROW = BVH.splitlines()[-1]
             ("3 Zrotation", "3 Wrotation", "the channel 'Wrotation'"),
             ("CHANNELS 3", "CHANNELS 4", "a count and as many names"))),
         (re.sub(r"OFFSET.*", "", BVH, count=1), "joint Hips has no OFFSET|stands where"),
-        *((changed(BVH, old, new), "stands where it cannot; expected one ROOT") for old, new in (
+        *((changed(BVH, old, new), "is in a wrong place; expected one ROOT") for old, new in (
             ("OFFSET", "OFFSETS"), ("{", ""), ("\nMOTION", "\n}\nMOTION"), ("JOINT", "ROOT"), ("CHY", "CHY\n{"))),
         (BVH.replace("LeftUpLeg", "Banana").replace("RightForeArm", "Apple"), "joint for left_hip, right_elbow among"),
-        (BVH.replace("Head", "Skulptur"), "no joint for head among Hips, .*; needed are"),
+        (BVH.replace("Head", "Skulptur"), "no joint for head among Hips, .*; expected left and right"),
         (files.bvh_text(ROTATIONS, WAY, unit=0.5), "times as tall as an adult; known units are m, cm"),
         (files.bvh_text(ROTATIONS, WAY * [100, 100, 1]), "m/s: are positions and bones in one unit"),
         (files.bvh_text(ROTATIONS, WAY * 1e9), "100 km|m/s"),
@@ -198,21 +198,22 @@ def test_bad_frames_of_a_bvh_are_left_out(tmp_path):
         (ASF, "hello world\n", "numbered frames of bones, got 'hello world'"),
         (ASF, ":FULLY-SPECIFIED\n", "no frame"), (ASF, "1\n2\n3\n", "moves no bone"),
         (ASF, AMC.replace("lfemur", "banana"), "moves banana, which s.asf does not have"),
-        (ASF, re.sub("lfemur .*", "lfemur 1 2", AMC), "lfemur has 2 numbers a frame, its skeleton 3"),
+        (ASF, re.sub("lfemur .*", "lfemur 1 2", AMC), "lfemur has 2 numbers per frame, its skeleton 3"),
         (ASF, re.sub("lfemur .*", "lfemur 1 2 x", AMC), "numbers of lfemur must be"),
         *((changed(ASF, old, new), AMC, message) for old, new, message in (
             (":bonedata", ":bones", ":bonedata is missing"), ("length 0.45", "length x", "length of :units"),
             ("length 0.45", "length 0", "length of :units must be above 0"), (" XYZ\n", " XYY\n", "order such as XYZ"),
             ("angle deg", "angle grad", "deg or rad, got 'grad'"), ("order TX", "order TW", "order of :root"),
             ("name lfemur", "name", "has no name"), ("name lfemur", "name rfemur", "rfemur twice"),
-            ("   direction", "   direktion", "lowerback has no direction"), ("dof rx", "dof l", "the freedom 'l'"),
+            ("   direction", "   direktion", "lowerback has no direction"),
+            ("dof rx", "dof l", "the degree of freedom 'l'"),
             ("  end\n:hierarchy", ":hierarchy", "stops inside a bone"),
             ("root lower", "root nobody lower", "names 'nobody'"),
-            ("root lowerback", "root", "lowerback.* hangs from nothing"))),
+            ("root lowerback", "root", "lowerback.*: no parent in :hierarchy"))),
         (ASF + "  root ltibia\n", AMC, "ltibia twice"),
         (ASF.replace("ltibia", "lshin"), AMC.replace("ltibia", "lshin"), "s.asf: has no bone ltibia among"),
         (re.sub(r"     length \S+", "     length 0", ASF), AMC, "have no length"),
-        (re.sub(r"     length (\S+)", "     length 1e300", ASF), AMC, "expected joints at finite positions"),
+        (re.sub(r"     length (\S+)", "     length 1e300", ASF), AMC, "expected finite joint positions"),
     ],
 )  # fmt: skip
 def test_a_wrong_amc_or_asf_is_named(tmp_path, asf, amc, message):
@@ -470,7 +471,7 @@ def test_what_is_no_motion_at_all(tmp_path):
     for name, content, message in (
         ("a.npz", b"", "is empty"),
         ("b.npz", b"hello", "plain arrays"),
-        ("c.fbx", b"hello", "expected a file of motion, one of .npz, .bvh"),
+        ("c.fbx", b"hello", "expected a motion file, one of .npz, .bvh"),
         ("d", b"hello", "give it the suffix of its format"),
     ):
         (tmp_path / name).write_bytes(content)
@@ -483,7 +484,7 @@ def test_what_is_no_motion_at_all(tmp_path):
         path.write_bytes(whole[: int(share * len(whole))])
         refused(path, "copied completely")
     (tmp_path / "empty").mkdir()
-    refused(tmp_path / "empty", "holds no file of motion; read are .npz, .bvh")
+    refused(tmp_path / "empty", "has no motion file; expected .npz, .bvh")
     for name in ("none.bvh", "none.json", "none"):
         refused(tmp_path / name, "no such file")
     for name, value in (("fps", 0), ("hz", -1), ("fps", float("nan")), ("up", "w")):

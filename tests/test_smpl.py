@@ -181,7 +181,7 @@ def test_a_pickle_gives_the_same_body(tmp_path, body):
 
 
 WRONG = [
-    ({"weights": None}, "no body of the SMPL family: weights missing; it has J_regressor"),
+    ({"weights": None}, "not a body model of the SMPL family: weights missing; it has J_regressor"),
     ({"v_template": np.zeros((5, 2))}, r"needs v_template \(V, 3\), .* got \(5, 2\)"),
     ({"v_template": np.full((1206, 3), np.nan)}, "v_template has values that are not finite"),
     ({"weights": np.zeros((5, 24))}, r"weights must be \(\d+, 24\) .* got \(5, 24\)"),
@@ -195,7 +195,7 @@ WRONG = [
         ({"kintree_table": tree + np.zeros((2, 24))}, "must begin with SMPL's joints")
         for tree in (0, 0.5, [np.arange(24) - 1, np.arange(24)])
     ),
-    *(({"f": np.array([[0, 1, bad]])}, "f must be whole numbers of vertices, 0 to") for bad in (10**6, -1)),
+    *(({"f": np.array([[0, 1, bad]])}, "f must be indices of vertices, 0 to") for bad in (10**6, -1)),
     ({"f": np.zeros((0, 3))}, r"f must be \(F, 3\)"),
 ]
 
@@ -228,7 +228,7 @@ def test_weights_sizes_and_files_must_be_a_person_s(tmp_path):
     for name, message in (
         *((f"{name}.npz", "sum to 1") for name in ("double", "less", "zero")),
         ("headless.npz", "no vertex .* head"), ("centimeters.npz", "expected meters"),
-        ("none.npz", "no such file"), ("array.npy", "expected a body of the SMPL family"),
+        ("none.npz", "no such file"), ("array.npy", "expected a body model of the SMPL family"),
         *((f"{name}.npz", "plain arrays") for name in ("broken", "objects")),
         ("list.pkl", "a dict of SMPL's arrays, got list"),
     ):  # fmt: skip
@@ -307,5 +307,5 @@ def test_motion_without_shapes_leaves_them_to_chance(tmp_path):
     assert load_betas(tmp_path / "motion.npz").shape == (0, 10)
     rig = smpl_rig(tmp_path / "body.npz", tmp_path / "motion.npz")
     assert rig.coefficients.shape == (256, 10) and 0.7 < rig.coefficients.std() < 1.1
-    with pytest.raises(InputError, match="expected a body of the SMPL family, .npz or .pkl"):
+    with pytest.raises(InputError, match="expected a body model of the SMPL family, .npz or .pkl"):
         SynthesisJob(what="people", count=4, body=str(tmp_path / "body.txt")).generator()

@@ -268,11 +268,13 @@ def load_body(path: str | os.PathLike) -> SmplBody:
             raise file_error(path, f"expected a dict of SMPL's arrays, got {type(arrays).__name__}")
         names = sorted(map(str, arrays))
     else:
-        raise file_error(path, "expected a body of the SMPL family, .npz or .pkl")
+        raise file_error(path, "expected a body model of the SMPL family, .npz or .pkl")
     missing_keys = [key for key in _KEYS if key not in arrays]
     if missing_keys:
         name_list = ", ".join(names[:12]) or "nothing"
-        raise file_error(path, f"is no body of the SMPL family: {', '.join(missing_keys)} missing; it has {name_list}")
+        raise file_error(
+            path, f"is not a body model of the SMPL family: {', '.join(missing_keys)} missing; it has {name_list}"
+        )
     return _body(path, arrays)
 
 
@@ -300,7 +302,7 @@ def _body(path: object, content: Mapping) -> SmplBody:
             )
     parents = _parents(path, tree)
     if (faces != np.round(faces)).any() or faces.min() < 0 or faces.max() >= vertex_count:
-        raise file_error(path, f"f must be whole numbers of vertices, 0 to {vertex_count - 1}")
+        raise file_error(path, f"f must be indices of vertices, 0 to {vertex_count - 1}")
     for key, rows in (("weights", weights), ("J_regressor", regressor)):
         if np.abs(rows.sum(1) - 1).max() > _SUM_TOLERANCE:
             raise file_error(path, f"the rows of {key} must sum to 1; was the file changed?")
@@ -328,10 +330,10 @@ def _body(path: object, content: Mapping) -> SmplBody:
 def _numbers(path: object, key: str, value: object) -> np.ndarray:
     """A C-contiguous float64 copy of a numeric array; a copy, so that the caller's array stays writable."""
     if isinstance(value, Unread):
-        raise file_error(path, f"{key} is a {value.name} that holds no numbers: ask for npz")
+        raise file_error(path, f"{key} is a {value.name} that holds no numbers: get the model as npz")
     # nested lists are refused: lists that repeat references to one list could expand without bound
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
-        raise file_error(path, f"{key} must be an array of numbers, got {type(value).__name__}: ask for npz")
+        raise file_error(path, f"{key} must be an array of numbers, got {type(value).__name__}: get the model as npz")
     array = value.astype(float, order="C")
     if not np.isfinite(array).all():
         raise file_error(path, f"{key} has values that are not finite; was the file copied completely?")

@@ -199,12 +199,12 @@ def load_sensor(path: str | Path) -> Sensor:
     fields = _from_json(path, text) if path.suffix.lower() == ".json" else _from_csv(path, text)
     elevations = _angles(path, "elevations", fields.pop("elevations"))
     if not len(elevations):
-        raise file_error(path, "holds no elevations; expected one a laser, in degrees")
+        raise file_error(path, "has no elevations; expected one per laser, in degrees")
     if np.abs(elevations).max() >= 90:
         raise file_error(path, f"elevations must be within +-90 degrees, got {np.abs(elevations).max():g}")
     # more than three lasers within less than 2.3 degrees are assumed to be in radians
     if len(elevations) > 3 and np.ptp(elevations) < 2.3 and np.abs(elevations).max() < 1.6:
-        raise file_error(path, f"elevations reach over {np.ptp(elevations):g}: they seem to be radians, give degrees")
+        raise file_error(path, f"elevations span {np.ptp(elevations):g}: they seem to be in radians, give degrees")
     order = np.argsort(elevations, kind="stable")
     offsets, clockwise = fields.pop("offsets", None), fields.pop("clockwise", False)
     if offsets is not None:
@@ -214,7 +214,7 @@ def load_sensor(path: str | Path) -> Sensor:
         offsets = np.radians(-offsets[order] if clockwise else offsets[order])
     columns = fields.pop("columns", _COLUMNS)
     if isinstance(columns, bool) or not isinstance(columns, int) or not 1 <= columns <= 100_000:
-        raise file_error(path, f"columns must be a whole number of columns a turn, got {columns!r}")
+        raise file_error(path, f"columns must be a whole number of columns per turn, got {columns!r}")
     try:
         return Sensor(
             name=str(fields.pop("name", path.stem)),
@@ -256,7 +256,7 @@ def _from_json(path: Path, text: str) -> dict:
     sections = [section for section in sections if isinstance(section, dict)]
     beams = next((section for section in sections if "beam_altitude_angles" in section), None)
     if beams is None:
-        raise file_error(path, "holds no beams; expected beam_altitude_angles, elevations_deg or a list of degrees")
+        raise file_error(path, "has no beams; expected beam_altitude_angles, elevations_deg or a list of degrees")
     modes = [str(section[key]) for key in ("lidar_mode", "columns_per_frame") for section in sections if key in section]
     # 1024x10, MODE_1024x10, or only the number of columns
     columns = [int(match[1]) for mode in modes if (match := re.search("([0-9]{3,5})(x|$)", mode))]
@@ -301,7 +301,7 @@ def _from_csv(path: Path, text: str) -> dict:
         raise file_error(path, f"is not CSV ({error})") from None
     rows = [row for row in rows if not row[0].startswith("#")]
     if not rows:
-        raise file_error(path, "holds no rows; expected one a laser")
+        raise file_error(path, "has no rows; expected one per laser")
     header = [cell.lower() for cell in rows[0]]
     elevation_column, offset_column, offset_name = 0, None, None
     if any(cell and not _is_number(cell) for cell in header):

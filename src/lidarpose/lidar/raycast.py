@@ -389,15 +389,15 @@ def _as_moved(moved: Any, vertices: np.ndarray) -> np.ndarray:
     """A copy (V, 3) float64 of `moved`, the new positions of `vertices` (V, 3)."""
     moved = _as_points("moved", moved)
     if moved.shape != vertices.shape:
-        raise InputError(f"moved must hold the vertices once more, {vertices.shape}, got {moved.shape}")
+        raise InputError(f"moved must have the shape of the vertices, {vertices.shape}, got {moved.shape}")
     return moved
 
 
 def _as_times(time: np.ndarray, count: int) -> np.ndarray:
     """A copy (count,) float64 in [0, 1]."""
-    time = _as_floats("time", time, f"({count},) numbers, one a ray")
+    time = _as_floats("time", time, f"({count},) numbers, one per ray")
     if time.shape != (count,):
-        raise InputError(f"time must be ({count},), one a ray, got {time.shape}")
+        raise InputError(f"time must be ({count},), one per ray, got {time.shape}")
     outside_indices = np.flatnonzero(~((time >= 0) & (time <= 1)))
     if len(outside_indices):
         raise InputError(

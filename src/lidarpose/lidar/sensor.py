@@ -71,14 +71,14 @@ class Sensor:
         kinds = (
             ("azimuth_offsets", _ANGLES),
             ("origin_heights", "heights in meters"),
-            ("ring_lags", "shares of a turn"),
+            ("ring_lags", "fractions of a turn"),
         )
         for name, kind in kinds:
             if getattr(self, name) is None:
                 continue
             values = _frozen(name, getattr(self, name), kind)
             if values.shape != elevations.shape:
-                raise InputError(f"Sensor.{name} must be {elevations.shape}, one a ring, got {values.shape}")
+                raise InputError(f"Sensor.{name} must be {elevations.shape}, one per ring, got {values.shape}")
             object.__setattr__(self, name, values)
         if self.ring_lags is not None and not 0 <= self.ring_lags.min() <= self.ring_lags.max() < 1:
             raise InputError(
@@ -91,7 +91,7 @@ class Sensor:
         column_count = 2 * np.pi / self.azimuth_step if self.azimuth_step > 0 else 0
         if column_count < 1 or abs(column_count - round(column_count)) > 1e-3:
             raise InputError(
-                f"Sensor.azimuth_step must divide 2 pi, got {self.azimuth_step} rad, {column_count:.4f} a turn"
+                f"Sensor.azimuth_step must divide 2 pi, got {self.azimuth_step} rad, {column_count:.4f} per turn"
             )
         check_limits(self)
 

@@ -68,15 +68,15 @@ def load_motion(
         check_name("up axis", up, UP_AXES)
     for name, rate in (("fps", fps), ("hz", hz)):
         if rate is not None and not 0 < rate < float("inf"):
-            raise file_error(path, f"{name} must be frames a second, above 0, got {rate}")
+            raise file_error(path, f"{name} must be frames per second, above 0, got {rate}")
     try:
         path = Path(path)
         whole_folder = path.is_dir()
     except (TypeError, ValueError) as error:
-        raise file_error(repr(path), f"expected the path of a file or folder of motion ({error})") from None
+        raise file_error(repr(path), f"expected the path of a motion file or folder ({error})") from None
     sources = _sources(path) if whole_folder else [path]
     if not sources:
-        raise file_error(path, f"holds no file of motion; read are {', '.join(FORMATS)} in it or its folders")
+        raise file_error(path, f"has no motion file; expected {', '.join(FORMATS)} in it or its folders")
     motions = []
     for source in sources:
         motion = _loader(source)(source, up=up, fps=fps)
@@ -88,7 +88,7 @@ def load_motion(
 def _loader(path: Path) -> Callable[..., Motion]:
     suffix = ".json" if path.is_dir() else path.suffix.lower()
     if suffix not in FORMATS:
-        expected = f"a file of motion, one of {', '.join(FORMATS)}, or a folder of them"
+        expected = f"a motion file, one of {', '.join(FORMATS)}, or a folder of them"
         # raises its own error if there is no such file
         read_bytes(path, expected=expected)
         raise file_error(path, f"expected {expected}: convert it, or give it the suffix of its format")

@@ -177,7 +177,7 @@ def match_joints(path: object, names: Sequence[str], parents: Sequence[int]) -> 
         name_list = ", ".join(n for n in names if not n.endswith(END))
         raise file_error(
             path,
-            f"has no joint for {', '.join(missing_joints)} among {name_list or 'no joints'}; needed are left and right "
+            f"has no joint for {', '.join(missing_joints)} among {name_list or 'no joints'}; expected left and right "
             "hip/UpLeg, knee/Leg, ankle/Foot, shoulder/Arm, elbow/ForeArm, wrist/Hand, and Head",
         )
     return indices

@@ -55,7 +55,7 @@ class Motion:
             if not np.isfinite(array).all():
                 raise InputError(f"{name} must be finite; drop the frames that are not")
         if not 0 < self.fps < np.inf:
-            raise InputError(f"fps must be frames a second, above 0, got {self.fps}")
+            raise InputError(f"fps must be frames per second, above 0, got {self.fps}")
 
     def __len__(self) -> int:
         return len(self.names)
@@ -87,7 +87,7 @@ class Motion:
         """The same clips with `hz` frames per second. A clip keeps its first frame and loses less than one new frame at
         its end. Rotations are interpolated along the shortest arc, the pelvis linearly."""
         if not 0 < hz < np.inf:
-            raise InputError(f"hz must be frames a second, above 0, got {hz}")
+            raise InputError(f"hz must be frames per second, above 0, got {hz}")
         if hz == self.fps:
             return self
         # the 1e-6 keeps the last frame despite rounding errors, as from 30 to 10 frames per second
@@ -198,7 +198,7 @@ def load_clips(path: str | PathLike) -> tuple[np.ndarray, tuple[str, ...], np.nd
     for key, value in (("clip_start", start), ("clip_length", length)):
         if value.shape != (clip.size,) or value.dtype.kind not in "iu":
             raise file_error(
-                path, f"{key} needs one whole number a clip, ({clip.size}), got {value.dtype} {value.shape}"
+                path, f"{key} needs one whole number per clip, ({clip.size}), got {value.dtype} {value.shape}"
             )
     # start + length could overflow in narrow or unsigned types
     start, length = start.astype(np.int64), length.astype(np.int64)
@@ -212,7 +212,7 @@ def load_clips(path: str | PathLike) -> tuple[np.ndarray, tuple[str, ...], np.nd
         raise file_error(path, "joints must be finite; drop the frames that are not")
     rate = float(fps.item())
     if not 0 < rate < np.inf:
-        raise file_error(path, f"fps must be frames a second, above 0, got {rate}")
+        raise file_error(path, f"fps must be frames per second, above 0, got {rate}")
     return joints, tuple(map(str, np.ravel(clip))), length, rate
 
 
@@ -264,7 +264,7 @@ def usable_clips(
         for k, piece in enumerate(np.diff([0, *gaps, count - bad_count]) if count else ()):
             pieces.append((name if k == 0 else f"{name}#{k + 1}", int(piece)))
     if not pieces:
-        raise file_error(path, "holds no frame of motion")
+        raise file_error(path, "has no frames of motion")
     piece_names, counts = zip(*pieces, strict=True)
     return {"names": piece_names, "length": np.array(counts), "fps": float(fps), "dropped": int((~good).sum())}
 

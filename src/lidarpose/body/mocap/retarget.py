@@ -79,7 +79,7 @@ def motion_from_joints(
     """
     is_usable = np.isfinite(joints).all((1, 2))
     if not is_usable.any():
-        raise file_error(path, "expected joints at finite positions, got no frame with any")
+        raise file_error(path, "expected finite joint positions, got none in any frame")
     with np.errstate(over="ignore", invalid="ignore"):
         joints = joints * meters_per_unit(path, joints[is_usable], unit_m)
     if not np.abs(joints[is_usable]).max() < _FARTHEST:
@@ -114,7 +114,7 @@ def meters_per_unit(path: object, joints: np.ndarray, unit_m: float | None = Non
     if not _SMALLEST < ratio * scale < _LARGEST:
         remedy = f"known units are {', '.join(UNITS)}: scale the skeleton to one of them"
         if unit_m:
-            remedy = f"a number is taken for {unit_m:.4g} m: scale the recording to that"
+            remedy = f"a number is read as {unit_m:.4g} m: scale the recording to that"
         raise file_error(path, f"the person is {ratio * scale:.3g} times as tall as an adult; {remedy}")
     return scale
 

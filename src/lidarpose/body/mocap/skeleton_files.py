@@ -124,7 +124,7 @@ def _bvh_joints(path: object, lines: list[str]) -> list[Joint]:
             joint.channels = _bvh_channels(path, joint.name, words)
         else:
             expected = "one ROOT, and in its braces OFFSET, CHANNELS, JOINT and End Site"
-            raise file_error(path, f"{line[:60]!r} stands where it cannot; expected {expected}")
+            raise file_error(path, f"{line[:60]!r} is in a wrong place; expected {expected}")
     if open_joints or awaits_brace or not joints:
         raise file_error(path, "the HIERARCHY is not complete; was the file copied completely?")
     return joints
@@ -136,7 +136,7 @@ def _bvh_channels(path: object, name: str, words: list[str]) -> list[str]:
     unknown_channels = [word for word in words[1:] if word.lower() not in _BVH_CHANNELS]
     if unknown_channels:
         raise file_error(
-            path, f"{name} has the channel {unknown_channels[0]!r}; known are Xposition, Zrotation and the like"
+            path, f"{name} has the channel {unknown_channels[0]!r}; expected Xposition, Zrotation or similar"
         )
     return [_BVH_CHANNELS[word.lower()] for word in words[1:]]
 
@@ -173,7 +173,7 @@ def read_amc(path: str | os.PathLike) -> tuple[JointTree, np.ndarray, float]:
     unknown_bones = sorted(values.keys() - set(tree.names))
     if unknown_bones:
         raise file_error(
-            path, f"moves {', '.join(unknown_bones)[:80]}, which {skeleton.name} does not have; is it this one?"
+            path, f"moves {', '.join(unknown_bones)[:80]}, which {skeleton.name} does not have; is this its skeleton?"
         )
     missing_bones = [bone for joint, bone in _BONES.items() if bone not in tree.names and joint not in _OPTIONAL]
     if missing_bones:
@@ -183,7 +183,9 @@ def read_amc(path: str | os.PathLike) -> tuple[JointTree, np.ndarray, float]:
             joint.channels = ()
         elif values[joint.name].shape[1] != len(joint.channels):
             numbers, freedoms = values[joint.name].shape[1], len(joint.channels)
-            raise file_error(path, f"{joint.name} has {numbers} numbers a frame, its skeleton {freedoms} freedoms")
+            raise file_error(
+                path, f"{joint.name} has {numbers} numbers per frame, its skeleton {freedoms} degrees of freedom"
+            )
     return tree, np.concatenate([values[name] for name in tree.names if name in values], 1), unit_m
 
 
@@ -275,7 +277,8 @@ def _bone(path: Path, name: str, properties: dict[str, list[str]], degrees: bool
     unknown_channels = [word for word in channels if word not in _ASF_CHANNELS]
     if unknown_channels:
         raise file_error(
-            path, f"bone {name} has the freedom {unknown_channels[0][:40]!r}; known are {', '.join(_ASF_CHANNELS)}"
+            path,
+            f"bone {name} has the degree of freedom {unknown_channels[0][:40]!r}; known are {', '.join(_ASF_CHANNELS)}",
         )
     with np.errstate(over="ignore"):
         norm = np.linalg.norm(direction)
@@ -317,7 +320,7 @@ def _in_tree_order(path: Path, lines: list[list[str]], bones: dict[str, Joint]) 
         order += children
     orphan_bones = [name for name in bones if name not in order]
     if orphan_bones:
-        raise file_error(path, f"{', '.join(orphan_bones)[:80]} hangs from nothing in :hierarchy")
+        raise file_error(path, f"{', '.join(orphan_bones)[:80]}: no parent in :hierarchy")
     return [bones[name] for name in order]
 
 
@@ -334,7 +337,7 @@ def _amc_frames(path: Path) -> dict[str, np.ndarray]:
         else:
             frames[-1][words[0]] = words[1:]
     if not frames or not frames[0]:
-        raise file_error(path, "holds no frame of motion, or one that moves no bone")
+        raise file_error(path, "has no frames, or a first frame that moves no bone")
     lengths = {name: len(words) for name, words in frames[0].items()}
     for k, frame in enumerate(frames, 1):
         if {name: len(words) for name, words in frame.items()} != lengths:

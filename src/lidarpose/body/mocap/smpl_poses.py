@@ -90,7 +90,7 @@ def motion_from_smpl(
         max_angle, max_distance = np.linalg.norm(pose, axis=-1).max(), np.linalg.norm(trans, axis=-1).max()
     if max_angle > _MOST_TURN:
         raise file_error(
-            path, f"pose has a turn of {max_angle:.4g} rad; {kind} has axis-angles in radians, not degrees"
+            path, f"pose has a rotation of {max_angle:.4g} rad; {kind} has axis-angles in radians, not degrees"
         )
     if max_distance > _FARTHEST:
         raise file_error(path, f"trans is {max_distance:.4g} m from the origin; expected meters")
