@@ -49,14 +49,14 @@ def random_rotations(seed, n, spread=0.6):
 
 
 def posed(rig, rest, **flexed):
-    """`rest` with named joints turned: joint=(axis, degrees)."""
+    """`rest` with named joints rotated: joint=(axis, degrees)."""
     rotations = np.broadcast_to(np.eye(3), (len(rest.vertices), 24, 3, 3)).copy()
     for joint, (axis, degrees) in flexed.items():
         rotations[:, SMPL24.index(joint)] = rotation_about(axis, np.radians(degrees))
     return pose_bodies(rig, rest, rotations, np.zeros((len(rotations), 3)))
 
 
-def test_asset_is_small_and_arrays_are_read_only(rig):
+def test_body_asset_is_small_and_read_only(rig):
     assert len(resources.files("lidarpose.body").joinpath("assets/body.npz").read_bytes()) <= 400_000
     assert load_rig() is rig
     with pytest.raises(ValueError, match="read-only"):
