@@ -54,7 +54,7 @@ def test_street_frames_are_full_turns_of_sensor(scenes):
             np.testing.assert_allclose(elevation, device.elevations[frame.ring], atol=2e-4)
         frame = scene.frames[0]
         assert frame.points[:, 2].min() == pytest.approx(-scene.height, abs=0.12)
-        # people stand on the road or on a kerb
+        # people stand on the road or on a curb
         bottoms = np.array([box.center[2] - box.size[2] / 2 + 0.05 + scene.height for box in frame.boxes])
         assert ((bottoms > -0.02) & (bottoms < 0.18)).all()
 
@@ -93,7 +93,7 @@ def test_people_keep_distance_and_walk_smoothly(scenes):
 def test_street_has_requested_number_of_people():
     counts = {len(street(2, index, people=(1, 3), sensor="vlp-16").frames[0].boxes) for index in range(8)}
     assert counts <= {1, 2, 3} and len(counts) > 1
-    # people who walk for a long time may leave the pavement
+    # people who walk for a long time may leave the sidewalk
     frames = street(4, 0, people=(2, 2), frames=60, sensor="vlp-16").frames
     assert len(frames) == 60 and len(frames[0].boxes) == 2
 
