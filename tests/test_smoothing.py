@@ -1,4 +1,4 @@
-"""Poses steady over a track: the smoother, the live filter, and clips of one person."""
+"""Smoothing of poses over time: the smoother, the live filter, and clips of one person."""
 
 import json
 from dataclasses import replace
@@ -30,7 +30,7 @@ def rest_pose(skeleton):
 
 @pytest.fixture(scope="module")
 def walker():
-    """(skeleton, seed) -> true joints of somebody who walks in a curve, and a track of noisy poses of them."""
+    """Function that returns true joints of a person who walks along a curve, and a track of noisy poses."""
 
     def made(skeleton=SMPL24, frames=40, noise=0.05, seed=0):
         rng = np.random.default_rng(seed)
@@ -50,7 +50,7 @@ def walker():
 
 @pytest.fixture(scope="module")
 def people_in_motion():
-    """True joints and noisy tracks of 40 synthesized clips, half of whose error all frames of a clip have in common."""
+    """True joints and noisy tracks of 40 synthesized clips; half of the error is the same in all frames of a clip."""
     from lidarpose.synth.generator import Generator
 
     generator, rng, clips = Generator(scene="wild", measure=False), np.random.default_rng(3), []
@@ -64,8 +64,8 @@ def people_in_motion():
     return clips
 
 
-def test_paths_are_those_of_one_dense_solve(walker):
-    """The filter forth and back finds the least squares' solution, whatever the steps."""
+def test_smooth_joints_matches_dense_solve(walker):
+    """Forward-backward filtering gives the least-squares solution for any time steps."""
     from reference.smoothing_reference import smooth_joints_reference
 
     rng = np.random.default_rng(1)
@@ -88,7 +88,7 @@ def error(joints, true):
 
 
 @pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=SKELETONS)
-def test_steady_is_nearer_and_smoother(walker, skeleton):
+def test_smoothing_reduces_error_and_jitter(walker, skeleton):
     true, track = walker(skeleton)
     before, steady = error(track.joints, true), error(smooth(track).joints, true)
     assert steady[0] < 0.7 * before[0] and steady[1] < 0.15 * before[1]
@@ -97,8 +97,8 @@ def test_steady_is_nearer_and_smoother(walker, skeleton):
 
 
 @pytest.mark.parametrize("speed", [10.0, -25.0])
-def test_a_sensor_that_moves(walker, speed):
-    """In coordinates that drive along and brake, steady poses are still where the person is."""
+def test_smoothing_works_for_moving_sensor(walker, speed):
+    """In the coordinates of a sensor that drives and brakes, smoothed poses are still at the person."""
     true, track = walker()
     way = np.outer(speed * track.times - 0.5 * np.sign(speed) * 2.5 * track.times**2, [1, 0, 0])[:, None]
     moved = replace(track, joints=track.joints + way)
@@ -110,7 +110,7 @@ def test_a_sensor_that_moves(walker, speed):
 
 
 @pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=SKELETONS)
-def test_frames_turned_round_are_turned_back(walker, skeleton):
+def test_smoothing_corrects_left_right_swaps(walker, skeleton):
     true, track = walker(skeleton)
     joints, spread, confidence = track.joints.copy(), track.spread.copy(), track.confidence.copy()
     turned = [3, 4, 5, 12, 20, 21, 22, 23, 24, 39]
@@ -122,7 +122,7 @@ def test_frames_turned_round_are_turned_back(walker, skeleton):
 
 
 @pytest.mark.parametrize("gap", [1.0, 3600.0])
-def test_people_may_turn_about_in_a_gap(gap):
+def test_smoothing_allows_turn_within_gap(gap):
     rng, standing = np.random.default_rng(0), rest_pose(SMPL24)
     facing = np.array([1.0] * 8 + [-1.0] * 4)
     times = np.concatenate([np.arange(8) / 10, 0.7 + gap + np.arange(4) / 10])
@@ -132,7 +132,7 @@ def test_people_may_turn_about_in_a_gap(gap):
     assert np.linalg.norm(smooth(track).joints - true, axis=-1).mean() < 0.03
 
 
-def test_somebody_who_hops_is_not_held_still():
+def test_smoothing_follows_hopping_person():
     rng, times = np.random.default_rng(0), np.arange(60) / 10
     true = rest_pose(SMPL24) + np.stack([0 * times, 0 * times, 0.1 * np.sin(2 * np.pi * 1.5 * times)], 1)[:, None]
     joints = true + rng.normal(0, 0.03 / 1.6, true.shape)
@@ -142,7 +142,7 @@ def test_somebody_who_hops_is_not_held_still():
 
 
 @pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=SKELETONS)
-def test_bones_keep_their_length(walker, skeleton):
+def test_smoothing_keeps_bone_lengths(walker, skeleton):
     true, track = walker(skeleton)
     bones = rigid_bones(skeleton)
     names = {tuple(skeleton.joints[end] for end in bone) for bone in bones}
@@ -152,17 +152,17 @@ def test_bones_keep_their_length(walker, skeleton):
     assert np.abs(lengths - lengths.mean(0)).max() < 0.005 and np.abs(lengths - exact).mean() < 0.02
 
 
-def test_unseen_frames_are_filled_and_say_so(walker):
+def test_smoothing_fills_and_marks_unseen_frames(walker):
     true, track = walker(frames=60)
     joints = track.joints.copy()
-    # 0.8 s, 2.9 s, and the end
+    # gaps of 0.8 s, 2.9 s, and at the end
     for gap in (slice(5, 13), slice(20, 49), slice(54, 60)):
         joints[gap] = np.nan
     given = TrackPoses(
         times=track.times, joints=joints, spread=track.spread, visible=track.visible, skeleton=track.skeleton
     )
     steady = smooth(given)
-    # the long gap only half a second from its ends
+    # the long gap is filled only within half a second of its ends
     far = [25 <= i < 44 or i == 59 for i in range(60)]
     assert [pose is None for pose in steady.poses()] == far
     assert steady.filled.tolist() == [bool(np.isnan(joints[i]).any()) and not far[i] for i in range(60)]
@@ -176,8 +176,8 @@ def test_unseen_frames_are_filled_and_say_so(walker):
 
 @pytest.mark.long
 @pytest.mark.parametrize("gap", [4, 8, 12])
-def test_filled_joints_are_as_far_off_as_their_spread_says(people_in_motion, gap):
-    """By the number of frames to the nearest one that was seen; a hand that moves fast must not be said to be near."""
+def test_spread_of_filled_joints_matches_error(people_in_motion, gap):
+    """Grouped by the number of frames to the nearest seen frame. Spread must be large enough for fast hands, too."""
     first = (16 - gap) // 2
     spread, error = ([[] for _ in range(gap // 2)] for _ in range(2))
     for true, track in people_in_motion:
@@ -191,11 +191,11 @@ def test_filled_joints_are_as_far_off_as_their_spread_says(people_in_motion, gap
             error[min(k, gap - 1 - k)].append(off[first + k])
     for stated, actual in zip(spread, error, strict=True):
         assert 0.95 < np.mean(stated) / np.mean(actual) < 1.4
-        # not on the mean alone
+        # also for single joints, not only on average
         assert 0.5 < (np.array(actual) < np.array(stated)).mean() < 0.9
 
 
-def test_the_past_alone_and_a_state_that_goes_on(walker):
+def test_live_filter_resumes_from_state(walker):
     _, track = walker()
     whole, poses = filter_track(track), track.poses()
     begun = LiveFilter(track.skeleton)
@@ -206,19 +206,19 @@ def test_the_past_alone_and_a_state_that_goes_on(walker):
         np.testing.assert_array_equal(again.update(track.times[t], poses[t]).joints, whole[t].joints)
 
 
-def test_tracks_without_or_with_one_frame(walker):
+def test_smoothing_of_one_and_of_no_pose(walker):
     _, track = walker(frames=1)
     assert np.abs(smooth(track).joints - track.joints).max() < 1e-3
     nobody = TrackPoses.of_poses(np.arange(3.0), [None] * 3, SMPL24)
     assert smooth(nobody).poses() == filter_track(nobody) == [None] * 3
 
 
-def test_times_must_increase():
+def test_track_poses_rejects_times_that_do_not_increase():
     with pytest.raises(InputError, match="later than the one before"):
         TrackPoses.of_poses(np.array([0.0, 0.0]), [None, None], SMPL24)
 
 
-# ---- of clouds
+# ---- clips of clouds
 
 
 @pytest.fixture(scope="module")
@@ -229,7 +229,7 @@ def clouds():
     return [person.sample.points for person in people]
 
 
-def test_a_clip_of_clouds(clouds):
+def test_predict_clip_smooths_poses_of_clouds(clouds):
     model = load("tiny", tta=1)
     given = [*clouds[:4], np.zeros((0, 3)), *clouds[5:]]
     steady = model.predict_clip(given, sensor_origin=(0, 0, 0), skeleton="human15")
@@ -240,7 +240,7 @@ def test_a_clip_of_clouds(clouds):
     assert not np.allclose(steady[3].joints, each[3].joints)
     first = model.predict_clip(given[:3], sensor_origin=(0, 0, 0), live=True)
     same = model.predict_clip(given, sensor_origin=(0, 0, 0), live=True)
-    # looked at as a whole the track is smoothed, live it is filtered, by the times that are given
+    # the track is smoothed, or filtered if live, with the given times
     own = [person.pose for person in each]
     for seconds in (None, np.cumsum([0.0, 0.1, 0.4, 0.1, 0.1, 0.3, 0.1, 0.1])):
         times = np.arange(8) / 10 if seconds is None else seconds
@@ -250,13 +250,13 @@ def test_a_clip_of_clouds(clouds):
             np.testing.assert_allclose(clip.to_numpy(), [pose.joints for pose in wanted], atol=1e-5)
     with pytest.raises(InputError, match="times: expected 8 finite numbers"):
         model.predict_clip(given, np.zeros(8), sensor_origin=(0, 0, 0))
-    # what comes later changes nothing but the rounding of a batch of another size
+    # later clouds change only the rounding, because of another batch size
     np.testing.assert_allclose(first.to_numpy(), same.to_numpy()[:3], rtol=0, atol=1e-6)
     assert len(model.predict_clip([])) == 0
 
 
 @pytest.mark.parametrize("live", [False, True])
-def test_a_clip_says_of_each_frame_whether_a_person_is_there(clouds, live):
+def test_predict_clip_keeps_person_probabilities(clouds, live):
     model = load("small")
     given = [*clouds[:3], np.zeros((0, 3)), *clouds[4:6]]
     each = model.predict(given, sensor_origin=(0, 0, 0))
@@ -266,7 +266,7 @@ def test_a_clip_says_of_each_frame_whether_a_person_is_there(clouds, live):
         assert (person.person is None) == (k == 3) and person.has_pose
 
 
-def test_times_that_are_none():
+def test_clip_times_defaults_and_rejects_invalid_times():
     assert clip_times(None, 3).tolist() == [0, 0.1, 0.2] and clip_times((0, 0.5, 7), 3).tolist() == [0, 0.5, 7]
     dates = [np.arange(3).astype(kind) for kind in ("M8[ms]", "m8[s]")]
     dates.append(pandas.Series(pandas.date_range("2024", periods=3, tz="UTC")))
@@ -275,7 +275,7 @@ def test_times_that_are_none():
             clip_times(times, 3)
 
 
-def test_a_gap_of_days_parts_what_is_made_steady(walker):
+def test_smoothing_splits_track_at_long_gap(walker):
     _, track = walker(frames=24)
     later = replace(track, times=track.times + np.where(np.arange(24) < 12, 0, 86_400.0))
     halves = [
@@ -283,7 +283,7 @@ def test_a_gap_of_days_parts_what_is_made_steady(walker):
         for rows in (slice(12), slice(12, 24))
     ]
     apart = np.concatenate([half.joints for half in halves])
-    # bones are measured in all frames
+    # bone lengths are estimated from all frames
     assert np.abs(smooth(later).joints - apart).max() < 0.06
     minute = replace(track, times=track.times + np.where(np.arange(24) < 12, 0, 60.0))
     np.testing.assert_allclose(smooth(later).joints, smooth(minute).joints, atol=1e-3)

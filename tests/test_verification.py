@@ -1,4 +1,4 @@
-"""Boxes of people who were found, by their poses."""
+"""Boxes of detected people, from their poses."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ STANDING = {
 
 
 def standing(yaw, place):
-    """Somebody who faces `yaw` rad at place (3,) m."""
+    """Pose of a standing person with heading `yaw` rad at place (3,) m."""
     joints = []
     for name in HUMAN15.joints:
         side, _, part = name.partition("_")
@@ -27,13 +27,13 @@ def standing(yaw, place):
 
 
 @pytest.mark.parametrize("yaw", [-3.0, -1.2, 0.0, 0.4, 2.5])
-def test_a_box_is_about_a_pose_and_faces_as_it_does(yaw):
+def test_box_about_encloses_pose_and_has_its_heading(yaw):
     place = np.array([7.0, -3.0, -1.7])
     pose = standing(yaw, place)
     box = box_about(pose, np.inf)
     assert abs(np.angle(np.exp(1j * (box.yaw - yaw)))) < 1e-3
-    # from 0.15 m around the joints: (deep, wide, tall)
+    # 0.15 m of margin around the joints: (depth, width, height)
     np.testing.assert_allclose(box.size, [0.1 + 0.3, 0.64 + 0.3, 1.52 + 0.3], atol=1e-3)
     assert box.contains(pose.joints).all() and box.center[2] == pytest.approx(-1.7 + 0.84 + 0.03, abs=1e-3)
-    # beside somebody the box is narrower
+    # the box is narrower next to another person
     np.testing.assert_allclose(box_about(pose, 0.6).size[:2], box.size[:2] - 0.1, atol=1e-3)
