@@ -275,11 +275,13 @@ def test_chunks_do_not_depend_on_start_and_workers(whole, monkeypatch):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_workers_ignore_stop_signals(whole, number):
     """The run needs them for the batches that it finishes before saving."""
-    made = []
+    made, signaled = [], 0
     for batches in chunks(RECIPE, 1):
         for worker in multiprocessing.active_children():
             os.kill(worker.pid, number)
+            signaled += 1
         made.append(batches)
+    assert signaled
     assert_same_chunks(made, whole)
 
 

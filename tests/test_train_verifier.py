@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import KDTree
 from training_runs import refused, train_until_killed
 
 from lidarpose.cli import main
@@ -90,7 +91,12 @@ def test_scan_crops_match_crops_of_detection(monkeypatch):
     verification.Crops(detections, clouds, origin).verdicts()
     assert 0 < crops.size <= len(shown)
     for cloud in crops.clouds:
-        assert len(cloud) == 1024 or any(len(a) == len(cloud) and np.allclose(a, cloud, atol=1e-4) for a in shown)
+        if len(cloud) < 1024:
+            assert any(len(a) == len(cloud) and np.allclose(a, cloud, atol=1e-4) for a in shown)
+        else:
+            # a subsample of one of the clouds
+            large_clouds = [KDTree(a) for a in shown if len(a) >= 1024]
+            assert min(tree.query(cloud)[0].max() for tree in large_clouds) < 1e-4
 
 
 @pytest.mark.long
