@@ -12,6 +12,7 @@ from hostile_files import KITTI, npy, refusal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import lidarpose
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.io.boxes import Boxes, read_boxes
@@ -347,3 +348,27 @@ def test_to_dict_gives_up_per_box_or_once_per_document(tmp_path):
     assert read_boxes([box.to_dict() | {"up": True}]).up == "z"
     with pytest.raises(InputError, match="b.txt: is written as JSON"):
         boxes.save(tmp_path / "b.txt")
+
+
+def test_boxes_rejects_rows():
+    with pytest.raises(InputError, match=r"expected objects of type Box, got list: convert with lidarpose.read_boxes"):
+        Boxes([[0, 0, 0, 1, 1, 2, 0]])
+
+
+def test_box_to_dict_keeps_known_values():
+    box = Box(center=np.zeros(3), size=np.ones(3), yaw=0.5, id="a", score=0.75, mounted=False, up="y")
+    assert vars(read_boxes([box.to_dict()])[0]).keys() == vars(box).keys()
+    result = read_boxes([box.to_dict()])[0]
+    assert (result.id, result.score, result.mounted, result.up) == ("a", 0.75, False, "y")
+    assert Box(center=np.zeros(3), size=np.ones(3)).to_dict().keys() == {"center", "size", "yaw"}
+
+
+def test_stated_up_axis_is_checked():
+    boxes = read_boxes({"schema": "lidarpose.boxes/1", "up": "z", "people": [[0, 0, 0, 1, 1, 2, 0]]})
+    assert boxes.has_up and boxes[:1].has_up and read_boxes(boxes).has_up
+    assert not read_boxes([[0, 0, 0, 1, 1, 2, 0]]).has_up
+    points = np.random.default_rng(0).normal(0, 0.3, (60, 3))
+    with pytest.raises(InputError, match="the up axis of the boxes is z, not y"):
+        lidarpose.predict(points, boxes=boxes, up="y")
+    # rows do not state an axis
+    assert len(lidarpose.predict(points, boxes=[[0, 0, 0, 1, 1, 2, 0]], up="y", model="tiny")) == 1

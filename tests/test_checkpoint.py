@@ -102,7 +102,7 @@ def test_load_checkpoint_rejects_missing_file_and_folder(tmp_path):
             lambda b: b[:-1] + bytes([b[-1] ^ 0x08]),
             "does not match the SHA-256 digest in its header: get the file again",
         ),
-        (lambda b: b"hello world, this is text", "something else: give a checkpoint"),
+        (lambda b: b"hello world, this is text", "something else: give a file of weights"),
         (lambda b: b"\x80\x02}q\x00(X\x01\x00\x00\x00aK\x01u.", "something else"),
         (lambda b: b"\x1f\x8b" + bytes(50), "something else"),
         (lambda b: bytes(64), "something else"),

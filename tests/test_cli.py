@@ -20,7 +20,7 @@ from safetensors.numpy import load_file, save_file
 
 import lidarpose
 from lidarpose import progress
-from lidarpose.cli import demo, main
+from lidarpose.cli import demo, main, predicting
 from lidarpose.errors import InputError
 from lidarpose.inference import predictor
 from lidarpose.models import BUNDLED, DEFAULT, bundled_path, weights_file
@@ -160,7 +160,7 @@ def test_predict_with_boxes_and_skeleton(crop, boxes, out, capsys):
     assert run("predict", crop, "--boxes", boxes, "--out", out, *words) == 0
     (person,) = json.loads((out / "crop.poses.json").read_text())["people"]
     assert person["id"] == "a" and len(person["joints"]) == 14
-    assert "1 of 1 people" in capsys.readouterr().err
+    assert "1 of 1 person" in capsys.readouterr().err
 
 
 def test_predict_combines_warnings_of_people_without_pose(crop, tmp_path, out, capsys):
@@ -431,7 +431,7 @@ BAD_COMMANDS = {
     "export how": ("export --format tflite --out DIR/x", "known are onnx, torch"),
     "export nothing": ("export no/such.safetensors --out DIR/x.onnx", "does not exist"),
     "import nothing": ("import no/such.safetensors DIR/x.safetensors", "does not exist"),
-    "import a pickle": ("import weights.pth DIR/x.safetensors", "got a pickle"),
+    "import a missing pickle": ("import weights.pth DIR/x.safetensors", "does not exist"),
     "import as": ("import DAPT DIR/x.safetensors --config kitti", "waymo"),
     "import into another kind": ("import DAPT DIR/x.onnx", "give a name that ends in .safetensors"),
     "import without an out": ("import DAPT", "OUT"),
@@ -627,7 +627,7 @@ def test_quiet_prints_errors_only(crop, tmp_path, capsys):
     assert "no.npy" in capsys.readouterr().err
     # the option affects only its own command
     assert run(*words) == 0
-    assert "1 of 1 people" in capsys.readouterr().err
+    assert "1 of 1 person" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -649,3 +649,16 @@ def test_stray_point_causes_no_rounding_warning(crop, points, tmp_path, out, cap
     np.save(tmp_path / "stray.npy", np.concatenate([points, [[5e6, 0, 0]]]).astype(np.float32))
     assert run("predict", tmp_path / "stray.npy", "--crop", "--out", out) == 0
     assert "rounded" not in capsys.readouterr().err
+
+
+def test_import_rejects_pickle(tmp_path, capsys):
+    path = tmp_path / "weights.pth"
+    path.write_bytes(b"\x80\x04.")
+    assert main(["import", str(path), str(tmp_path / "x.safetensors")]) == 2
+    assert "got a pickle, which can run programs" in capsys.readouterr().err
+
+
+def test_advice_after_empty_detection_unless_explained():
+    assert "a lower --min-score finds more" in predicting._none_found(" -> x.json", ["dropped 3 points"])
+    explained = predicting._none_found(" -> x.json", ["no people found with up z, but 4 people with up y: try up y"])
+    assert explained == "no people found -> x.json"

@@ -587,7 +587,7 @@ def test_rows_contain_limit_baselines_and_released_arithmetic(written):
     wanted = metrics.by_group(table, "waymo14", empty=0.0)["head"]
     assert waymo.line("mpjpe", "joints", "head", arithmetic="released").value == pytest.approx(wanted)
     # the released alignment is undefined with missing labels
-    with pytest.raises(InputError, match="no line"):
+    with pytest.raises(InputError, match="no row"):
         waymo.line("pa_mpjpe", arithmetic="released")
     assert humanm3.line("pa_mpjpe", arithmetic="released").value > 0
 

@@ -15,6 +15,9 @@ from lidarpose import metrics
 from lidarpose.errors import InputError
 from lidarpose.eval.metric_rows import METRICS, SUMMARIES
 from lidarpose.geometry import axis_angle_to_matrix, similarity_align
+from lidarpose.inference.results import PersonPose, Poses
+from lidarpose.sample import Pose
+from lidarpose.skeleton import SKELETONS
 
 REFERENCE = Path(__file__).parent / "parity" / "metrics.npz"
 DISTANCES = (metrics.mpjpe, metrics.pa_mpjpe, metrics.pck)
@@ -399,3 +402,14 @@ def test_interval_accepts_missing_cluster_labels():
         metrics.interval(np.arange(24.0) ** 2, np.random.default_rng(0), clusters=c) for c in (units, units + 100)
     ]
     assert intervals[0] == intervals[1]
+
+
+def test_metrics_take_poses_as_predicted():
+    joints = np.random.default_rng(0).normal(size=(2, 15, 3))
+    skeleton = SKELETONS["human15"]
+    people = tuple(
+        PersonPose(pose=Pose(joints=own, skeleton=skeleton), points=np.zeros((9, 3)), skeleton=skeleton)
+        for own in joints
+    )
+    poses = Poses(people=people, skeleton=skeleton)
+    assert metrics.mpjpe(poses, joints + [0, 0, 0.01]) == pytest.approx(10)

@@ -18,7 +18,7 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
 from lidarpose.inference import inputs as people_module
 from lidarpose.inference.backend import Raw
-from lidarpose.inference.checks import flat_axis, is_lying, rows_inside, unit_warning
+from lidarpose.inference.checks import flat_axis, is_lying, rows_inside, scan_unit_warning, unit_warning
 from lidarpose.inference.inputs import MAX_POINTS, as_origin, candidates, clean
 from lidarpose.inference.predict_scan import predictor_of
 from lidarpose.inference.predictor import Predictor
@@ -887,3 +887,39 @@ def test_predict_checks_upside_down_people_in_one_batch(model, points, monkeypat
     same = model.predict_in([points * [1, -1, -1]] * 3, np.array([0.1, 0.2, 0.3]), check_upside_down=False)
     assert batches == [3] * 2
     np.testing.assert_array_equal(same.to_numpy(), people.to_numpy())
+
+
+def test_predict_warns_once_of_boxes_in_millimeters(model, sweep):
+    """The distance of the boxes to sensor and points follows from their unit."""
+    _, clouds, boxes = sweep
+    scaled = [
+        {**box, "center": (1000 * np.array(box["center"])).tolist(), "size": [1000 * value for value in box["size"]]}
+        for box in boxes
+    ]
+    poses = lidarpose.predict(np.concatenate(clouds), boxes=scaled, model=model)
+    (warning,) = poses.warnings
+    assert "a person's box is" in warning and "millimeters" in warning
+
+
+def test_predict_warns_of_few_scored_people_upside_down_only_if_most_are(model, points):
+    flipped = points * [1, -1, -1]
+    for clouds, count in (([flipped, points, points], 0), ([flipped, flipped, points], 2)):
+        centers = np.array([cloud.mean(0) for cloud in clouds])
+        people = model.predict_in(clouds, None, box_centers=centers, is_scored=True)
+        assert sum("try up -z" in " ".join(person.warnings) for person in people) == count
+        people = model.predict_in(clouds, None, box_centers=centers)
+        assert sum("try up -z" in " ".join(person.warnings) for person in people) == max(count, 1)
+
+
+def test_predict_rejects_objects_that_hold_points(model):
+    frame = lidarpose.Frame(points=np.zeros((9, 3)), index=0, id="0")
+    with pytest.raises(InputError, match=r"got Frame, its points are in .points$"):
+        lidarpose.predict(frame, model=model)
+    with pytest.raises(InputError, match=r"array of numbers, got NoneType$"):
+        model.predict(None)
+
+
+def test_scan_unit_warning_of_person_in_millimeters():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (500, 3)) * [500, 300, 950]
+    assert "are the units millimeters? divide all coordinates by 1000" in scan_unit_warning(points, len(points))

@@ -14,7 +14,7 @@ import pytest
 from walking_people import FRAMES, PLACES, STEPS, moving_source, walking_clouds
 
 import lidarpose
-from lidarpose import Box, InputError
+from lidarpose import Box, Boxes, InputError
 from lidarpose.cli import main
 from lidarpose.geometry import UP_AXES, rigid_transform, rotation_about
 from lidarpose.io.sources.frame import Frame, FrameSource, IndexedRecording, Sweep
@@ -767,3 +767,10 @@ def test_boxes_of_unknown_frames_raise_at_the_end(model):
     frames = lidarpose.predict_recording(fed([np.ones((9, 3))]), boxes=boxes, model=model)
     with pytest.raises(InputError, match="has boxes of frames b, but this recording has other frames, the last one 0"):
         list(frames)
+
+
+def test_boxes_of_one_scan_are_rejected_for_recording(tmp_path, model):
+    path = tmp_path / "a.boxes.json"
+    Boxes([Box(center=np.zeros(3), size=np.ones(3))]).save(path)
+    with pytest.raises(InputError, match="a.boxes.json: expected one entry per frame.*one box file is one scan"):
+        next(iter(lidarpose.predict_recording(fed([np.ones((9, 3))]), boxes=path, model=model)))

@@ -75,7 +75,7 @@ def test_spread_selects_people_of_whole_dataset(dataset):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["none"], "is not a dataset: dataset.json is missing"),
+        (["none"], "is not a dataset: there is no such folder"),
         (["streetlife", "-n", "0"], "expected 1 to"),
         (["streetlife", "--out", "streetlife/dataset.json/x.png"], "is a file"),
         (["streetlife", "--out", "sheet.jpg"], "sheet.jpg: is written as PNG: give a name that ends in .png"),

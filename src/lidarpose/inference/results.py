@@ -47,6 +47,7 @@ class PersonPose:
         warnings: messages for the user about this person.
         model: name, version and settings of the network.
         up: up axis of the input frame, used for drawing.
+        stored_points: number of points of the crop if `points` does not hold them, see `read_poses`.
     """
 
     pose: Pose | None
@@ -57,6 +58,7 @@ class PersonPose:
     warnings: tuple[str, ...] = ()
     model: dict = field(default_factory=dict)
     up: str = "z"
+    stored_points: int | None = None
 
     @property
     def has_pose(self) -> bool:
@@ -128,14 +130,13 @@ class PersonPose:
 
     @property
     def num_points(self) -> int:
-        return len(self.points)
+        return len(self.points) if self.stored_points is None else self.stored_points
 
     def to_dict(self) -> dict:
         """The entry of this person in the list "people" of `Poses.to_dict`."""
         return {
             "id": self.id,
-            # the document states "up" once for all people
-            "box": self.box and replace(self.box, up=None).to_dict(),
+            "box": self.box and self.box.place_dict(),
             "score": None if self.score is None else round(self.score, 4),
             "mounted": self.mounted,
             "num_points": self.num_points,
@@ -362,7 +363,7 @@ class Poses(Sequence[PersonPose]):
     def _distance(self, person: PersonPose) -> float | None:
         """Distance of the person from the sensor, m; NaN if the sensor position is unknown, None without detection or
         points."""
-        if self.scan is None or not person.num_points:
+        if self.scan is None or not len(person.points):
             return None
         return np.nan if self.origin is None else float(np.linalg.norm(np.median(person.points, 0) - self.origin))
 
@@ -398,7 +399,7 @@ def _upright(person: PersonPose, up: str) -> PersonPose:
 
 def _box_around(person: PersonPose) -> Box | None:
     """A box around the points of a person (z up), aligned with the heading of the pose; None without points."""
-    if not person.num_points:
+    if not len(person.points):
         return None
     yaw = facing_yaw(person.pose)
     R_level_local = rotation_about("z", yaw)

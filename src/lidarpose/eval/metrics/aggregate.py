@@ -45,7 +45,11 @@ _BLOCK = 1 << 21
 
 
 def as_numbers(name: str, value: ArrayLike) -> np.ndarray:
-    """An array of floats, NaN where masked. Raises InputError for other content or lists of unequal length."""
+    """An array of floats, NaN where masked; of `Poses`, the joints. Raises InputError for other content or lists of
+    unequal length."""
+    if hasattr(value, "people"):
+        # the result of a prediction
+        value = value.to_numpy()
     try:
         value = list(map(to_numpy, value)) if isinstance(value, list | tuple) else to_numpy(value)
         return np.asarray(value, float)
