@@ -108,6 +108,19 @@ def test_few_bins_half_floats_and_far_logits_are_fine(name):
     np.testing.assert_allclose(find(logits, low=0.0, step=1.0), [30, 2], atol=0.01)
 
 
+@pytest.mark.parametrize("constant", [-1e4, 1e3, 1e4])
+def test_a_window_does_not_depend_on_the_logits_zero(constant):
+    logits = gaussian([7.3, 12.0], 24)
+    moved = decode.window(logits + constant, low=0.0, step=1.0)
+    np.testing.assert_allclose(moved, decode.window(logits, low=0.0, step=1.0), atol=1e-9)
+
+
+def test_a_probability_is_that_of_its_log_odds():
+    odds = np.array([0.01, 0.5, 1, 3, 99])
+    np.testing.assert_allclose(decode.sigmoid(np.log(odds)), odds / (1 + odds))
+    assert decode.sigmoid(np.array([-1e4, 1e4])).tolist() == [0, 1]
+
+
 def test_out_of_range():
     logits = gaussian(np.array([[0.0, 1.0], [70.0, 71.0]]), 72)
     assert decode.out_of_range(logits).tolist() == [[True, False], [False, True]]
