@@ -21,11 +21,11 @@ from lidarpose.inference.backend import Raw
 from lidarpose.inference.checks import flat_axis, is_lying, rows_inside, unit_warning
 from lidarpose.inference.inputs import MAX_POINTS, as_origin, candidates, clean
 from lidarpose.inference.predict_scan import predictor_of
-from lidarpose.inference.predictor import Predictor
+from lidarpose.inference.predictor import Predictor, _select_pose
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.point_cloud import Cloud
 from lidarpose.models import bundled_path
-from lidarpose.sample import Box
+from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import BODY26, SKELETONS, WAYMO14
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
@@ -753,6 +753,31 @@ def test_ids_are_what_json_can_hold(model, sweep):
         with pytest.raises(InputError, match="Box.id must be text or a whole number"):
             Box(center=[0, 0, 0], size=[9, 9, 9], id=wrong)
     json.loads(lidarpose.predict(path, boxes=[box], model=model).to_json())
+
+
+def answers(*people):
+    """Poses of candidates (x m, confidence, probability of a person), each with its part of the cloud."""
+    for k, (x, confidence, person) in enumerate(people):
+        joints, confidences = np.zeros((26, 3)) + [x, 0, 0], np.full(26, confidence)
+        known = {"person": np.array(person), "second_person": np.array(0.1)}
+        yield Pose(joints=joints, skeleton=BODY26, confidence=confidences, **known), np.full((1, 3), float(k))
+
+
+@pytest.mark.parametrize(
+    ("people", "box_x", "best", "second"),
+    [
+        # the surest; whoever is beside counts as a second person if sure, too
+        ([(0, 0.5, 0.9), (1, 0.9, 0.8), (5, 0.2, 1.0)], None, 1, 0.1),
+        ([(0, 0.6, 0.9), (1, 0.9, 0.8)], None, 1, 0.9),
+        # with a box the surest of the nearest person among those who are sure
+        ([(0, 0.6, 0.9), (0.2, 0.7, 0.5), (1, 0.9, 0.8)], 0.1, 1, 0.8),
+        ([(0.1, 0.3, 0.9), (1, 0.9, 0.8), (2, 0.95, 0.7)], 0.1, 1, 0.7),
+        ([(0, 0.6, 0.05), (1, 0.9, 0.05)], 0.8, 1, 0.1),
+    ],
+)
+def test_of_the_candidates_of_a_crop_the_sure_one_that_is_meant_is_the_answer(people, box_x, best, second):
+    pose, part = _select_pose(list(answers(*people)), None if box_x is None else np.array([box_x, 0, 0]))
+    assert part[0, 0] == best and pose.joints[0, 0] == people[best][0] and pose.second_person == second
 
 
 def test_without_confidence_the_whole_cloud_is_the_answer(points):

@@ -215,6 +215,8 @@ def test_the_center_of_one_point_is_its_cell():
 def test_what_a_box_contains_is_asked_of_points():
     box = Box(center=[0, 0, 0], size=[1, 1, 2])
     assert box.contains(np.zeros((2, 4))).tolist() == [True, True]
+    # its faces are part of it
+    assert box.contains(np.array([[0.5, 0.5, 1], [-0.5, -0.5, -1], [0, 0, 1.001]])).tolist() == [True, True, False]
     for wrong in (np.zeros(3), np.zeros((4, 2)), np.zeros((2, 3, 3)), "points", [[1, 2, 3], [1, 2]]):
         with pytest.raises(InputError, match=r"^Box.contains: expected points \(n, 3\) m, got shape"):
             box.contains(wrong)
