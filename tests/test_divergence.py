@@ -163,12 +163,14 @@ def test_the_columns_of_a_stack_are_those_of_the_sensor_wherever_the_body_goes()
     hits = scan(body.vertices, body.faces, AV2, window_vertices=both, moved=body.vertices + step)
     azimuths = -np.pi + (hits.column + hits.column0) * AV2.azimuth_step + AV2.azimuth_shifts[hits.ring]
     np.testing.assert_allclose(np.arctan2(hits.points[:, 1], hits.points[:, 0]), azimuths, atol=1e-5)
-    # rings of the two lags, with windows that begin in other columns
-    apart = replace(AV2, azimuth_offsets=AV2.azimuth_shifts + 0.4 * AV2.azimuth_step * (AV2.ring_lags > 0))
-    hits = scan(body.vertices, body.faces, apart)
-    azimuths = -np.pi + (hits.column + hits.column0) * apart.azimuth_step + apart.azimuth_shifts[hits.ring]
-    np.testing.assert_allclose(np.arctan2(hits.points[:, 1], hits.points[:, 0]), azimuths, atol=1e-5)
-    assert hits.column.min() >= 0
+    # the windows of the two origins begin in other columns, now of the one first, now of the other
+    for first in (-1, 1):
+        offsets = 0.4 * first * np.sign(AV2.ring_lags - 0.1) * AV2.azimuth_step
+        apart = replace(AV2, azimuth_offsets=offsets)
+        hits = scan(body.vertices, body.faces, apart)
+        azimuths = -np.pi + (hits.column + hits.column0) * apart.azimuth_step + apart.azimuth_shifts[hits.ring]
+        np.testing.assert_allclose(np.arctan2(hits.points[:, 1], hits.points[:, 0]), azimuths, atol=1e-5)
+        assert hits.column.min() >= 0
 
 
 def test_origins_at_one_height_are_one_sensor():
