@@ -164,6 +164,7 @@ def test_the_columns_of_a_stack_are_those_of_the_sensor_wherever_the_body_goes()
     azimuths = -np.pi + (hits.column + hits.column0) * AV2.azimuth_step + AV2.azimuth_shifts[hits.ring]
     np.testing.assert_allclose(np.arctan2(hits.points[:, 1], hits.points[:, 0]), azimuths, atol=1e-5)
     # the windows of the two origins begin in other columns, now of the one first, now of the other
+    body = box_at(2.0)
     for first in (-1, 1):
         offsets = 0.4 * first * np.sign(AV2.ring_lags - 0.1) * AV2.azimuth_step
         apart = replace(AV2, azimuth_offsets=offsets)

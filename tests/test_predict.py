@@ -288,6 +288,12 @@ def test_a_million_points_are_thinned_with_a_note(model, points):
     assert len(x) == MAX_POINTS and np.diff(x).max() < 1e-4 and x[0] == 0.1 and x[-1] > 1.0999
 
 
+def test_of_a_list_the_cloud_with_rounded_coordinates_is_named(model, points):
+    far = (points + [5e6, 0, 0]).astype(np.float32)
+    warnings = [person.warnings for person in model.predict([points, far, far.astype(float) + 0.01])]
+    assert [any("coordinates are rounded to 0.5 m" in line for line in own) for own in warnings] == [False, True, False]
+
+
 def test_map_coordinates_cost_no_accuracy(model, points):
     offset = np.array([5e5, 5e6, 300.0])
     moved = model.predict(points.astype(float) + offset)

@@ -182,6 +182,10 @@ def test_times_that_are_wrong_cost_the_smoothing_of_their_frames_alone():
     assert steady_rows(wrong) == steady_rows(times[:10] * 2) == rows
     # two frames that changed places: one of them stays as it is
     assert steady_rows([*times[:9], times[10], times[9], *times[11:]]) == rows[:10] + rows[11:]
+    # a frame before two others: both stay
+    assert steady_rows([*times[:9], times[11], times[9], times[10], *times[12:]]) == rows[:10] + rows[12:]
+    # nobody is filled in where a frame is damaged
+    assert steady_rows(times, damaged=[9]) == rows[:9] + rows[10:]
 
 
 def test_a_late_frame_does_not_end_the_memory_of_live_poses():
