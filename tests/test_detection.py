@@ -16,6 +16,7 @@ from lidarpose.errors import InputError
 from lidarpose.eval.detector.labeled_scans import heldout_scans
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
 from lidarpose.inference import detection, verification
+from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.lidar.raycast import scan
 from lidarpose.models.detector.candidates import SceneIndex
 from lidarpose.models.detector.detector import Detector, rows_that_matter
@@ -563,6 +564,24 @@ def test_who_cannot_reach_the_least_score_is_neither_verified_nor_posed(monkeypa
     assert len(more) > len(people.boxes)
     for own, same in zip(people.boxes, more, strict=False):
         assert (own.score, *own.center, *own.size) == (same.score, *same.center, *same.size)
+    # of those who were verified, a third of the least score or less is nobody
+    nobody = detections.centers[(highest >= 0.6) & (scores < 0.2)]
+    np.testing.assert_array_equal(people.rejected, nobody)
+    # who is known is not verified again, which makes nobody of no one
+    own = [people.pelvises[:1], people.boxes[0].center[None], np.array([0.5])]
+    known = KnownPlaces(
+        boxes=people.boxes[:1],
+        **dict(zip(("pelvises", "tracks", "reach"), own, strict=True)),
+        rejected=np.zeros((0, 3)),
+    )
+    again = verification.verified(detections, points, origin, header, 0.6, known=known)
+    assert sorted(again.verified) == [False] + [True] * (len(people.boxes) - 1) and len(nobody)
+    assert {tuple(place) for place in again.rejected} <= {tuple(place) for place in nobody}
+    # of one person who is asked for, two places are posed: the surest
+    verified.clear()
+    (alone,) = verification.verified(detections, points, origin, header, 0.6, 1).boxes
+    assert sorted(verified[1][0]) == sorted(np.lexsort((-logits, -np.nan_to_num(scores)))[:2])
+    np.testing.assert_array_equal(alone.center, people.boxes[0].center)
     # nobody is most of somebody surer
     owned = set()
     for rows in people.rows:

@@ -386,6 +386,27 @@ def test_a_run_that_is_told_to_stop_saves_and_goes_on_to_the_same_losses(monkeyp
     assert_resumes_to(unbroken, folder)
 
 
+@pytest.mark.long
+def test_a_run_that_is_told_to_stop_in_its_last_batches_ends(monkeypatch, tmp_path):
+    original = PoseNetObjective.terms
+
+    def interrupted(*args, **kwargs):
+        monkeypatch.setattr(PoseNetObjective, "terms", original)
+        os.kill(os.getpid(), signal.SIGTERM)
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(PoseNetObjective, "terms", interrupted)
+    assert loop.train(replace(RECIPE, people=CHUNK), tmp_path / "run") == tmp_path / "run" / run_dir.MODEL
+    assert people_of(tmp_path / "run") == [CHUNK]
+
+
+@pytest.mark.parametrize(("people", "steps"), [(CHUNK, BATCHES), (CHUNK + 1, BATCHES + 1), (1, 1)])
+def test_the_last_batch_of_a_run_may_show_more_people_than_asked_for(people, steps, tmp_path):
+    recipe = replace(RECIPE, people=people)
+    run = loop._Run(recipe, setup.make_setup(recipe), tmp_path, loop.Accelerator(cpu=True), "", None)
+    assert run.steps == steps
+
+
 def test_a_second_request_stops_at_once():
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt), StopRequest() as stop:

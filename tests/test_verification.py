@@ -8,7 +8,7 @@ import pytest
 from lidarpose.inference import verification
 from lidarpose.inference.verification import Crops, box_about, inside_column
 from lidarpose.models.detector.detector import Detections
-from lidarpose.sample import Pose
+from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import HUMAN15
 
 # facing +x, left is +y, m
@@ -86,3 +86,71 @@ def test_features_are_odds_that_hardly_grow_beyond_six_and_the_number_of_points(
         for log_points in np.log1p([5, 100, 1e5]):
             possible = np.column_stack([np.arange(3.0), np.full(3, odds), np.full(3, log_points)])
             assert (verification.final_score(possible, header) <= highest).all()
+
+
+def fitted(monkeypatch, scores, places, mounted=0.0, sure=0.5, max_people=None, known=None):
+    """Boxes about people who stand at places (x, y), and how many points each has of a grid about all of them."""
+    network = SimpleNamespace(header=SimpleNamespace(skeleton=HUMAN15))
+    monkeypatch.setattr(verification, "_bundled", lambda name: network)
+    joints = np.array([standing(0.0, np.array([*place, 0.0])).joints for place in places])
+    axes = np.arange(-3, 3, 0.1), np.arange(-3, 3, 0.1), np.arange(0, 1.8, 0.1)
+    points = np.stack(np.meshgrid(*axes), -1).reshape(-1, 3)
+    detections = verification._ScoredDetections(
+        scores=np.array(scores), logits=np.array(scores), mounted=np.broadcast_to(mounted, len(scores)), joints=joints,
+        pelvises=joints[:, HUMAN15.index("pelvis")], near_rows=[np.arange(len(points))] * len(scores),
+    )  # fmt: skip
+    people = verification._fit_boxes(detections, points, sure, max_people, known or {})
+    for _, box, rows in people:
+        if not known:
+            np.testing.assert_array_equal(rows, np.flatnonzero(box.contains(points)))
+    return people
+
+
+def test_boxes_say_who_it_is_how_sure_and_whether_mounted(monkeypatch):
+    people = fitted(monkeypatch, [0.6, 0.9, 0.7], [(0, 0), (0, 2), (0.2, 2)], mounted=[0.4, 0.6, 0.1])
+    # the third is the second again
+    assert [(row, box.score, box.mounted) for row, box, _ in people] == [(1, 0.9, True), (0, 0.6, False)]
+    assert [row for row, _, _ in fitted(monkeypatch, [0.6, 0.9], [(0, 0), (0, 2)], max_people=1)] == [1]
+
+
+@pytest.mark.parametrize(("scores", "narrow"), [((0.9, 0.6), (1, 1)), ((0.9, 0.4), (0, 1)), ((0.4, 0.3), (0, 1))])
+def test_boxes_make_room_for_whoever_is_sure_or_surer(scores, narrow, monkeypatch):
+    people = fitted(monkeypatch, scores, [(0, 0), (0, 0.6)])
+    widths = [0.64 + 2 * (0.1 if is_narrow else 0.15) for is_narrow in narrow]
+    np.testing.assert_allclose([box.size[1] for _, box, _ in people], widths, atol=1e-3)
+
+
+def test_a_known_person_keeps_the_box_and_has_points_around_it(monkeypatch):
+    box = Box(center=(0, 0, 0.9), size=(0.6, 0.6, 1.8), mounted=True)
+    ((row, kept, rows),) = fitted(monkeypatch, [0.9], [(0, 0)], known={0: box})
+    assert row == 0 and kept.mounted and kept.score == 0.9
+    np.testing.assert_array_equal(kept.size, box.size)
+    # from 15 cm to either side: 9 by 9 columns of the grid
+    assert len(rows) == 9 * 9 * 18
+
+
+def test_points_on_people_are_near_their_bones_or_in_their_known_boxes(monkeypatch):
+    monkeypatch.setattr(
+        verification, "_bundled", lambda name: SimpleNamespace(header=SimpleNamespace(skeleton=HUMAN15))
+    )
+    joints = np.stack([standing(0.0, np.array([x, 0.0, 0.0])).joints for x in (0.0, 5.0)])
+    # at the left knee, at 17 and 19 cm before it, between the knees and the hands, and beside the second
+    points = np.array([[0, 0.1, 0.5], [0.19, 0.1, 0.5], [0.21, 0.1, 0.5], [0.05, 0.32, 0.5], [0, 0, 3], [5, 1, 1]])
+    places = SimpleNamespace(joints=joints, near_rows=[np.array([4, 3, 2, 1, 0]), np.array([5])])
+    box = Box(center=(0, 0, 1), size=(1, 1, 2))
+    people = [(0, box, np.array([0])), (1, box, np.array([5]))]
+    known = verification._on_people(places, people, points, {1: box})
+    assert known.tolist() == [True, True, False, False, False, True]
+    assert verification._on_people(places, people, points, {}).tolist() == [True, True, False, False, False, False]
+
+
+def test_detections_in_some_of_the_points_are_joined_by_the_numbers_of_all():
+    def scored(count, rows):
+        values = {name: np.arange(float(count)) for name in ("scores", "logits", "mounted")}
+        places = {"joints": np.zeros((count, 15, 3)), "pelvises": np.zeros((count, 3))}
+        return verification._ScoredDetections(**values, **places, near_rows=rows)
+
+    some = scored(1, [np.array([0, 2])])
+    joined = scored(2, [np.array([3]), np.array([1, 2])]).joined(some, np.array([4, 6, 9]))
+    assert [rows.tolist() for rows in joined.near_rows] == [[3], [1, 2], [4, 9]] and joined.joints.shape == (3, 15, 3)
+    assert joined.scores.tolist() == [0, 1, 0]
