@@ -17,6 +17,7 @@ from lidarpose.cli import main
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
 from lidarpose.inference import inputs as people_module
+from lidarpose.inference import predictor
 from lidarpose.inference.backend import Raw
 from lidarpose.inference.checks import flat_axis, is_lying, rows_inside, unit_warning
 from lidarpose.inference.inputs import MAX_POINTS, as_origin, candidates, clean
@@ -208,6 +209,11 @@ def test_many_are_as_one_by_one(model, points, standing):
             np.testing.assert_allclose(
                 person.joints, model.predict(cloud, skeleton="human15").joints, atol=1e-3, rtol=1e-4
             )
+
+
+def test_lists_of_lists_of_rows_are_many_people(model, points):
+    people = model.predict([list(points), points.tolist()])
+    np.testing.assert_array_equal(people.to_numpy(), model.predict([points, points]).to_numpy())
 
 
 def test_lists_of_none_and_stacks(model, points):
@@ -918,3 +924,6 @@ def test_all_who_may_be_upside_down_are_looked_at_in_one_batch(model, points, mo
     same = model.predict_in([points * [1, -1, -1]] * 3, np.array([0.1, 0.2, 0.3]), check_upside_down=False)
     assert batches == [3] * 2
     np.testing.assert_array_equal(same.to_numpy(), people.to_numpy())
+    # who lies may have another axis up, which is said of the whole scan
+    monkeypatch.setattr(predictor, "is_lying", lambda pose, part: True)
+    assert not any("try up" in line for line in model.predict(points * [1, -1, -1]).warnings)
