@@ -564,17 +564,25 @@ def test_the_card_s_command_is_as_it_was_typed(tmp_path, monkeypatch):
     assert typed[typed.index("--motion") + 1] == motion.name and typed[typed.index("--subjects") + 1] == "My Walk"
 
 
-def test_a_run_s_rates_follow_its_schedule(monkeypatch, tmp_path):
-    rates, step = [], loop._Run._step
+def test_a_run_s_rates_mean_and_draws_follow_its_steps(monkeypatch, tmp_path):
+    rates, seeds, means, step, average = [], [], [], loop._Run._step, loop.average
 
     def recorded(self, arrays, *of):
         terms = step(self, arrays, *of)
         rates.append([group["lr"] for optimizer in self.optimizers for group in optimizer.param_groups])
+        seeds.append(torch.initial_seed())
         return terms
 
+    def averaged(mean, network, step, ema):
+        means.append((step, ema))
+        average(mean, network, step, ema)
+
+    monkeypatch.setattr(loop, "average", averaged)
     monkeypatch.setattr(loop._Run, "_step", recorded)
     monkeypatch.setattr(setup, "VALIDATION", 0)
     loop.train(RECIPE, tmp_path / "run")
+    assert means == [(k, RECIPE.ema) for k in range(3 * BATCHES)]
+    assert seeds == [loop._seed(RECIPE.seed, loop.RandomStream.TRAINING_STEP, k, 0) for k in range(3 * BATCHES)]
     due = [rate_factor(k / (3 * BATCHES), RECIPE) for k in range(3 * BATCHES)]
     np.testing.assert_allclose(rates, np.outer(due, [RECIPE.rate, RECIPE.muon_rate]))
 
