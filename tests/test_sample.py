@@ -27,7 +27,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def contains_slowly(box, points, margin):
-    """A point is inside where it lies between the box's three pairs of faces."""
+    """A point is inside if it lies between all three pairs of opposite faces."""
     cos, sin = np.cos(box.yaw), np.sin(box.yaw)
     axes = zip(([cos, sin, 0], [-sin, cos, 0], [0, 0, 1]), box.size, strict=True)
     return np.all([np.abs(points @ axis - box.center @ axis) <= size / 2 + margin for axis, size in axes], 0)
@@ -35,17 +35,17 @@ def contains_slowly(box, points, margin):
 
 @quick
 @given(seeds, st.floats(-7, 7), st.floats(0, 0.5))
-def test_a_box_holds_what_its_slow_twin_says(seed, yaw, margin):
+def test_box_contains_matches_reference(seed, yaw, margin):
     rng = np.random.default_rng(seed)
     box = Box(center=rng.normal(0, 3, 3), size=rng.uniform(0.2, 2, 3), yaw=yaw)
     points = box.center + rng.uniform(-1.5, 1.5, (200, 3))
     np.testing.assert_array_equal(box.contains(points, margin), contains_slowly(box, points, margin))
-    # further columns, as intensity, are ignored
+    # further columns, such as intensity, are ignored
     wide = np.column_stack([points, rng.normal(size=(200, 2))])
     np.testing.assert_array_equal(box.contains(wide, margin), box.contains(points, margin))
 
 
-def test_a_box_turns_with_its_yaw():
+def test_box_contains_respects_yaw():
     box = Box(center=[0, 0, 0], size=[4, 1, 2], yaw=np.pi / 2)
     assert box.contains(np.array([[0, 1.9, 0], [1.9, 0, 0], [0.4, 0, 0.9]])).tolist() == [True, False, True]
     assert box.contains(np.zeros((0, 3))).shape == (0,)
@@ -70,13 +70,13 @@ def test_a_box_turns_with_its_yaw():
         ({"score": 1.1}, "score must be a probability"),
     ],
 )
-def test_boxes_that_are_none(change, message):
+def test_box_rejects_invalid_values(change, message):
     with pytest.raises(InputError, match=message) as caught:
         Box(**{"center": [0, 0, 0], "size": [1, 1, 2], "yaw": 0.0} | change)
     assert "\n" not in str(caught.value)
 
 
-def test_a_box_keeps_its_own_numbers():
+def test_box_copies_its_input():
     center = np.zeros(3)
     box = Box(center=center, size=[1, 1, 1])
     center[0] = 5
@@ -90,7 +90,7 @@ def pose(skeleton=BODY26, shape=(), **more):
 
 @pytest.mark.parametrize("shape", [(), (2,), (3, 4)])
 @pytest.mark.parametrize("other", [SMPL24, HUMAN15, WAYMO14, BODY26], ids=lambda s: s.name)
-def test_a_pose_in_another_skeleton_keeps_each_joint_by_name(shape, other):
+def test_pose_to_skeleton_maps_joints_by_name(shape, other):
     rng = np.random.default_rng(1)
     confidence, spread = rng.random((2, *shape, 26))
     full = pose(shape=shape, confidence=confidence, spread=spread, frame="sensor")
@@ -105,7 +105,7 @@ def test_a_pose_in_another_skeleton_keeps_each_joint_by_name(shape, other):
     assert pose(shape=shape).to(other).confidence is None
 
 
-def test_lists_are_as_good_as_arrays():
+def test_pose_and_sample_accept_lists():
     joints = np.arange(78.0).reshape(26, 3)
     made = Pose(joints=joints.tolist(), skeleton=BODY26, confidence=[0.5] * 26, in_range=[True] * 26)
     np.testing.assert_array_equal(made.joints, joints)
@@ -144,12 +144,12 @@ SAMPLE = {"points": np.zeros((4, 3), np.float32), "center": np.zeros(3)}
         ],
     ],
 )
-def test_poses_and_samples_of_wrong_shapes_are_refused(make, message):
+def test_pose_and_sample_reject_wrong_shapes(make, message):
     with pytest.raises(InputError, match=message):
         make()
 
 
-def test_a_sample_may_be_empty_and_stays_as_it_is():
+def test_sample_may_be_empty_and_is_frozen():
     Sample(points=np.zeros((0, 3), np.float32), center=np.zeros(3), part=np.zeros(0, np.uint8))
     with pytest.raises(AttributeError):
         Sample(**SAMPLE).center = np.ones(3)
@@ -164,7 +164,7 @@ def test_a_sample_may_be_empty_and_stays_as_it_is():
     ],
     ids=["box", "pose", "sample"],
 )
-def test_what_holds_arrays_is_equal_to_itself_alone(make):
+def test_array_classes_compare_by_identity(make):
     one, other = make(), make()
     assert one == one and one != other and one in [other, one] and len({one, other}) == 2
 
@@ -177,11 +177,11 @@ def cloud(rng, n=150):
 
 @quick
 @given(seeds)
-def test_the_center_ignores_density_and_order_and_moves_with_the_cloud(seed):
+def test_center_of_ignores_density_and_order_and_translates(seed):
     rng = np.random.default_rng(seed)
     points = cloud(rng)
     center = center_of(points)
-    # a part of the body seen more densely
+    # one part of the body with more points
     np.testing.assert_allclose(center_of(np.concatenate([points, points[:40].repeat(30, 0)])), center, atol=1e-12)
     np.testing.assert_allclose(center_of(rng.permutation(points)), center, atol=1e-12)
     shift = rng.integers(-400, 400, 3) * 0.1
@@ -190,14 +190,14 @@ def test_the_center_ignores_density_and_order_and_moves_with_the_cloud(seed):
 
 @quick
 @given(seeds)
-def test_the_center_is_the_median_of_cells_written_with_a_set(seed):
+def test_center_of_matches_median_of_cells(seed):
     points = cloud(np.random.default_rng(seed), 60)
     cells = {tuple(int(np.floor(c / 0.1)) for c in point) for point in points}
     expected = [(np.median([cell[k] for cell in cells]) + 0.5) * 0.1 for k in range(3)]
     np.testing.assert_allclose(center_of(points), expected, atol=1e-9)
 
 
-def test_a_few_strays_hardly_move_the_center_however_far_they_are():
+def test_center_of_is_robust_to_stray_points():
     rng = np.random.default_rng(0)
     points = cloud(rng)
     for far in (10.0, 1e3, 1e6, 1e9):
@@ -208,11 +208,11 @@ def test_a_few_strays_hardly_move_the_center_however_far_they_are():
         np.testing.assert_allclose(center_of(dense), center_of(np.concatenate([points, strays])), atol=1e-9)
 
 
-def test_the_center_of_one_point_is_its_cell():
+def test_center_of_single_point_is_cell_center():
     np.testing.assert_allclose(center_of(np.array([[0.26, -0.01, 10.04]])), [0.25, -0.05, 10.05])
 
 
-def test_what_a_box_contains_is_asked_of_points():
+def test_box_contains_rejects_invalid_points():
     box = Box(center=[0, 0, 0], size=[1, 1, 2])
     assert box.contains(np.zeros((2, 4))).tolist() == [True, True]
     # its faces are part of it
@@ -232,14 +232,14 @@ def with_axis(hips, shoulders=(0.0, 0.0, 0.0)):
 
 @quick
 @given(st.floats(-3.1, 3.1), st.floats(-1.2, 1.2))
-def test_a_person_faces_to_the_right_of_the_left_side(yaw, lean):
+def test_facing_is_perpendicular_to_left_right_axis(yaw, lean):
     R = rotation_about("z", yaw) @ rotation_about("x", lean)
     pose = with_axis(R @ [0, 0.2, 0], R @ [0, 0.4, 0])
     np.testing.assert_allclose(facing(pose), [np.cos(yaw), np.sin(yaw), 0], atol=1e-9)
     assert facing_yaw(pose) == pytest.approx(yaw)
 
 
-def test_who_has_no_left_and_right_faces_nowhere():
+def test_facing_is_none_for_vertical_or_short_axis():
     # as on the side: 15 degrees from the vertical, and hardly any width
     for axis in ([0, np.sin(np.radians(15)), np.cos(np.radians(15))], [0, 0.015, 0]):
         assert facing(with_axis(axis)) is None and facing_yaw(with_axis(axis)) == 0
@@ -260,7 +260,7 @@ def test_who_has_no_left_and_right_faces_nowhere():
         ({"visible": np.nan}, False),
     ],
 )
-def test_plain_people_are_upright_whole_and_alone(change, is_plain):
+def test_person_info_plain(change, is_plain):
     info = {"upright": True, "visible": 0.9, "clutter": 0.02, "height_seen": 0.9} | change
     assert PersonInfo(**info).plain is is_plain
 
@@ -270,7 +270,7 @@ def labeled(labels, joints, **more):
     return LabeledSample(**SAMPLE | more, pose=pose, joint_labels=np.array(labels, np.uint8))
 
 
-def test_a_joint_is_nan_where_it_has_no_label_and_nowhere_else():
+def test_labeled_sample_requires_nan_exactly_at_unlabeled_joints():
     joints = np.zeros((15, 3))
     joints[3] = np.nan
     labels = [SEEN] * 14 + [HIDDEN]
@@ -281,7 +281,7 @@ def test_a_joint_is_nan_where_it_has_no_label_and_nowhere_else():
             labeled(wrong, joints)
 
 
-def test_the_distance_is_from_the_sensor_to_the_center():
+def test_labeled_sample_distance():
     joints, labels = np.zeros((15, 3)), [SEEN] * 15
     assert labeled(labels, joints, center=np.array([3.0, 0.0, 4.0])).distance == 5
     assert np.isnan(labeled(labels, joints, sensor_known=False).distance)

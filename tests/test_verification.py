@@ -1,4 +1,4 @@
-"""Boxes of people who were found, by their poses, and the points and scores that detections are judged by."""
+"""Verification of detections: their points and features, and boxes from poses."""
 
 from types import SimpleNamespace
 
@@ -20,7 +20,7 @@ STANDING = {
 
 
 def standing(yaw, place):
-    """Somebody who faces `yaw` rad at place (3,) m."""
+    """Pose of a standing person with heading `yaw` rad at place (3,) m."""
     joints = []
     for name in HUMAN15.joints:
         side, _, part = name.partition("_")
@@ -31,19 +31,19 @@ def standing(yaw, place):
 
 
 @pytest.mark.parametrize("yaw", [-3.0, -1.2, 0.0, 0.4, 2.5])
-def test_a_box_is_about_a_pose_and_faces_as_it_does(yaw):
+def test_box_about_encloses_pose_and_has_its_heading(yaw):
     place = np.array([7.0, -3.0, -1.7])
     pose = standing(yaw, place)
     box = box_about(pose, np.inf)
     assert abs(np.angle(np.exp(1j * (box.yaw - yaw)))) < 1e-3
-    # from 0.15 m around the joints: (deep, wide, tall)
+    # 0.15 m of margin around the joints: (depth, width, height)
     np.testing.assert_allclose(box.size, [0.1 + 0.3, 0.64 + 0.3, 1.52 + 0.3], atol=1e-3)
     assert box.contains(pose.joints).all() and box.center[2] == pytest.approx(-1.7 + 0.84 + 0.03, abs=1e-3)
-    # beside somebody the box is narrower
+    # the box is narrower next to another person
     np.testing.assert_allclose(box_about(pose, 0.6).size[:2], box.size[:2] - 0.1, atol=1e-3)
 
 
-def test_a_column_is_wider_at_the_top_than_at_the_bottom():
+def test_inside_column_limits():
     center, size = np.array([5.0, 2.0, 1.0]), np.array([0.8, 0.8, 1.8])
     sides = [[0.59, 0, 0], [0, -0.59, 0], [0.61, 0, 0], [0.5, 0.5, 0]]
     heights = [[0, 0, -0.9 - 0.14], [0, 0, -0.9 - 0.16], [0, 0, 0.9 + 0.24], [0, 0, 0.9 + 0.26]]
@@ -59,7 +59,7 @@ def detections_at(*places):
     )
 
 
-def test_features_are_odds_that_hardly_grow_beyond_six_and_the_number_of_points(monkeypatch):
+def test_verification_features_and_score_bound(monkeypatch):
     """The verifier is asked about the columns with five points or more."""
     places = [(5.0, 0.0, 1.0), (9.0, 0.0, 1.0), (13.0, 0.0, 1.0)]
     clouds = {
@@ -106,7 +106,7 @@ def fitted(monkeypatch, scores, places, mounted=0.0, sure=0.5, max_people=None, 
     return people
 
 
-def test_boxes_say_who_it_is_how_sure_and_whether_mounted(monkeypatch):
+def test_fit_boxes_keeps_score_and_mounted_without_duplicates(monkeypatch):
     people = fitted(monkeypatch, [0.6, 0.9, 0.7], [(0, 0), (0, 2), (0.2, 2)], mounted=[0.4, 0.6, 0.1])
     # the third is the second again
     assert [(row, box.score, box.mounted) for row, box, _ in people] == [(1, 0.9, True), (0, 0.6, False)]
@@ -114,13 +114,13 @@ def test_boxes_say_who_it_is_how_sure_and_whether_mounted(monkeypatch):
 
 
 @pytest.mark.parametrize(("scores", "narrow"), [((0.9, 0.6), (1, 1)), ((0.9, 0.4), (0, 1)), ((0.4, 0.3), (0, 1))])
-def test_boxes_make_room_for_whoever_is_sure_or_surer(scores, narrow, monkeypatch):
+def test_fit_boxes_narrows_boxes_beside_neighbors(scores, narrow, monkeypatch):
     people = fitted(monkeypatch, scores, [(0, 0), (0, 0.6)])
     widths = [0.64 + 2 * (0.1 if is_narrow else 0.15) for is_narrow in narrow]
     np.testing.assert_allclose([box.size[1] for _, box, _ in people], widths, atol=1e-3)
 
 
-def test_a_known_person_keeps_the_box_and_has_points_around_it(monkeypatch):
+def test_fit_boxes_keeps_known_box(monkeypatch):
     box = Box(center=(0, 0, 0.9), size=(0.6, 0.6, 1.8), mounted=True)
     ((row, kept, rows),) = fitted(monkeypatch, [0.9], [(0, 0)], known={0: box})
     assert row == 0 and kept.mounted and kept.score == 0.9
@@ -129,7 +129,7 @@ def test_a_known_person_keeps_the_box_and_has_points_around_it(monkeypatch):
     assert len(rows) == 9 * 9 * 18
 
 
-def test_points_on_people_are_near_their_bones_or_in_their_known_boxes(monkeypatch):
+def test_on_people_uses_bones_or_known_boxes(monkeypatch):
     monkeypatch.setattr(
         verification, "_bundled", lambda name: SimpleNamespace(header=SimpleNamespace(skeleton=HUMAN15))
     )
@@ -144,7 +144,7 @@ def test_points_on_people_are_near_their_bones_or_in_their_known_boxes(monkeypat
     assert verification._on_people(places, people, points, {}).tolist() == [True, True, False, False, False, False]
 
 
-def test_detections_in_some_of_the_points_are_joined_by_the_numbers_of_all():
+def test_joined_detections_map_rows_to_all_points():
     def scored(count, rows):
         values = {name: np.arange(float(count)) for name in ("scores", "logits", "mounted")}
         places = {"joints": np.zeros((count, 15, 3)), "pelvises": np.zeros((count, 3))}
