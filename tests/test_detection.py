@@ -564,10 +564,10 @@ def test_verified_skips_candidates_below_min_score(monkeypatch):
     assert len(more) > len(people.boxes)
     for own, same in zip(people.boxes, more, strict=False):
         assert (own.score, *own.center, *own.size) == (same.score, *same.center, *same.size)
-    # of those who were verified, a third of the least score or less is nobody
+    # verified detections below a third of the score threshold are rejected
     nobody = detections.centers[(highest >= 0.6) & (scores < 0.2)]
     np.testing.assert_array_equal(people.rejected, nobody)
-    # who is known is not verified again, which makes nobody of no one
+    # known people are not verified again and their positions are not rejected
     own = [people.pelvises[:1], people.boxes[0].center[None], np.array([0.5])]
     known = KnownPlaces(
         boxes=people.boxes[:1],
@@ -577,7 +577,7 @@ def test_verified_skips_candidates_below_min_score(monkeypatch):
     again = verification.verified(detections, points, origin, header, 0.6, known=known)
     assert sorted(again.verified) == [False] + [True] * (len(people.boxes) - 1) and len(nobody)
     assert {tuple(place) for place in again.rejected} <= {tuple(place) for place in nobody}
-    # of one person who is asked for, two places are posed: the surest
+    # for max_people=1, the two highest-scoring detections are posed
     verified.clear()
     (alone,) = verification.verified(detections, points, origin, header, 0.6, 1).boxes
     assert sorted(verified[1][0]) == sorted(np.lexsort((-logits, -np.nan_to_num(scores)))[:2])

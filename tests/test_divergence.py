@@ -146,7 +146,7 @@ def test_scan_beams_start_at_own_origin(azimuth):
 @pytest.mark.parametrize("azimuth", [0.7, np.pi])
 def test_scan_window_of_each_origin_holds_body(azimuth):
     body = box_at(azimuth)
-    # many vertices, since the window holds vertices rather than edges
+    # points along the edges, since the window is that of vertices
     share = np.linspace(0, 1, 40)[:, None, None]
     corners = body.vertices[body.faces]
     edges = (corners + share[:, :, None] * (np.roll(corners, 1, 1) - corners)).reshape(-1, 3)
@@ -163,7 +163,7 @@ def test_scan_columns_match_azimuths_for_several_origins():
     hits = scan(body.vertices, body.faces, AV2, window_vertices=both, moved=body.vertices + step)
     azimuths = -np.pi + (hits.column + hits.column0) * AV2.azimuth_step + AV2.azimuth_shifts[hits.ring]
     np.testing.assert_allclose(np.arctan2(hits.points[:, 1], hits.points[:, 0]), azimuths, atol=1e-5)
-    # the windows of the two origins begin in other columns, now of the one first, now of the other
+    # windows of the two origins start in different columns, in either order
     body = box_at(2.0)
     for first in (-1, 1):
         offsets = 0.4 * first * np.sign(AV2.ring_lags - 0.1) * AV2.azimuth_step

@@ -381,7 +381,7 @@ def test_example_moves_points_and_joints_together():
         offsets = sample.points[0] - sample.pose.joints
         np.testing.assert_allclose(shown.points[0] - shown.joints, offsets, atol=1e-5)
         np.testing.assert_array_equal(shown.part, sample.part)
-        # clutter beside a joint does not show it
+        # clutter near a joint does not make it visible
         body = sample.points[sample.part > 0]
         np.testing.assert_array_equal(shown.visible, visible_joints(sample.pose.joints, body))
         assert np.abs(np.median(shown.points, axis=0)).max() < 1.0

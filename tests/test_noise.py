@@ -197,7 +197,7 @@ def test_add_sensor_noise_has_configured_range_errors():
 
 
 def test_intensity_dropout_is_half_at_half_range_max():
-    """Clothes reflect a quarter of the target for which the maximum range is stated."""
+    """Of surfaces that face the sensor; see `REACH`."""
     vertices = np.array([[50, -1, -1], [50, 1, -1], [50, 0, 2]], np.float32)
     mesh, count = Mesh(vertices, np.array([[0, 1, 2]], np.int32)), 4000
     zeros = np.zeros(count, np.int32)

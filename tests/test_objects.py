@@ -154,6 +154,6 @@ def test_people_in_is_unknown_for_few_points_of_second_person():
     for others, due in ((0, 0.0), (9, np.nan), (14, np.nan), (15, 1.0), (60, 1.0)):
         sample = Sample(points=points, center=np.zeros(3), second_person_points=others)
         np.testing.assert_array_equal(people_in(sample), np.float32([1, due]))
-    # of many points a tenth
+    # at least a tenth of the points
     for others, due in ((29, np.nan), (30, 1.0)):
         assert second_person_label(others, 300) == pytest.approx(due, nan_ok=True)

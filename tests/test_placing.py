@@ -93,7 +93,7 @@ def test_narrow_field_of_view_holds_whole_person():
     for _ in range(400):
         place = draw_place(replace(WILD, distance=(5.0, 6.0)), device, 1.7, 1.2, 1.0, rng)
         sides.append(abs(np.arctan2(place.feet[1], place.feet[0])) + np.arctan2(1.2, place.distance))
-    # but for 5 percent
+    # about 5 percent may be cut
     assert np.mean(np.array(sides) > device.azimuths[1] + 1e-9) < 0.06
 
 
@@ -116,7 +116,7 @@ def test_inverted_sensor_ignores_tilt_of_upright_mount(tilt):
         assert 2 <= -place.feet[2] <= 5
         ends = place.to_sensor(place.feet + np.array([[0, 0, 0], [0, 0, 1.7]]))
         feet, head = np.arctan2(ends[:, 2], np.hypot(ends[:, 0], ends[:, 1]))
-        # upside down, and the person in the fan or about its middle
+        # upside down, with the person inside the fan or centered in it
         low, high = device.elevations[[0, -1]]
         assert feet > head and ((low - 1e-9 <= head and feet <= high + 1e-9) or abs(feet + head - low - high) < 1e-6)
 

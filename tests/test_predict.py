@@ -778,10 +778,10 @@ def answers(*people):
 @pytest.mark.parametrize(
     ("people", "box_x", "best", "second"),
     [
-        # the surest; whoever is beside counts as a second person if sure, too
+        # the most confident pose; confident poses beside it count as a second person
         ([(0, 0.5, 0.9), (1, 0.9, 0.8), (5, 0.2, 1.0)], None, 1, 0.1),
         ([(0, 0.6, 0.9), (1, 0.9, 0.8)], None, 1, 0.9),
-        # with a box the surest of the nearest person among those who are sure
+        # with a box, the most confident pose of the nearest person among confident poses
         ([(0, 0.6, 0.9), (0.2, 0.7, 0.5), (1, 0.9, 0.8)], 0.1, 1, 0.8),
         ([(0.1, 0.3, 0.9), (1, 0.9, 0.8), (2, 0.95, 0.7)], 0.1, 1, 0.7),
         ([(0, 0.6, 0.05), (1, 0.9, 0.05)], 0.8, 1, 0.1),
@@ -924,6 +924,6 @@ def test_predict_checks_upside_down_people_in_one_batch(model, points, monkeypat
     same = model.predict_in([points * [1, -1, -1]] * 3, np.array([0.1, 0.2, 0.3]), check_upside_down=False)
     assert batches == [3] * 2
     np.testing.assert_array_equal(same.to_numpy(), people.to_numpy())
-    # who lies may have another axis up, which is said of the whole scan
+    # lying people get no warning of their own
     monkeypatch.setattr(predictor, "is_lying", lambda pose, part: True)
     assert not any("try up" in line for line in model.predict(points * [1, -1, -1]).warnings)

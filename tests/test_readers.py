@@ -89,7 +89,7 @@ def test_humanm3_box_encloses_joints_and_crops_points(tmp_path, smpl):
         np.testing.assert_allclose(box.size, np.ptp(joints, 0) + 0.4, atol=1e-5)
         np.testing.assert_array_equal(item.centers["joints_box"], box.center)
         assert box.contains(item.points, 0.3001).all() and len(item.points) >= 150
-        # four LiDARs
+        # the clouds are fused from four LiDARs
         assert not item.sensor_known and np.isnan(item.distance)
     # the box extends 20 cm beyond the joints; points within 30 cm of the box are kept
     top = items[0].box.center + [0, 0, items[0].box.size[2] / 2]

@@ -203,7 +203,7 @@ def test_center_of_is_robust_to_stray_points():
     for far in (10.0, 1e3, 1e6, 1e9):
         strays = np.array([[far, far, far], [-far, far, -far]])
         assert np.abs(center_of(np.concatenate([points, strays])) - center_of(points)).max() <= 0.1 + 1e-9
-        # a dense part of the body counts no more than its cells
+        # the density of points has no effect
         dense = np.concatenate([points, strays, points[:1].repeat(500, 0)])
         np.testing.assert_allclose(center_of(dense), center_of(np.concatenate([points, strays])), atol=1e-9)
 
@@ -215,7 +215,7 @@ def test_center_of_single_point_is_cell_center():
 def test_box_contains_rejects_invalid_points():
     box = Box(center=[0, 0, 0], size=[1, 1, 2])
     assert box.contains(np.zeros((2, 4))).tolist() == [True, True]
-    # its faces are part of it
+    # faces belong to the box
     assert box.contains(np.array([[0.5, 0.5, 1], [-0.5, -0.5, -1], [0, 0, 1.001]])).tolist() == [True, True, False]
     for wrong in (np.zeros(3), np.zeros((4, 2)), np.zeros((2, 3, 3)), "points", [[1, 2, 3], [1, 2]]):
         with pytest.raises(InputError, match=r"^Box.contains: expected points \(n, 3\) m, got shape"):
@@ -240,11 +240,11 @@ def test_facing_is_perpendicular_to_left_right_axis(yaw, lean):
 
 
 def test_facing_is_none_for_vertical_or_short_axis():
-    # as on the side: 15 degrees from the vertical, and hardly any width
+    # 15 degrees from the vertical, and a very short axis
     for axis in ([0, np.sin(np.radians(15)), np.cos(np.radians(15))], [0, 0.015, 0]):
         assert facing(with_axis(axis)) is None and facing_yaw(with_axis(axis)) == 0
     assert facing(None) is None
-    # at 20 degrees, and a child's hips
+    # 20 degrees from the vertical, and the hips of a child
     for axis in ([0, np.sin(np.radians(20)), np.cos(np.radians(20))], [0, 0.05, 0]):
         np.testing.assert_allclose(facing(with_axis(axis)), [1, 0, 0])
 

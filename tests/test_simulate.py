@@ -194,10 +194,10 @@ def test_scan_background_shows_static_meshes_behind_person():
     where = replace(where, background=[ground, wall, other], still=2)
     points = scan_background(where, body(where), 0)
     depth = local(points, where)[:, 0]
-    # the wall 3 m behind, the other person, who moves, 1.2 m behind; nothing is before the wall but the ground
+    # only the ground is in front of the wall: the other person, the last mesh, is not static
     is_ground = np.abs(points[:, 2] - feet[2]) < 1e-3
     assert np.abs(depth[~is_ground] - 2.95).max() < 0.01 and (~is_ground).sum() > 500
-    # a degree to each side of the body
+    # the window is a degree wider than the body on each side
     azimuth, body_azimuth = (np.arctan2(xyz[:, 1], xyz[:, 0]) for xyz in (points, body(where).vertices))
     np.testing.assert_allclose(
         np.degrees([azimuth.min() - body_azimuth.min(), azimuth.max() - body_azimuth.max()]), [-1, 1], atol=0.15

@@ -180,7 +180,7 @@ def test_smoothing_fills_and_marks_unseen_frames(walker):
     assert live[10].spread.mean() > 2 * live[4].spread.mean()
     assert (live[10].visible == 0).all()
     np.testing.assert_allclose(live[10].confidence, likely_hit(live[10].spread))
-    # in a gap the confidence follows from the spread, elsewhere it is the network's
+    # confidence of filled frames follows from their spread; that of other frames is unchanged
     steady = smooth(replace(given, confidence=track.confidence))
     np.testing.assert_allclose(steady.confidence[5:13], likely_hit(steady.spread[5:13]))
     assert (steady.confidence[:5] == 0.8).all()
@@ -191,7 +191,7 @@ def test_smooth_fills_gaps_up_to_max_gap(walker, gap, is_filled):
     _, track = walker(frames=60)
     joints = track.joints.copy()
     joints[20 : 20 + gap] = np.nan
-    # at 0.9 s from either end
+    # frame 29 is 0.9 s or more from both ends of the gap
     assert smooth(replace(track, joints=joints)).filled[29] == is_filled
 
 
@@ -241,7 +241,7 @@ def test_live_filter_keeps_bone_lengths(walker):
 
 
 def test_learn_process_noise_matches_enumeration():
-    """Against a sum over every course that the scales may take from frame to frame."""
+    """The enumeration sums over all sequences of scales."""
     rng = np.random.default_rng(0)
     times, usual = np.array([0.0, 0.2, 3.0, 3.4]), np.array([0.04, 0.4])
     joints = np.cumsum(rng.normal(0, 0.3, (4, 2, 3)), 0)
@@ -267,7 +267,7 @@ def test_learn_process_noise_matches_enumeration():
 def test_facing_correction_follows_walking_direction(walker, sign):
     true, track = walker()
     flip = list(track.skeleton.flip)
-    # the same walk, forth or back in time
+    # the same walk forward or backward in time
     track = replace(track, joints=track.joints[::sign].copy(), confidence=np.zeros(track.spread.shape))
     joints = with_facing_corrected(track).joints
     np.testing.assert_array_equal(joints, track.joints if sign > 0 else track.joints[:, flip])

@@ -265,7 +265,7 @@ def test_tracker_smooths_heading_and_size():
         yaw, own_size = 0.4 * k, np.array([0.5 + 0.1 * k, 0.5, 1.7 - 0.05 * k])
         tracker.update(time, [Box(center=(0, 0, 0.9), size=own_size, yaw=yaw)])
         if k:
-            # the mean of all so far, or with a time constant of half a second
+            # the mean of all boxes so far, or a filter with a time constant of 0.5 s
             weight = max(1 / (k + 1), 1 - np.exp(-(time - times[k - 1]) / 0.5))
             heading = heading + weight * (np.array([np.cos(yaw), np.sin(yaw)]) - heading)
             size = size + weight * (own_size - size)

@@ -375,7 +375,7 @@ def test_add_disturbances_changes_points_only():
         assert (other.part[count:] == 0).all() and len(other.part) == len(other.points) and other.pose is sample.pose
         np.testing.assert_array_equal(other.center, center_of(other.points))
     assert max(len(other.points) for other in cluttered) > count + 50
-    # in a crop of two people the center tells who is meant
+    # the center is kept in a crop of two people
     crowded = replace(sample, source="synth/wide/os1-64/inverted+crowded", center=sample.center + np.float32(0.3))
     moved = add_disturbances(crowded, strays=1.0, noise=1.0, rng=np.random.default_rng(0))
     assert len(moved.points) != count and np.array_equal(moved.center, crowded.center)

@@ -60,7 +60,7 @@ def detections_at(*places):
 
 
 def test_verification_features_and_score_bound(monkeypatch):
-    """The verifier is asked about the columns with five points or more."""
+    """Columns with fewer than five points are not verified."""
     places = [(5.0, 0.0, 1.0), (9.0, 0.0, 1.0), (13.0, 0.0, 1.0)]
     clouds = {
         k: np.repeat([place], count, axis=0) for k, (place, count) in enumerate(zip(places, (9, 4, 20), strict=True))
@@ -79,7 +79,7 @@ def test_verification_features_and_score_bound(monkeypatch):
     np.testing.assert_allclose(features[:, 1], [6 + 0.2, np.nan, -2 - 0.02])
     np.testing.assert_allclose(features[:, 2], np.log([10, 5, 21]))
     np.testing.assert_allclose(mounted, [0.5, np.nan, 0.75])
-    # no output of the verifier scores more than is thought possible
+    # the bound holds for any output of the verifier
     header = {"verification": {"bias": -1.0, "logit": 1.0, "verifier": 0.5, "log_points": 0.1}}
     highest = verification._highest_score(detections_at(*places), header)
     for odds in (-6.5, 0.0, 6.5):
@@ -89,7 +89,7 @@ def test_verification_features_and_score_bound(monkeypatch):
 
 
 def fitted(monkeypatch, scores, places, mounted=0.0, sure=0.5, max_people=None, known=None):
-    """Boxes about people who stand at places (x, y), and how many points each has of a grid about all of them."""
+    """Boxes of standing people at places (x, y), fitted to a grid of points around all of them."""
     network = SimpleNamespace(header=SimpleNamespace(skeleton=HUMAN15))
     monkeypatch.setattr(verification, "_bundled", lambda name: network)
     joints = np.array([standing(0.0, np.array([*place, 0.0])).joints for place in places])
@@ -108,7 +108,7 @@ def fitted(monkeypatch, scores, places, mounted=0.0, sure=0.5, max_people=None, 
 
 def test_fit_boxes_keeps_score_and_mounted_without_duplicates(monkeypatch):
     people = fitted(monkeypatch, [0.6, 0.9, 0.7], [(0, 0), (0, 2), (0.2, 2)], mounted=[0.4, 0.6, 0.1])
-    # the third is the second again
+    # the third detection duplicates the second
     assert [(row, box.score, box.mounted) for row, box, _ in people] == [(1, 0.9, True), (0, 0.6, False)]
     assert [row for row, _, _ in fitted(monkeypatch, [0.6, 0.9], [(0, 0), (0, 2)], max_people=1)] == [1]
 
@@ -125,7 +125,7 @@ def test_fit_boxes_keeps_known_box(monkeypatch):
     ((row, kept, rows),) = fitted(monkeypatch, [0.9], [(0, 0)], known={0: box})
     assert row == 0 and kept.mounted and kept.score == 0.9
     np.testing.assert_array_equal(kept.size, box.size)
-    # from 15 cm to either side: 9 by 9 columns of the grid
+    # with a margin of 15 cm: 9 x 9 columns of the grid
     assert len(rows) == 9 * 9 * 18
 
 
@@ -134,7 +134,7 @@ def test_on_people_uses_bones_or_known_boxes(monkeypatch):
         verification, "_bundled", lambda name: SimpleNamespace(header=SimpleNamespace(skeleton=HUMAN15))
     )
     joints = np.stack([standing(0.0, np.array([x, 0.0, 0.0])).joints for x in (0.0, 5.0)])
-    # at the left knee, at 17 and 19 cm before it, between the knees and the hands, and beside the second
+    # at the left knee, 17 and 19 cm in front of it, between bones, and two points far from the first person
     points = np.array([[0, 0.1, 0.5], [0.19, 0.1, 0.5], [0.21, 0.1, 0.5], [0.05, 0.32, 0.5], [0, 0, 3], [5, 1, 1]])
     places = SimpleNamespace(joints=joints, near_rows=[np.array([4, 3, 2, 1, 0]), np.array([5])])
     box = Box(center=(0, 0, 1), size=(1, 1, 2))

@@ -175,6 +175,6 @@ def test_view_features_point_to_sensor():
     np.testing.assert_allclose(center + view[:3] * np.exp(view[3]), origin, atol=1e-5)
     assert view[4] == 1 and np.exp(view[3]) == pytest.approx(5, rel=1e-5)
     np.testing.assert_array_equal(view_features(center, None), np.zeros(5))
-    # nearer than 10 cm the range says no more
+    # ranges are at least 10 cm
     np.testing.assert_allclose(view_features(center, center + [0.02, 0, 0]), [0.2, 0, 0, np.log(0.1), 1], atol=1e-6)
     np.testing.assert_allclose(view_features(center, center), [0, 0, 0, np.log(0.1), 1], atol=1e-6)

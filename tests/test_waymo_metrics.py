@@ -89,7 +89,7 @@ def test_pck_box_matches_documented_example():
     pred[0, 7:, 0] += 0.2521
     assert metrics.pck_box(pred, true, boxes[:, 3:6]) == 50
     assert metrics.pck_box(pred, true, SIZE, threshold=0.3) == 100
-    # at the threshold itself, too
+    # joints at the threshold count
     one = np.zeros((1, 1, 3))
     assert metrics.pck_box(one + [0.25, 0, 0], one, (1, 1, 1), threshold=0.25) == 100
     # as in Waymo's code: the threshold times the sigma of each joint
@@ -236,7 +236,7 @@ def test_pem_does_not_excuse_predictions_of_labeled_people():
     whose, boxes = people(10)
     found = metrics.pem([away], [whose], [boxes], [np.zeros((1, J))])
     assert (found.people_excused, found.people_extra, found.extra) == (1, 1, J)
-    # nor whoever has no keypoint inside their box, however near
+    # predictions near the box without keypoints inside are not excused
     found = metrics.pem([whose + [0.9, 0, 0]], [whose], [boxes], [np.zeros((1, J))])
     assert (found.people_excused, found.people_extra, found.extra) == (0, 1, J)
 
@@ -247,7 +247,7 @@ def test_pem_does_not_match_far_from_the_box():
     boxes[:, 0] += 2
     found = metrics.pem([true], [true], [boxes])
     assert found.pem == pytest.approx(250) and (found.people_missed, found.people_extra) == (1, 1)
-    # the nearest keypoint decides: 24 or 26 cm in front of the box
+    # by the nearest keypoint, 24 or 26 cm in front of the box
     for gap, people_matched in ((0.24, 1), (0.26, 0)):
         boxes[:, 0] = true[0, :, 0].max() + gap + SIZE[0] / 2
         assert metrics.pem([true], [true], [boxes]).people == people_matched
