@@ -369,10 +369,12 @@ def test_beam_window_covers_box_and_second_person(name, crowded):
 
 @pytest.mark.parametrize("window", [0.0, 1.0])
 def test_beam_window_uses_sample_box_in_every_scan(window, monkeypatch):
-    boxes, cast = [], simulate_module._cast
+    boxes, from_feet, cast = [], [], simulate_module._cast
 
     def recorded(scene, meshes, frame, *, margin=0.0, box=None):
         boxes.append(box)
+        if box is not None:
+            from_feet.append(box.center - scene.place.feet)
         return cast(scene, meshes, frame, margin=margin, box=box)
 
     monkeypatch.setattr(simulate_module, "_cast", recorded)
@@ -382,12 +384,15 @@ def test_beam_window_uses_sample_box_in_every_scan(window, monkeypatch):
     )
     for draw in (lambda: [merged.person(SEED, 0)], lambda: clips.clip(SEED, 0, frames=2)):
         boxes.clear()
+        from_feet.clear()
         drawn_boxes = [person.sample.box for person in draw()]
         window_boxes = [box for box in boxes if box is not None]
         assert len(boxes) > 1 and bool(window_boxes) == bool(window)
         # other sensors have the box in their own frames
         assert {tuple(box.size) for box in window_boxes} == {tuple(box.size) for box in drawn_boxes if window}
         assert not window or np.array_equal(window_boxes[0].center, drawn_boxes[0].center)
+        if window and len(drawn_boxes) == 1:
+            np.testing.assert_allclose(from_feet, [from_feet[0]] * len(from_feet), atol=1e-9)
 
 
 @pytest.mark.long

@@ -179,6 +179,7 @@ def test_read_boxes_converts_kitti_labels_to_lidar_frame(tmp_path, tracking):
     # the vertical axes of camera and LiDAR differ: 4 cm and a degree at most
     np.testing.assert_allclose([fields(box) for box in boxes], rows, atol=0.04)
     np.testing.assert_allclose([box.size for box in boxes], rows[:, 3:6], atol=1e-6)
+    np.testing.assert_allclose([box.center for box in boxes], rows[:, :3], atol=1e-5)
     assert [fields(box) for box in read_boxes(label, calib=calib)] == [fields(box) for box in boxes]
 
     for text, words in (

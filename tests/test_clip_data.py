@@ -32,6 +32,8 @@ def test_rotation_vector_round_trip_near_half_turn():
     angle = np.concatenate([np.pi - np.geomspace(1e-9, 0.1, 199), [np.pi]])
     R = axis_angle_to_matrix(axis * angle[:, None])
     np.testing.assert_allclose(axis_angle_to_matrix(rotation_vector(R)), R, atol=2e-6)
+    # in single precision, too
+    np.testing.assert_allclose(axis_angle_to_matrix(rotation_vector(R.astype(np.float32))), R, atol=1e-3)
     assert np.abs(rotation_vector(np.eye(3))).max() == 0
 
 

@@ -108,6 +108,19 @@ def test_decoders_accept_few_bins_and_float16(name):
     np.testing.assert_allclose(find(logits, low=0.0, step=1.0), [30, 2], atol=0.01)
 
 
+@pytest.mark.parametrize("constant", [-1e4, 1e3, 1e4])
+def test_window_is_invariant_to_constant_offset(constant):
+    logits = gaussian([7.3, 12.0], 24)
+    moved = decode.window(logits + constant, low=0.0, step=1.0)
+    np.testing.assert_allclose(moved, decode.window(logits, low=0.0, step=1.0), atol=1e-9)
+
+
+def test_sigmoid_inverts_log_odds():
+    odds = np.array([0.01, 0.5, 1, 3, 99])
+    np.testing.assert_allclose(decode.sigmoid(np.log(odds)), odds / (1 + odds))
+    assert decode.sigmoid(np.array([-1e4, 1e4])).tolist() == [0, 1]
+
+
 def test_out_of_range_detects_peaks_at_end_bins():
     logits = gaussian(np.array([[0.0, 1.0], [70.0, 71.0]]), 72)
     assert decode.out_of_range(logits).tolist() == [[True, False], [False, True]]

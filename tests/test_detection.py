@@ -16,6 +16,7 @@ from lidarpose.errors import InputError
 from lidarpose.eval.detector.labeled_scans import heldout_scans
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
 from lidarpose.inference import detection, verification
+from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.lidar.raycast import scan
 from lidarpose.models.detector.candidates import SceneIndex
 from lidarpose.models.detector.detector import Detector, rows_that_matter
@@ -564,6 +565,24 @@ def test_verified_skips_candidates_below_min_score(monkeypatch):
     assert len(more) > len(people.boxes)
     for own, same in zip(people.boxes, more, strict=False):
         assert (own.score, *own.center, *own.size) == (same.score, *same.center, *same.size)
+    # verified detections below a third of the score threshold are rejected
+    nobody = detections.centers[(highest >= 0.6) & (scores < 0.2)]
+    np.testing.assert_array_equal(people.rejected, nobody)
+    # known people are not verified again and their positions are not rejected
+    own = [people.pelvises[:1], people.boxes[0].center[None], np.array([0.5])]
+    known = KnownPlaces(
+        boxes=people.boxes[:1],
+        **dict(zip(("pelvises", "tracks", "reach"), own, strict=True)),
+        rejected=np.zeros((0, 3)),
+    )
+    again = verification.verified(detections, points, origin, header, 0.6, known=known)
+    assert sorted(again.verified) == [False] + [True] * (len(people.boxes) - 1) and len(nobody)
+    assert {tuple(place) for place in again.rejected} <= {tuple(place) for place in nobody}
+    # for max_people=1, the two highest-scoring detections are posed
+    verified.clear()
+    (alone,) = verification.verified(detections, points, origin, header, 0.6, 1).boxes
+    assert sorted(verified[1][0]) == sorted(np.lexsort((-logits, -np.nan_to_num(scores)))[:2])
+    np.testing.assert_array_equal(alone.center, people.boxes[0].center)
     # people share few points with those of higher scores
     owned = set()
     for rows in people.rows:

@@ -61,6 +61,8 @@ def test_footprint_is_even_and_normalized():
     assert offsets == pytest.approx([-0.001, 0, 0.001]) and weights.sum() == pytest.approx(1)
     assert weights == pytest.approx(weights.T) and weights[1, 1] == weights.max()
     assert weights[0] == pytest.approx(weights[2])
+    # a Gaussian that falls to 1/e^2 at half the divergence
+    assert weights[1, 2] / weights[1, 1] == pytest.approx(np.exp(-2 * (0.001 / 0.0015) ** 2))
 
 
 def test_divergence_widens_silhouettes_by_half_its_angle():
@@ -139,6 +141,37 @@ def test_scan_beams_start_at_own_origin(azimuth):
     assert (np.diff(key) > 0).all()
     assert hits.column.max() < hits.columns and hits.row0 <= hits.ring.min()
     assert hits.ring.max() < hits.row0 + hits.rows
+
+
+@pytest.mark.parametrize("azimuth", [0.7, np.pi])
+def test_scan_window_of_each_origin_holds_body(azimuth):
+    body = box_at(azimuth)
+    # points along the edges, since the window is that of vertices
+    share = np.linspace(0, 1, 40)[:, None, None]
+    corners = body.vertices[body.faces]
+    edges = (corners + share[:, :, None] * (np.roll(corners, 1, 1) - corners)).reshape(-1, 3)
+    own = scan(body.vertices, body.faces, AV2, window_vertices=edges)
+    wide = scan(body.vertices, body.faces, AV2, window_vertices=edges, margin=0.1)
+    np.testing.assert_array_equal(own.points, wide.points)
+    np.testing.assert_array_equal((own.column + own.column0) % AV2.columns, (wide.column + wide.column0) % AV2.columns)
+    assert own.rows < wide.rows and own.columns < wide.columns
+
+
+def test_scan_columns_match_azimuths_for_several_origins():
+    body, step = box_at(1.1), np.array([0.3, -0.3, 0.0])
+    both = np.concatenate([body.vertices, body.vertices + step])
+    hits = scan(body.vertices, body.faces, AV2, window_vertices=both, moved=body.vertices + step)
+    azimuths = -np.pi + (hits.column + hits.column0) * AV2.azimuth_step + AV2.azimuth_shifts[hits.ring]
+    np.testing.assert_allclose(np.arctan2(hits.points[:, 1], hits.points[:, 0]), azimuths, atol=1e-5)
+    # windows of the two origins start in different columns, in either order
+    body = box_at(2.0)
+    for first in (-1, 1):
+        offsets = 0.4 * first * np.sign(AV2.ring_lags - 0.1) * AV2.azimuth_step
+        apart = replace(AV2, azimuth_offsets=offsets)
+        hits = scan(body.vertices, body.faces, apart)
+        azimuths = -np.pi + (hits.column + hits.column0) * apart.azimuth_step + apart.azimuth_shifts[hits.ring]
+        np.testing.assert_allclose(np.arctan2(hits.points[:, 1], hits.points[:, 0]), azimuths, atol=1e-5)
+        assert hits.column.min() >= 0
 
 
 def test_scan_with_equal_origins_equals_single_origin():

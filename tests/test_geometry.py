@@ -13,6 +13,7 @@ from lidarpose.geometry import (
     distance_to_segments,
     from_spherical,
     inverse_transform,
+    is_rotation,
     quaternion_to_matrix,
     rigid_transform,
     rotation_about,
@@ -115,6 +116,8 @@ def test_rotation_from_up_maps_axis_to_z(up):
     assert np.linalg.det(rotation) == pytest.approx(1)
     sign = -1 if up[0] == "-" else 1
     np.testing.assert_array_equal(rotation @ np.eye(3)["xyz".index(up[-1])], [0, 0, sign])
+    # forward is x of an input with z up or down, else its z
+    np.testing.assert_array_equal(rotation @ np.eye(3)["xyz".index("x" if up[-1] == "z" else "z")], [1, 0, 0])
 
 
 def test_rotation_from_up_known_and_invalid_axes():
@@ -189,6 +192,15 @@ def test_rigid_transforms_and_quaternions(seed):
     half = np.linalg.norm(axis_angle) / 2
     quaternion = np.array([np.cos(half), *(np.sin(half) * unit(axis_angle))])
     np.testing.assert_allclose(quaternion_to_matrix(-7 * quaternion), R, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("factor", "is_one"), [(1.0, True), (1.004, True), (1.02, False), (-1.0, False), (1e300, False)]
+)
+def test_is_rotation_rejects_scales_and_mirrors(factor, is_one):
+    R = axis_angle_to_matrix(np.array([0.3, -1.2, 0.5]))
+    assert is_rotation(factor * R) is is_one
+    assert not is_rotation(R @ np.diag([1, 1, -1])) and not is_rotation(np.zeros((3, 3)))
 
 
 @quick

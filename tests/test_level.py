@@ -36,6 +36,18 @@ def test_leveling_finds_up_from_turning_people(degrees):
         assert np.degrees(np.arccos((np.trace(found) - 1) / 2)) == pytest.approx(degrees, abs=2)
 
 
+def test_leveling_compensates_forward_lean():
+    joints, lean = people(0), np.radians(12)
+    left = joints[:, 1] - joints[:, 2]
+    headings = np.linspace(-1.2, 1.2, len(joints))
+    for k, yaw in enumerate(np.arctan2(left[:, 1], left[:, 0])):
+        # the left side along y, then forward over the hips, then to the heading
+        ahead = joints[k] @ rotation_about("z", np.pi / 2 - yaw).T @ rotation_about("y", lean).T
+        joints[k] = ahead @ rotation_about("z", headings[k]).T
+    up, _ = up_of_people(joints)
+    assert np.degrees(np.arccos(up[2])) < 4
+
+
 def test_leveling_is_none_for_few_frames():
     assert up_of_people(people(15, frames=LEAST_FRAMES - 1)) is None and leveling(people(15, frames=3)) is None
 

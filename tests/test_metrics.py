@@ -240,6 +240,8 @@ def test_calibration_error_by_hand():
     hit = np.array([1, 1, 0, 0] + [1] * 3 + [0] * 17)
     assert metrics.calibration_error(confidence, hit) == pytest.approx(0.45 * 4 / 24)
     assert metrics.calibration_error([1.0, 0.0], [True, False]) == 0
+    # a confidence of 1 is in the last bin, not in the first
+    assert metrics.calibration_error([1.0, 0.05], [False, True]) == pytest.approx((1 + 0.95) / 2)
     assert np.isnan(metrics.calibration_error([], []))
 
 

@@ -16,8 +16,11 @@ from lidarpose.models.decode import HALF_WIDTH
 from lidarpose.models.decode import window as window_mean
 from lidarpose.models.layers import (
     REACH,
+    WAVELENGTHS,
     Convolution,
     CrossAttention,
+    JointHead,
+    PersonHead,
     RotaryEmbedding,
     VoteHead,
     attend,
@@ -258,6 +261,12 @@ def test_rotary_embedding_depends_on_relative_position():
     torch.testing.assert_close(product(here, here), (query * key).sum(-1), atol=1e-5, rtol=1e-5)
 
 
+def test_head_frequencies_cycle_through_wavelengths():
+    waves = 2 * np.pi / head_frequencies(5, 24).numpy()
+    assert waves.shape == (5, 1, 4)
+    np.testing.assert_allclose(waves.ravel(), [WAVELENGTHS[k % len(WAVELENGTHS)] for k in range(20)], rtol=1e-6)
+
+
 def test_cross_attention_matches_loop():
     """The loop takes one query, one head and one voxel at a time."""
     torch.manual_seed(0)
@@ -304,6 +313,24 @@ def test_vote_head_matches_loop():
             torch.testing.assert_close(felt[b, j], weight @ voxels[b, :n], atol=1e-5, rtol=1e-4)
 
 
+def test_joint_head_uses_vote_without_gradient():
+    torch.manual_seed(0)
+    head, anchors, voxels = JointHead(32, 20, 24), torch.randn(2, 5, 32), torch.randn(2, 5, 20)
+    vote = torch.randn(2, 5, 3, requires_grad=True)
+    for value, other in zip(head(anchors, voxels, vote), head(anchors, voxels, vote + 1), strict=True):
+        assert torch.autograd.grad(value.sum(), vote, retain_graph=True, allow_unused=True) == (None,)
+        assert (value - other).abs().max() > 1e-3
+
+
+def test_person_head_ignores_padding_and_has_no_input_gradient():
+    torch.manual_seed(0)
+    head, anchors, voxels = PersonHead(32, 20, 5), torch.randn(2, 5, 32, requires_grad=True), torch.randn(2, 7, 20)
+    certainty, valid = [torch.randn(2, 5) for _ in range(3)], torch.arange(7) < torch.tensor([[4], [7]])
+    logits = head(anchors, voxels, valid, certainty)
+    torch.testing.assert_close(head(anchors, voxels[:, :4], valid[:, :4], certainty)[0], logits[0])
+    assert torch.autograd.grad(logits.sum(), anchors, allow_unused=True) == (None,)
+
+
 # --- heatmaps
 
 # the target is 1.2 bins wide and not cut at this distance from the window's edge
@@ -318,6 +345,8 @@ def test_decode_is_within_tenth_of_bin_and_symmetric(offsets):
     torch.testing.assert_close(heatmap.sum(-1), torch.ones(len(offsets)))
     assert (decode(heatmap.log()) - offset).abs().max() < 0.1 * BIN
     torch.testing.assert_close(heatmap, encode(-offset, SIGMA, BINS).flip(-1), atol=1e-6, rtol=1e-5)
+    variance = (heatmap * (bin_centers(BINS) - offset[:, None]) ** 2).sum(-1)
+    torch.testing.assert_close(variance.sqrt(), torch.full_like(variance, SIGMA), atol=0, rtol=0.02)
     torch.testing.assert_close(bin_centers(BINS), -bin_centers(BINS).flip(-1), atol=1e-6, rtol=0)
 
 
@@ -352,6 +381,9 @@ def test_example_moves_points_and_joints_together():
         offsets = sample.points[0] - sample.pose.joints
         np.testing.assert_allclose(shown.points[0] - shown.joints, offsets, atol=1e-5)
         np.testing.assert_array_equal(shown.part, sample.part)
+        # clutter near a joint does not make it visible
+        body = sample.points[sample.part > 0]
+        np.testing.assert_array_equal(shown.visible, visible_joints(sample.pose.joints, body))
         assert np.abs(np.median(shown.points, axis=0)).max() < 1.0
         kinds.add(bool(shown.view[4]))
         if shown.view[4]:

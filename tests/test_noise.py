@@ -190,9 +190,21 @@ def test_add_sensor_noise_has_configured_range_errors():
     shared = error(bias=0.01)
     of_ring = np.array([shared[hits.ring == r].mean() for r in range(64)])
     np.testing.assert_allclose(shared, of_ring[hits.ring], atol=2e-6)
+    assert of_ring.std() == pytest.approx(0.01, rel=0.3)
     outwards = error(one_sided=0.02)
     assert outwards.min() > -2e-6 and outwards.max() < 0.0201
     assert outwards.mean() == pytest.approx(0.01, rel=0.03)
+
+
+def test_intensity_dropout_is_half_at_half_range_max():
+    """Of surfaces that face the sensor; see `REACH`."""
+    vertices = np.array([[50, -1, -1], [50, 1, -1], [50, 0, 2]], np.float32)
+    mesh, count = Mesh(vertices, np.array([[0, 1, 2]], np.int32)), 4000
+    zeros = np.zeros(count, np.int32)
+    points = np.tile(np.float32([50, 0, 0]), (count, 1))
+    wall = Hits(points=points, face=zeros, column=zeros, ring=zeros, columns=0, rows=0, column0=0, row0=0)
+    points, _ = add_sensor_noise(wall, mesh, PERFECT, ScanConditions(intensity_dropout=1.0), RNG(0))
+    assert len(points) / count == pytest.approx(0.5, abs=0.03)
 
 
 # --- clutter points, cuts, masks without a grid
@@ -342,6 +354,19 @@ def test_draw_box_has_configured_errors():
     assert abs(yaw.std() - WILD.jitter) < 0.01 and abs(yaw.mean()) < 0.01
     loose = boxes(WILD, rng, 800, difficulty=0.0)
     assert abs(np.mean([box.size[0] > 0.5 + 0.3 for box in loose]) - WILD.loose) < 0.04
+
+
+def test_draw_box_jitter_is_halved_in_z():
+    found = boxes(replace(EXACT, jitter=1.0), RNG(1), 800)
+    center, top = np.array([box.center for box in found]), [box.center[2] + box.size[2] / 2 for box in found]
+    np.testing.assert_allclose(center[:, :2].std(0), 1.0, atol=0.08)
+    assert np.std(top) == pytest.approx(0.5, abs=0.05)
+
+
+def test_draw_box_has_minimum_size():
+    flat = ([-0.02, -0.01, 0.0], [0.02, 0.01, 0.1])
+    sizes = [draw_box(EXACT, 1.0, flat, PLACE, RNG(seed)).size for seed in range(50)]
+    assert np.min(sizes) == 0.4
 
 
 def test_draw_box_cuts_increase_with_difficulty():

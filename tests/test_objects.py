@@ -19,7 +19,7 @@ from lidarpose.synth.scene import NoiseConfig, scene_config
 from lidarpose.synth.simulate import ScanConditions, Scene, simulate_still
 from lidarpose.synth.views import with_views
 from lidarpose.train import data_loader
-from lidarpose.train.augment import people_in
+from lidarpose.train.augment import people_in, second_person_label
 from lidarpose.train.data_loader import SyntheticSource
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.setup import make_setup
@@ -154,3 +154,6 @@ def test_people_in_is_unknown_for_few_points_of_second_person():
     for others, due in ((0, 0.0), (9, np.nan), (14, np.nan), (15, 1.0), (60, 1.0)):
         sample = Sample(points=points, center=np.zeros(3), second_person_points=others)
         np.testing.assert_array_equal(people_in(sample), np.float32([1, due]))
+    # at least a tenth of the points
+    for others, due in ((29, np.nan), (30, 1.0)):
+        assert second_person_label(others, 300) == pytest.approx(due, nan_ok=True)

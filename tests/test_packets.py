@@ -170,8 +170,11 @@ def write(path, ips, *, link="ethernet", order="<", nano=False, period=10**6):
     return path
 
 
-def write_ng(path, ips, order="<"):
-    """pcapng with two interfaces, the second in nanoseconds, and a block of unknown type."""
+def write_ng(path, ips, order="<", resolution=9, frequency=10**9):
+    """pcapng with two interfaces and a block of unknown type.
+
+    resolution: of the second interface's times, as its option states it; frequency: 1/s.
+    """
 
     def block(kind, body):
         body += bytes(-len(body) % 4)
@@ -179,11 +182,11 @@ def write_ng(path, ips, order="<"):
 
     data = block(0x0A0D0D0A, struct.pack(order + "IHHq", 0x1A2B3C4D, 1, 0, -1))
     data += block(1, struct.pack(order + "HHI", 1, 0, 0)) + block(0xBAD, b"what is this")
-    options = struct.pack(order + "HH4sHHB3sHH", 1, 3, b"abc\0", 9, 1, 9, b"", 0, 0)
+    options = struct.pack(order + "HH4sHHB3sHH", 1, 3, b"abc\0", 9, 1, resolution, b"", 0, 0)
     data += block(1, struct.pack(order + "HHI", 101, 0, 0) + options)
     for k, ip in enumerate(ips):
         frame = LINKS["ethernet"][1](ip) if k % 2 == 0 else ip
-        ticks = (1000 + k) * (10**6 if k % 2 == 0 else 10**9)
+        ticks = (1000 + k) * (10**6 if k % 2 == 0 else frequency)
         head = struct.pack(order + "5I", k % 2, ticks >> 32, ticks & 0xFFFFFFFF, len(frame), len(frame))
         data += block(6, head + frame)
     path.write_bytes(data)
@@ -215,6 +218,19 @@ def test_capture_reads_pcapng_and_ipv6(tmp_path, order):
     for path in (write_ng(tmp_path / "a.pcapng", ips, order), write(tmp_path / "a.pcap", ips)):
         datagrams = list(Capture(path))
         assert [datagram.payload for datagram in datagrams] == payloads and datagrams[0].time < datagrams[1].time < 1010
+
+
+@pytest.mark.parametrize(("resolution", "frequency"), [(9, 10**9), (3, 1000), (0x80 | 20, 2**20)])
+def test_pcapng_time_resolution(tmp_path, resolution, frequency):
+    ips = [ip4(bytes([k]))[0] for k in range(4)]
+    path = write_ng(tmp_path / "a.pcapng", ips, resolution=resolution, frequency=frequency)
+    assert [datagram.time for datagram in Capture(path)] == [1000, 1001, 1002, 1003]
+
+
+def test_capture_reads_packets_with_zero_length_field(tmp_path):
+    (packet,) = ip4(b"payload")
+    path = write(tmp_path / "a.pcap", [packet[:2] + b"\0\0" + packet[4:]], link="raw")
+    assert [datagram.payload for datagram in Capture(path)] == [b"payload"]
 
 
 def test_capture_joins_fragments_and_counts_incomplete_ones(tmp_path):

@@ -88,6 +88,15 @@ def test_draw_place_rarely_cuts_people_by_field_of_view(name):
     assert total > 100 and cut / total < 0.09
 
 
+def test_narrow_field_of_view_holds_whole_person():
+    device, rng, sides = sensor("livox-avia"), np.random.default_rng(4), []
+    for _ in range(400):
+        place = draw_place(replace(WILD, distance=(5.0, 6.0)), device, 1.7, 1.2, 1.0, rng)
+        sides.append(abs(np.arctan2(place.feet[1], place.feet[0])) + np.arctan2(1.2, place.distance))
+    # about 5 percent may be cut
+    assert np.mean(np.array(sides) > device.azimuths[1] + 1e-9) < 0.06
+
+
 def test_draw_place_paper_sensor_is_level_at_fixed_height():
     rng = np.random.default_rng(1)
     azimuths = []
@@ -97,6 +106,19 @@ def test_draw_place_paper_sensor_is_level_at_fixed_height():
         assert np.hypot(*place.feet[:2]) == pytest.approx(place.distance)
         azimuths.append(np.arctan2(place.feet[1], place.feet[0]))
     assert {int(a) for a in np.floor(np.array(azimuths) / (np.pi / 4))} == set(range(-4, 4))
+
+
+@pytest.mark.parametrize("tilt", [0.0, 40.0])
+def test_inverted_sensor_ignores_tilt_of_upright_mount(tilt):
+    device, rng = replace(sensor("vlp-16"), tilt=np.radians(tilt)), np.random.default_rng(2)
+    for _ in range(50):
+        place = draw_place(replace(WILD, mount=0.0), device, 1.7, 0.3, 1.0, rng, inverted=True)
+        assert 2 <= -place.feet[2] <= 5
+        ends = place.to_sensor(place.feet + np.array([[0, 0, 0], [0, 0, 1.7]]))
+        feet, head = np.arctan2(ends[:, 2], np.hypot(ends[:, 0], ends[:, 1]))
+        # upside down, with the person inside the fan or centered in it
+        low, high = device.elevations[[0, -1]]
+        assert feet > head and ((low - 1e-9 <= head and feet <= high + 1e-9) or abs(feet + head - low - high) < 1e-6)
 
 
 @settings(max_examples=40, deadline=None)

@@ -17,15 +17,16 @@ from lidarpose.cli import main
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
 from lidarpose.inference import inputs as people_module
+from lidarpose.inference import predictor
 from lidarpose.inference.backend import Raw
 from lidarpose.inference.checks import flat_axis, is_lying, rows_inside, scan_unit_warning, unit_warning
 from lidarpose.inference.inputs import MAX_POINTS, as_origin, candidates, clean
 from lidarpose.inference.predict_scan import predictor_of
-from lidarpose.inference.predictor import Predictor
+from lidarpose.inference.predictor import Predictor, _select_pose
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.point_cloud import Cloud
 from lidarpose.models import bundled_path
-from lidarpose.sample import Box
+from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import BODY26, SKELETONS, WAYMO14
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
@@ -210,6 +211,11 @@ def test_predict_list_matches_single_calls(model, points, standing):
             )
 
 
+def test_predict_accepts_lists_of_row_lists(model, points):
+    people = model.predict([list(points), points.tolist()])
+    np.testing.assert_array_equal(people.to_numpy(), model.predict([points, points]).to_numpy())
+
+
 def test_predict_accepts_empty_lists_and_stacks(model, points):
     assert len(model.predict([])) == 0 and json.loads(model.predict([]).to_json())["people"] == []
     assert len(model.predict((points, points))) == len(model.predict(list(np.stack([points] * 2)))) == 2
@@ -286,6 +292,12 @@ def test_predict_thins_million_points_with_warning(model, points):
     # points are removed evenly
     x = clean(np.linspace([0.1, 0, 0], [1.1, 0, 0], 3 * MAX_POINTS))[0][:, 0]
     assert len(x) == MAX_POINTS and np.diff(x).max() < 1e-4 and x[0] == 0.1 and x[-1] > 1.0999
+
+
+def test_predict_warns_about_rounded_clouds_of_list(model, points):
+    far = (points + [5e6, 0, 0]).astype(np.float32)
+    warnings = [person.warnings for person in model.predict([points, far, far.astype(float) + 0.01])]
+    assert [any("coordinates are rounded to 0.5 m" in line for line in own) for own in warnings] == [False, True, False]
 
 
 def test_predict_is_accurate_in_map_coordinates(model, points):
@@ -755,6 +767,31 @@ def test_box_id_is_text_or_whole_number(model, sweep):
     json.loads(lidarpose.predict(path, boxes=[box], model=model).to_json())
 
 
+def answers(*people):
+    """Poses of candidates (x m, confidence, probability of a person), each with its part of the cloud."""
+    for k, (x, confidence, person) in enumerate(people):
+        joints, confidences = np.zeros((26, 3)) + [x, 0, 0], np.full(26, confidence)
+        known = {"person": np.array(person), "second_person": np.array(0.1)}
+        yield Pose(joints=joints, skeleton=BODY26, confidence=confidences, **known), np.full((1, 3), float(k))
+
+
+@pytest.mark.parametrize(
+    ("people", "box_x", "best", "second"),
+    [
+        # the most confident pose; confident poses beside it count as a second person
+        ([(0, 0.5, 0.9), (1, 0.9, 0.8), (5, 0.2, 1.0)], None, 1, 0.1),
+        ([(0, 0.6, 0.9), (1, 0.9, 0.8)], None, 1, 0.9),
+        # with a box, the most confident pose of the nearest person among confident poses
+        ([(0, 0.6, 0.9), (0.2, 0.7, 0.5), (1, 0.9, 0.8)], 0.1, 1, 0.8),
+        ([(0.1, 0.3, 0.9), (1, 0.9, 0.8), (2, 0.95, 0.7)], 0.1, 1, 0.7),
+        ([(0, 0.6, 0.05), (1, 0.9, 0.05)], 0.8, 1, 0.1),
+    ],
+)
+def test_select_pose_by_confidence_and_box_center(people, box_x, best, second):
+    pose, part = _select_pose(list(answers(*people)), None if box_x is None else np.array([box_x, 0, 0]))
+    assert part[0, 0] == best and pose.joints[0, 0] == people[best][0] and pose.second_person == second
+
+
 def test_predict_without_confidence_uses_whole_cloud(points):
     """Not the smallest candidate, which is processed first."""
 
@@ -887,6 +924,9 @@ def test_predict_checks_upside_down_people_in_one_batch(model, points, monkeypat
     same = model.predict_in([points * [1, -1, -1]] * 3, np.array([0.1, 0.2, 0.3]), check_upside_down=False)
     assert batches == [3] * 2
     np.testing.assert_array_equal(same.to_numpy(), people.to_numpy())
+    # lying people get no warning of their own
+    monkeypatch.setattr(predictor, "is_lying", lambda pose, part: True)
+    assert not any("try up" in line for line in model.predict(points * [1, -1, -1]).warnings)
 
 
 def test_predict_warns_once_of_boxes_in_millimeters(model, sweep):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from lidarpose.data.prepare import READERS, reader
+from lidarpose.data.readers import sloper4d
 from lidarpose.data.readers.base import Skipped, SmplJoints, read_cloud
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
@@ -88,6 +89,8 @@ def test_humanm3_box_encloses_joints_and_crops_points(tmp_path, smpl):
         np.testing.assert_allclose(box.size, np.ptp(joints, 0) + 0.4, atol=1e-5)
         np.testing.assert_array_equal(item.centers["joints_box"], box.center)
         assert box.contains(item.points, 0.3001).all() and len(item.points) >= 150
+        # the clouds are fused from four LiDARs
+        assert not item.sensor_known and np.isnan(item.distance)
     # the box extends 20 cm beyond the joints; points within 30 cm of the box are kept
     top = items[0].box.center + [0, 0, items[0].box.size[2] / 2]
     path = tmp_path / items[0].sequence / f"pointcloud/{items[0].frame:06d}.pcd"
@@ -338,6 +341,16 @@ def write_labels(root, content):
     (root / "seq001_labels.pkl").write_bytes(pickle.dumps(content))
 
 
+def test_sloper4d_matches_scans_by_time(tmp_path):
+    folder = tmp_path / "lidar_data" / "lidar_frames_rot"
+    folder.mkdir(parents=True)
+    for name in ("1641234567_500", "1641234567_550", "notes"):
+        (folder / f"{name}.pcd").touch()
+    times = {1: 1641234567.485, 2: 1641234567.524, 3: 1641234567.535}
+    found = sloper4d._scans(tmp_path, times)
+    assert {frame: path.stem for frame, path in found.items()} == {1: "1641234567_500", 3: "1641234567_550"}
+
+
 def test_sloper4d_counts_skipped_frames(tmp_path, smpl):
     content, truth = files.sloper4d_labels(smpl, "seq001", frames=7, without=())
     person = content["second_person"]
@@ -346,7 +359,7 @@ def test_sloper4d_counts_skipped_frames(tmp_path, smpl):
     person["point_clouds"][2] = [["x", 1, 2]]
     person["opt_pose"][3, 5] = np.nan
     person["opt_pose"], person["opt_trans"] = person["opt_pose"][:6], person["opt_trans"][:6]
-    content["first_person"]["lidar_traj"][4, 4:8] = 0
+    content["first_person"]["lidar_traj"][4, 4:8] *= 1.02
     # a fourth column must not shift the values that follow
     person["point_clouds"][3] = np.hstack([person["point_clouds"][3], np.ones((150, 1))])
     person["point_clouds"].append(person["point_clouds"][5][:9])

@@ -182,6 +182,10 @@ def test_wrong_times_only_disable_smoothing_of_their_frames():
     assert steady_rows(wrong) == steady_rows(times[:10] * 2) == rows
     # two swapped frames: one of them is not smoothed
     assert steady_rows([*times[:9], times[10], times[9], *times[11:]]) == rows[:10] + rows[11:]
+    # both frames after a later one are not smoothed
+    assert steady_rows([*times[:9], times[11], times[9], times[10], *times[12:]]) == rows[:10] + rows[12:]
+    # people are not filled in in damaged frames
+    assert steady_rows(times, damaged=[9]) == rows[:9] + rows[10:]
 
 
 def test_late_frame_does_not_reset_live_filter():

@@ -386,6 +386,27 @@ def test_stopped_run_saves_and_resumes_to_same_losses(monkeypatch, tmp_path, unb
     assert_resumes_to(unbroken, folder)
 
 
+@pytest.mark.long
+def test_stop_request_in_last_chunk_finishes_run(monkeypatch, tmp_path):
+    original = PoseNetObjective.terms
+
+    def interrupted(*args, **kwargs):
+        monkeypatch.setattr(PoseNetObjective, "terms", original)
+        os.kill(os.getpid(), signal.SIGTERM)
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(PoseNetObjective, "terms", interrupted)
+    assert loop.train(replace(RECIPE, people=CHUNK), tmp_path / "run") == tmp_path / "run" / run_dir.MODEL
+    assert people_of(tmp_path / "run") == [CHUNK]
+
+
+@pytest.mark.parametrize(("people", "steps"), [(CHUNK, BATCHES), (CHUNK + 1, BATCHES + 1), (1, 1)])
+def test_run_steps_are_rounded_up(people, steps, tmp_path):
+    recipe = replace(RECIPE, people=people)
+    run = loop._Run(recipe, setup.make_setup(recipe), tmp_path, loop.Accelerator(cpu=True), "", None)
+    assert run.steps == steps
+
+
 def test_second_stop_request_interrupts_immediately():
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt), StopRequest() as stop:
@@ -543,17 +564,25 @@ def test_card_stores_command_as_typed(tmp_path, monkeypatch):
     assert typed[typed.index("--motion") + 1] == motion.name and typed[typed.index("--subjects") + 1] == "My Walk"
 
 
-def test_learning_rates_follow_schedule(monkeypatch, tmp_path):
-    rates, step = [], loop._Run._step
+def test_learning_rates_mean_weights_and_seeds_follow_steps(monkeypatch, tmp_path):
+    rates, seeds, means, step, average = [], [], [], loop._Run._step, loop.average
 
     def recorded(self, arrays, *of):
         terms = step(self, arrays, *of)
         rates.append([group["lr"] for optimizer in self.optimizers for group in optimizer.param_groups])
+        seeds.append(torch.initial_seed())
         return terms
 
+    def averaged(mean, network, step, ema):
+        means.append((step, ema))
+        average(mean, network, step, ema)
+
+    monkeypatch.setattr(loop, "average", averaged)
     monkeypatch.setattr(loop._Run, "_step", recorded)
     monkeypatch.setattr(setup, "VALIDATION", 0)
     loop.train(RECIPE, tmp_path / "run")
+    assert means == [(k, RECIPE.ema) for k in range(3 * BATCHES)]
+    assert seeds == [loop._seed(RECIPE.seed, loop.RandomStream.TRAINING_STEP, k, 0) for k in range(3 * BATCHES)]
     due = [rate_factor(k / (3 * BATCHES), RECIPE) for k in range(3 * BATCHES)]
     np.testing.assert_allclose(rates, np.outer(due, [RECIPE.rate, RECIPE.muon_rate]))
 

@@ -6,7 +6,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
-from lidarpose.sample import Box, Pose, Sample, center_of
+from lidarpose.geometry import rotation_about
+from lidarpose.sample import (
+    HIDDEN,
+    SEEN,
+    UNLABELED,
+    Box,
+    LabeledSample,
+    PersonInfo,
+    Pose,
+    Sample,
+    center_of,
+    facing,
+    facing_yaw,
+)
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14
 
 quick = settings(max_examples=60, deadline=None)
@@ -53,6 +66,8 @@ def test_box_contains_respects_yaw():
         ({"yaw": "north"}, "yaw must be a finite"),
         ({"yaw": None}, "yaw must be a finite"),
         ({"yaw": [0.1]}, "yaw must be a finite"),
+        ({"score": -0.1}, "score must be a probability"),
+        ({"score": 1.1}, "score must be a probability"),
     ],
 )
 def test_box_rejects_invalid_values(change, message):
@@ -188,6 +203,9 @@ def test_center_of_is_robust_to_stray_points():
     for far in (10.0, 1e3, 1e6, 1e9):
         strays = np.array([[far, far, far], [-far, far, -far]])
         assert np.abs(center_of(np.concatenate([points, strays])) - center_of(points)).max() <= 0.1 + 1e-9
+        # the density of points has no effect
+        dense = np.concatenate([points, strays, points[:1].repeat(500, 0)])
+        np.testing.assert_allclose(center_of(dense), center_of(np.concatenate([points, strays])), atol=1e-9)
 
 
 def test_center_of_single_point_is_cell_center():
@@ -197,6 +215,74 @@ def test_center_of_single_point_is_cell_center():
 def test_box_contains_rejects_invalid_points():
     box = Box(center=[0, 0, 0], size=[1, 1, 2])
     assert box.contains(np.zeros((2, 4))).tolist() == [True, True]
+    # faces belong to the box
+    assert box.contains(np.array([[0.5, 0.5, 1], [-0.5, -0.5, -1], [0, 0, 1.001]])).tolist() == [True, True, False]
     for wrong in (np.zeros(3), np.zeros((4, 2)), np.zeros((2, 3, 3)), "points", [[1, 2, 3], [1, 2]]):
         with pytest.raises(InputError, match=r"^Box.contains: expected points \(n, 3\) m, got shape"):
             box.contains(wrong)
+
+
+def with_axis(hips, shoulders=(0.0, 0.0, 0.0)):
+    """A pose whose left hip and shoulder lie by these vectors, m, from the right ones."""
+    joints = np.zeros((len(BODY26), 3))
+    for part, right_to_left in (("hip", hips), ("shoulder", shoulders)):
+        joints[BODY26.index(f"left_{part}")] = right_to_left
+    return Pose(joints=joints, skeleton=BODY26)
+
+
+@quick
+@given(st.floats(-3.1, 3.1), st.floats(-1.2, 1.2))
+def test_facing_is_perpendicular_to_left_right_axis(yaw, lean):
+    R = rotation_about("z", yaw) @ rotation_about("x", lean)
+    pose = with_axis(R @ [0, 0.2, 0], R @ [0, 0.4, 0])
+    np.testing.assert_allclose(facing(pose), [np.cos(yaw), np.sin(yaw), 0], atol=1e-9)
+    assert facing_yaw(pose) == pytest.approx(yaw)
+
+
+def test_facing_is_none_for_vertical_or_short_axis():
+    # 15 degrees from the vertical, and a very short axis
+    for axis in ([0, np.sin(np.radians(15)), np.cos(np.radians(15))], [0, 0.015, 0]):
+        assert facing(with_axis(axis)) is None and facing_yaw(with_axis(axis)) == 0
+    assert facing(None) is None
+    # 20 degrees from the vertical, and the hips of a child
+    for axis in ([0, np.sin(np.radians(20)), np.cos(np.radians(20))], [0, 0.05, 0]):
+        np.testing.assert_allclose(facing(with_axis(axis)), [1, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("change", "is_plain"),
+    [
+        ({}, True),
+        ({"upright": False}, False),
+        ({"visible": 0.75}, False),
+        ({"clutter": 0.1}, False),
+        ({"height_seen": 0.8}, False),
+        ({"visible": np.nan}, False),
+    ],
+)
+def test_person_info_plain(change, is_plain):
+    info = {"upright": True, "visible": 0.9, "clutter": 0.02, "height_seen": 0.9} | change
+    assert PersonInfo(**info).plain is is_plain
+
+
+def labeled(labels, joints, **more):
+    pose = Pose(joints=joints, skeleton=HUMAN15)
+    return LabeledSample(**SAMPLE | more, pose=pose, joint_labels=np.array(labels, np.uint8))
+
+
+def test_labeled_sample_requires_nan_exactly_at_unlabeled_joints():
+    joints = np.zeros((15, 3))
+    joints[3] = np.nan
+    labels = [SEEN] * 14 + [HIDDEN]
+    labels[3] = UNLABELED
+    labeled(labels, joints)
+    for wrong in (labels[:3] + [SEEN] + labels[4:], [UNLABELED] + labels[1:]):
+        with pytest.raises(InputError, match="a joint must be NaN exactly where its label is UNLABELED"):
+            labeled(wrong, joints)
+
+
+def test_labeled_sample_distance():
+    joints, labels = np.zeros((15, 3)), [SEEN] * 15
+    assert labeled(labels, joints, center=np.array([3.0, 0.0, 4.0])).distance == 5
+    assert np.isnan(labeled(labels, joints, sensor_known=False).distance)
+    assert labeled(labels, joints, info=PersonInfo(distance=7.0)).distance == 7

@@ -202,6 +202,12 @@ def test_interval_coverage_with_few_units(units, least, most):
     assert least < held / 4 < most
 
 
+@pytest.mark.parametrize("units, is_stated", [(9, False), (10, True)])
+def test_interval_stated_requires_ten_units(units, is_stated):
+    found = metrics.interval(np.arange(float(units)), np.random.default_rng(0), repeats=100)
+    assert found.units == units and (found.stated == ((found.low, found.high) if is_stated else (None, None)))
+
+
 def test_interval_without_width_is_not_stated():
     for value in (0.0, 100.0):
         found = metrics.interval(np.full(30, value), np.random.default_rng(0))

@@ -54,6 +54,7 @@ def test_sensor_is_frozen():
         ({"elevations": np.array([])}, "at least one ring"),
         ({"elevations": np.array([0.0, np.nan])}, "finite"),
         ({"azimuth_step": 0.1}, "divide 2 pi"),
+        ({"azimuth_step": 2 * np.pi / 360.05}, "divide 2 pi"),
         ({"azimuth_step": -np.pi}, "divide 2 pi"),
         ({"azimuth_offsets": np.zeros(3)}, "one per ring"),
         ({"origin_heights": np.zeros(3)}, "one per ring"),
@@ -99,6 +100,27 @@ def test_window_contains_exactly_beams_between_bounds():
     assert np.flatnonzero(inside).tolist() == list(range(w.column0, w.column0 + w.columns))
     assert np.flatnonzero(rings).tolist() == list(range(w.row0, w.row0 + w.rows))
     assert s.azimuths(w)[:, 0] == pytest.approx(azimuths[inside])
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_window_matches_loop_for_shifted_rings(seed):
+    s, rng = sensor("pandar64"), np.random.default_rng(seed)
+    left, width = rng.uniform(-3, 2), rng.uniform(0, 0.1)
+    low, high = np.sort(rng.choice(s.elevations, 2))
+    w = s.window(left, left + width, low, high)
+    assert s.elevations[w.row0] == low and s.elevations[w.row0 + w.rows - 1] == high
+    columns = s.azimuth_start + np.arange(s.columns) * s.azimuth_step
+    azimuths = columns[:, None] + s.azimuth_shifts
+    inside = np.flatnonzero(((azimuths >= left) & (azimuths <= left + width)).any(1))
+    assert set(inside) <= set(range(w.column0, w.column0 + w.columns)) and w.columns <= len(inside) + 2
+    np.testing.assert_allclose(s.azimuths(w), azimuths[w.column0 :][: w.columns, w.row0 : w.row0 + w.rows])
+
+
+def test_origins_of_lags_start_at_smallest_lag():
+    s = Sensor(name="x", elevations=[-0.1, 0.0, 0.1], azimuth_step=np.pi / 180, ring_lags=[0.25, 0.75, 0.25])
+    assert s.lag == 0.5
+    assert [(share, rings.tolist()) for _, share, _, rings in s.origins] == [(0, [0, 2]), (1, [1])]
 
 
 def test_window_across_seam_and_full_turn():

@@ -18,7 +18,16 @@ from lidarpose.synth.generator import Generator
 from lidarpose.synth.place import Place
 from lidarpose.synth.props.attachments import rigid_prop
 from lidarpose.synth.scene import SCENES, scene_config
-from lidarpose.synth.simulate import ScanConditions, Scene, SimulatedScan, count_alone, draw_conditions, simulate_scan
+from lidarpose.synth.simulate import (
+    ScanConditions,
+    Scene,
+    SimulatedScan,
+    count_alone,
+    draw_conditions,
+    label_box,
+    scan_background,
+    simulate_scan,
+)
 
 SEED = 11
 PAPER = SCENES["paper"]
@@ -168,6 +177,33 @@ def test_ground_window_includes_ground(monkeypatch):
     assert np.count_nonzero(paper.part == 0) > 1.5 * np.count_nonzero(alone.part == 0)
 
 
+@pytest.mark.parametrize("yaw", [0.0, 0.8, 4.0])
+def test_label_box_encloses_body_with_margin(yaw):
+    corners = np.array([[x, y, z] for x in (-0.2, 0.4) for y in (-0.3, 0.3) for z in (0.0, 1.7)])
+    label = label_box(corners @ rotation_about("z", yaw).T + [5.0, 2.0, -1.0], yaw, 3)
+    np.testing.assert_allclose(label.size, [0.7, 0.7, 1.8])
+    np.testing.assert_allclose(label.center, rotation_about("z", yaw) @ [0.1, 0, 0.85] + [5.0, 2.0, -1.0])
+    assert label.yaw == pytest.approx((yaw + np.pi) % (2 * np.pi) - np.pi) and label.id == 3
+
+
+def test_scan_background_shows_static_meshes_behind_person():
+    where = scene()
+    feet = where.place.feet
+    wall, other = (box(np.array([0.1, 4.0, 2.0])).moved(feet * [k, k, 1], where.place.yaw) for k in (1.5, 1.2))
+    ground = quad(1.0, np.zeros(2)).moved(feet)
+    where = replace(where, background=[ground, wall, other], still=2)
+    points = scan_background(where, body(where), 0)
+    depth = local(points, where)[:, 0]
+    # only the ground is in front of the wall: the other person, the last mesh, is not static
+    is_ground = np.abs(points[:, 2] - feet[2]) < 1e-3
+    assert np.abs(depth[~is_ground] - 2.95).max() < 0.01 and (~is_ground).sum() > 500
+    # the window is a degree wider than the body on each side
+    azimuth, body_azimuth = (np.arctan2(xyz[:, 1], xyz[:, 0]) for xyz in (points, body(where).vertices))
+    np.testing.assert_allclose(
+        np.degrees([azimuth.min() - body_azimuth.min(), azimuth.max() - body_azimuth.max()]), [-1, 1], atol=0.15
+    )
+
+
 # --- people and their surroundings
 
 
@@ -231,6 +267,12 @@ def test_props_move_with_person_and_only_clothes_are_labeled():
         hip = where.body_place.of_body(actor.joints[frame][:1])[0] + [0, 0, 0.05]
         for mesh in (cloth, thing):
             np.testing.assert_allclose(mesh.vertices.mean(0), hip, atol=1e-5)
+
+
+def test_body_is_lifted_by_highest_prop():
+    low = rigid_prop("low", box((0.1, 0.1, 0.1)), at_the_hip, lift=0.1)
+    where = scene(props=[CLOTH, low, STAND])
+    np.testing.assert_allclose(where.body_place.feet, where.place.feet + [0, 0, 0.25])
 
 
 @pytest.mark.parametrize("props", [(), (STAND,)], ids=["on the ground", "lifted"])
@@ -298,6 +340,17 @@ def test_stacked_sensors_see_person_half_a_turn_apart(azimuth):
         for m in (twice.meshes(actor, 0)[0], where.meshes(actor, 0)[0])
     )
     np.testing.assert_allclose(2 * quick, slow, atol=1e-5)
+
+
+@pytest.mark.parametrize("azimuth", [0.5, -0.5])
+def test_scan_window_covers_moving_body(azimuth):
+    counts = []
+    for margin in (0.0, 0.1):
+        where = scene("av2", azimuth, config=replace(CLEAN, margin=margin, around=0.0))
+        where = replace(where, sensor=replace(where.sensor, dropout=0.0))
+        meshes = where.meshes(strider([1.0, 1.0, 0.0]), 0)
+        counts.append(len(simulate_scan(where, meshes, np.random.default_rng(0)).points))
+    assert counts[0] == counts[1] > 100
 
 
 def test_bodies_of_stacked_sensors_move_within_frame():

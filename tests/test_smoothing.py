@@ -14,8 +14,14 @@ from lidarpose.skeleton import SKELETONS, SMPL24
 from lidarpose.tracking.bones import rigid_bones
 from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.live import LiveFilter, filter_track
-from lidarpose.tracking.motion_model import smooth_joints
-from lidarpose.tracking.smoothing import smooth
+from lidarpose.tracking.motion_model import (
+    SCALES,
+    KalmanState,
+    learn_process_noise,
+    pooled,
+    smooth_joints,
+)
+from lidarpose.tracking.smoothing import likely_hit, smooth, with_facing_corrected
 
 
 def rest_pose(skeleton):
@@ -172,6 +178,110 @@ def test_smoothing_fills_and_marks_unseen_frames(walker):
     live = filter_track(given)
     assert live[12] is not None and live[20] is not None and live[48] is None and live[49] is not None
     assert live[10].spread.mean() > 2 * live[4].spread.mean()
+    assert (live[10].visible == 0).all()
+    np.testing.assert_allclose(live[10].confidence, likely_hit(live[10].spread))
+    # confidence of filled frames follows from their spread; that of other frames is unchanged
+    steady = smooth(replace(given, confidence=track.confidence))
+    np.testing.assert_allclose(steady.confidence[5:13], likely_hit(steady.spread[5:13]))
+    assert (steady.confidence[:5] == 0.8).all()
+
+
+@pytest.mark.parametrize(("gap", "is_filled"), [(19, True), (20, False)])
+def test_smooth_fills_gaps_up_to_max_gap(walker, gap, is_filled):
+    _, track = walker(frames=60)
+    joints = track.joints.copy()
+    joints[20 : 20 + gap] = np.nan
+    # frame 29 is 0.9 s or more from both ends of the gap
+    assert smooth(replace(track, joints=joints)).filled[29] == is_filled
+
+
+def test_likely_hit_matches_sampled_distances():
+    rng = np.random.default_rng(0)
+    for spread in (0.05, 0.12):
+        distance = np.linalg.norm(rng.normal(size=(200_000, 2)), axis=1)
+        share = (distance * spread / distance.mean() < 0.1).mean()
+        assert likely_hit(np.array(spread)) == pytest.approx(share, abs=0.005)
+
+
+def test_smoothing_is_robust_to_outlier_frame(walker):
+    true, track = walker()
+    joints = track.joints.copy()
+    joints[20] += [1.0, 0, 0]
+    off = replace(track, joints=joints)
+    assert error(smooth(off).joints, true)[0] < 1.1 * error(smooth(track).joints, true)[0]
+    live = np.stack([pose.joints for pose in filter_track(off)])
+    assert np.linalg.norm(live[20] - true[20], axis=-1).mean() < 0.2
+
+
+def test_smoothed_spread_keeps_common_error():
+    times = np.arange(100) / 10
+    joints = np.broadcast_to(rest_pose(SMPL24), (100, 24, 3))
+    steady = smooth(TrackPoses(times=times, joints=joints, skeleton=SMPL24, spread=np.full((100, 24), 0.05)))
+    assert 0.8 * 0.05 < steady.spread[50].min() and steady.spread[50].max() < 0.05
+
+
+def test_smoothing_limits_tiny_spread():
+    rng, times = np.random.default_rng(0), np.arange(10) / 10
+    joints = rest_pose(SMPL24) + rng.normal(0, 0.01, (10, 24, 3))
+    for spread in (0.0, 1e-9):
+        track = TrackPoses(times=times, joints=joints, skeleton=SMPL24, spread=np.full((10, 24), spread))
+        steady = smooth(track)
+        assert np.linalg.norm(steady.joints - joints, axis=-1).max() < 0.1 and (steady.spread > 1e-3).all()
+        assert all(np.isfinite(pose.joints).all() for pose in filter_track(track))
+
+
+def test_live_filter_keeps_bone_lengths(walker):
+    _, track = walker(frames=60)
+    bones = rigid_bones(track.skeleton)
+    before, live = track.joints[30:], np.stack([pose.joints for pose in filter_track(track)[30:]])
+    before, live = (
+        np.linalg.norm(j[:, bones[:, 0]] - j[:, bones[:, 1]], axis=-1).std(0).mean() for j in (before, live)
+    )
+    assert live < 0.15 * before
+
+
+def test_learn_process_noise_matches_enumeration():
+    """The enumeration sums over all sequences of scales."""
+    rng = np.random.default_rng(0)
+    times, usual = np.array([0.0, 0.2, 3.0, 3.4]), np.array([0.04, 0.4])
+    joints = np.cumsum(rng.normal(0, 0.3, (4, 2, 3)), 0)
+    precision = rng.uniform(200, 800, (4, 2))
+    state, steps, likelihood = KalmanState.unknown((len(SCALES), 2)), np.diff(times, prepend=0.0), np.empty((4, 9, 2))
+    for row, step in enumerate(steps):
+        state, likelihood[row] = state.predicted(step, SCALES[:, None] * usual).updated(joints[row], precision[row])
+    likelihood = np.exp(pooled(likelihood) - pooled(likelihood).max(1, keepdims=True))
+    expected = np.empty((4, 2))
+    for j in range(2):
+        course = likelihood[0, :, j] / 9
+        for row in range(1, 4):
+            stay = np.exp(-steps[row] / 20)
+            change = stay * np.eye(9) + (1 - stay) / 9
+            course = course[..., None] * change * likelihood[row, :, j]
+        for row in range(4):
+            share = course.sum(tuple(k for k in range(4) if k != row))
+            expected[row, j] = np.log(SCALES) @ share / share.sum()
+    np.testing.assert_allclose(learn_process_noise(times, joints, precision, usual), usual * np.exp(expected))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_facing_correction_follows_walking_direction(walker, sign):
+    true, track = walker()
+    flip = list(track.skeleton.flip)
+    # the same walk forward or backward in time
+    track = replace(track, joints=track.joints[::sign].copy(), confidence=np.zeros(track.spread.shape))
+    joints = with_facing_corrected(track).joints
+    np.testing.assert_array_equal(joints, track.joints if sign > 0 else track.joints[:, flip])
+
+
+def test_facing_correction_follows_confident_frames():
+    joints = np.broadcast_to(rest_pose(SMPL24), (10, 24, 3)).copy()
+    confidence = np.full((10, 24), 0.1)
+    confidence[:3] = 0.9
+    joints[:3] = joints[:3, list(SMPL24.flip)]
+    track = TrackPoses(
+        times=np.arange(10) / 10, joints=joints, skeleton=SMPL24, spread=np.full((10, 24), 0.05), confidence=confidence
+    )
+    np.testing.assert_array_equal(with_facing_corrected(track).joints, np.broadcast_to(joints[0], joints.shape))
 
 
 @pytest.mark.long

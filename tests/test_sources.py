@@ -495,8 +495,11 @@ def quaternion(R):
     return [w, *(np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (4 * w))]
 
 
-def write_nuscenes(root, scenes=("scene-0061", "scene-0103"), version="v1.0-mini"):
-    """Writes nuScenes tables and LiDAR sweeps: five frames per scene, of which the second is not a key frame."""
+def write_nuscenes(root, scenes=("scene-0061", "scene-0103"), version="v1.0-mini", apart=10**9):
+    """Writes nuScenes tables and LiDAR sweeps: five frames per scene, of which the second is not a key frame.
+
+    apart: us between the starts of scenes.
+    """
     T_ego_sensor = rigid(-1.57, 0.02, 0.01, (0.94, 0, 1.84))
     tables = {name: [] for name in ("sample_data", "sample", "scene", "ego_pose", "calibrated_sensor", "sensor")}
     for channel in ("CAM_FRONT", "LIDAR_TOP"):
@@ -513,7 +516,7 @@ def write_nuscenes(root, scenes=("scene-0061", "scene-0103"), version="v1.0-mini
         tables["scene"].append({"token": f"token {scene}", "name": scene})
         tables["sample"].append({"token": f"sample {scene}", "scene_token": f"token {scene}"})
         # the later scene comes first in the tables
-        begin = 1533151603547590 + (len(scenes) - number) * 10**9
+        begin = 1533151603547590 + (len(scenes) - number) * apart
         for k, T_world_ego in reversed(list(enumerate(drive()))):
             stamp = begin + 50_000 * k
             T = {"translation": T_world_ego[:3, 3].tolist(), "rotation": quaternion(T_world_ego[:3, :3])}
@@ -553,6 +556,11 @@ def test_nuscenes_is_read_by_scene_with_poses(tmp_path):
     one = open_source(root, topic="scene-0061")
     assert one.count == 5 and frames[5].id == next(iter(one)).id
     refusal(open_source, root, topic="scene-0062", words=["unknown scene", "scene-0061"])
+
+
+def test_nuscenes_keeps_overlapping_scenes_apart(tmp_path):
+    frames = list(open_source(write_nuscenes(tmp_path, apart=25_000)))
+    assert [frame.id.split("/")[0] for frame in frames] == ["scene-0103"] * 5 + ["scene-0061"] * 5
 
 
 @pytest.mark.parametrize("damage", [None, {}, {"rotation": [0, 0, 0, 0]}, {"translation": [1, float("nan"), 0]}])

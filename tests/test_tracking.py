@@ -241,6 +241,39 @@ def test_low_score_box_moves_track_less():
     assert 0.15 < moved[0] < 0.3 and moved[1] < 0.5 * moved[0]
 
 
+@pytest.mark.parametrize(("squared", "id"), [(15.9, 0), (16.7, 1)])
+def test_tracker_gates_boxes_by_mahalanobis_distance(squared, id):
+    tracker = Tracker()
+    for time in np.arange(40) / 50:
+        tracker.update(time, [person(0)])
+    expected = tracker.predicted(0.8)[0]
+    deviation = np.sqrt(expected.position_sd**2 + POSITION_SD[0] ** 2)
+    assert tracker.update(0.8, [person(expected.center[0] + deviation * np.sqrt(squared))]) == [id]
+
+
+@pytest.mark.parametrize(("distance", "id"), [(5.0, 0), (7.0, 1)])
+def test_tracker_rejects_unlikely_boxes_of_uncertain_tracks(distance, id):
+    tracker = Tracker()
+    assert tracker.update(0.0, [person(0)]) == [0] and tracker.update(2.0, [person(distance)]) == [id]
+
+
+def test_tracker_smooths_heading_and_size():
+    tracker = Tracker()
+    times = [0.0, 0.01, 0.02, 0.03, 1.03, 1.23, 3.2]
+    heading, size = np.array([1.0, 0.0]), np.array([0.5, 0.5, 1.7])
+    for k, time in enumerate(times):
+        yaw, own_size = 0.4 * k, np.array([0.5 + 0.1 * k, 0.5, 1.7 - 0.05 * k])
+        tracker.update(time, [Box(center=(0, 0, 0.9), size=own_size, yaw=yaw)])
+        if k:
+            # the mean of all boxes so far, or a filter with a time constant of 0.5 s
+            weight = max(1 / (k + 1), 1 - np.exp(-(time - times[k - 1]) / 0.5))
+            heading = heading + weight * (np.array([np.cos(yaw), np.sin(yaw)]) - heading)
+            size = size + weight * (own_size - size)
+        expected = tracker.predicted(time)[0]
+        np.testing.assert_allclose(expected.size, size)
+        assert expected.yaw == pytest.approx(np.arctan2(heading[1], heading[0]))
+
+
 def test_update_rejects_invalid_boxes_without_change():
     tracker, other = Tracker(), Tracker()
     for each in (tracker, other):

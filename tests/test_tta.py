@@ -78,6 +78,22 @@ def test_average_weights_estimates_by_confidence():
     assert average([sure]) is sure
 
 
+def test_average_in_range_is_majority_vote():
+    joints, in_range = np.zeros((1, 15, 3)), np.zeros((3, 1, 15), bool)
+    in_range[:1, 0, 0] = in_range[:2, 0, 1] = in_range[:, 0, 2] = True
+    found = average([Pose(joints=joints, skeleton=HUMAN15, in_range=own) for own in in_range])
+    assert found.in_range[0, :4].tolist() == [False, True, True, False]
+
+
+def test_apply_shifts_then_rotates_then_mirrors():
+    np.testing.assert_array_equal(TTATransform(1, True).R_view_person @ [1, 2, 3], [-2, -1, 3])
+    # a sensor two meters ahead and one to the left of the shifted center
+    transform, center = TTATransform(1, True, (0.05, 0.1, 0.0)), np.array([[4.0, 5.0, 1.0]])
+    (points,), view = apply(transform, [np.array([[5.05, 7.1, 4.0]])], center, np.array([6.05, 6.1, 1.0]))
+    np.testing.assert_allclose(points, [[-2, -1, 3]], atol=1e-9)
+    np.testing.assert_allclose(view[0, :3] * np.exp(view[0, 3]), [-1, -2, 0], atol=1e-6)
+
+
 def test_tta_transforms_are_distinct_and_start_with_identity():
     assert tta_transforms(1) == (TTATransform(),) and tta_transforms(np.int64(3)) == tta_transforms(3)
     assert len(set(TRANSFORMS)) == len(TRANSFORMS) == len(tta_transforms(8))

@@ -122,6 +122,15 @@ def test_point_voxel_maps_points_to_their_voxel():
     assert (tables.point_voxel >= 0).tolist() == [True, False, False, False, False, True]
 
 
+@pytest.mark.parametrize("copies", [3, 7])
+def test_deviation_of_equal_points_is_zero(copies):
+    points, _ = crowd(0, [50], dtype=float)
+    apart = np.unique(np.floor(points / GRID), axis=0, return_index=True)[1]
+    points = points[apart].repeat(copies, 0)
+    pyramid = voxelize(points, np.array([len(points)]), grid=GRID, max_voxels=1000)
+    assert (pyramid.deviation >= 0).all() and pyramid.deviation.max() < 1e-6
+
+
 def test_voxelize_accepts_empty_people_and_single_points():
     none = voxelize(np.zeros((0, 3), np.float32), np.zeros(2, int), grid=GRID, max_voxels=9)
     assert none.fine.valid.shape == (2, 1) and not none.fine.valid.any() and not none.coarse.valid.any()
@@ -166,4 +175,6 @@ def test_view_features_point_to_sensor():
     np.testing.assert_allclose(center + view[:3] * np.exp(view[3]), origin, atol=1e-5)
     assert view[4] == 1 and np.exp(view[3]) == pytest.approx(5, rel=1e-5)
     np.testing.assert_array_equal(view_features(center, None), np.zeros(5))
-    assert np.isfinite(view_features(center, center)).all()
+    # ranges are at least 10 cm
+    np.testing.assert_allclose(view_features(center, center + [0.02, 0, 0]), [0.2, 0, 0, np.log(0.1), 1], atol=1e-6)
+    np.testing.assert_allclose(view_features(center, center), [0, 0, 0, np.log(0.1), 1], atol=1e-6)

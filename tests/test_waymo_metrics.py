@@ -89,6 +89,9 @@ def test_pck_box_matches_documented_example():
     pred[0, 7:, 0] += 0.2521
     assert metrics.pck_box(pred, true, boxes[:, 3:6]) == 50
     assert metrics.pck_box(pred, true, SIZE, threshold=0.3) == 100
+    # joints at the threshold count
+    one = np.zeros((1, 1, 3))
+    assert metrics.pck_box(one + [0.25, 0, 0], one, (1, 1, 1), threshold=0.25) == 100
     # as in Waymo's code: the threshold times the sigma of each joint
     pred = true.copy()
     pred[0, :, 1] += 0.2 * 2 ** (1 / 3) * 0.15
@@ -233,6 +236,9 @@ def test_pem_does_not_excuse_predictions_of_labeled_people():
     whose, boxes = people(10)
     found = metrics.pem([away], [whose], [boxes], [np.zeros((1, J))])
     assert (found.people_excused, found.people_extra, found.extra) == (1, 1, J)
+    # predictions near the box without keypoints inside are not excused
+    found = metrics.pem([whose + [0.9, 0, 0]], [whose], [boxes], [np.zeros((1, J))])
+    assert (found.people_excused, found.people_extra, found.extra) == (0, 1, J)
 
 
 def test_pem_does_not_match_far_from_the_box():
@@ -241,6 +247,10 @@ def test_pem_does_not_match_far_from_the_box():
     boxes[:, 0] += 2
     found = metrics.pem([true], [true], [boxes])
     assert found.pem == pytest.approx(250) and (found.people_missed, found.people_extra) == (1, 1)
+    # by the nearest keypoint, 24 or 26 cm in front of the box
+    for gap, people_matched in ((0.24, 1), (0.26, 0)):
+        boxes[:, 0] = true[0, :, 0].max() + gap + SIZE[0] / 2
+        assert metrics.pem([true], [true], [boxes]).people == people_matched
 
 
 def test_pem_ignores_joints_that_are_not_predicted():
