@@ -47,7 +47,7 @@ def test_published_figures_match_paper():
         "sloper4d": {"mpjpe": 28.01, "pa_mpjpe": 21.52, "pck3": 99.30, "pck5": 99.87},
     }
     assert set(methods["NE"]) == set(methods["LiDARCap"]) == {"lidarhuman26m", "sloper4d"}
-    assert "not run here" in published["note"] and "Table 1" in published["source"]
+    assert "not reproduced here" in published["note"] and "Table 1" in published["source"]
     assert all("oracle" in about["protocol"] for about in published["datasets"].values())
 
 

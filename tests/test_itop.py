@@ -214,8 +214,8 @@ def test_itop_skips_unusable_frames_with_reasons(tmp_path, smpl):
     people, records = everything(tmp_path)
     assert [person.frame for person in people] == [10, 10]
     assert [record.reason for record in records if isinstance(record, Skipped)] == [
-        "no person stands out from the room", "id in another format", "no joint is labelled",
-        "no points in the box", "id in another format", "no joint is labelled",
+        "no person stands out from the room", "id in another format", "no joint is labeled",
+        "no points in the box", "id in another format", "no joint is labeled",
     ]  # fmt: skip
 
 

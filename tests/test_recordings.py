@@ -481,7 +481,7 @@ def test_predict_command_writes_files_and_summary(drive, folder, tmp_path, monke
     monkeypatch.chdir(tmp_path)
     assert main(["predict", f"{drive}/frame_*.npy", "--start", "0.3", "--format", "csv", "--picture", "--track"]) == 0
     said = capsys.readouterr().err
-    assert "4 frames, 6 people, 2 tracks, 1 damaged -> drive.poses.csv and drive.poses.png" in said
+    assert "4 frames, 6 poses, 2 tracks, 1 damaged -> drive.poses.csv and drive.poses.png" in said
     assert "warning: 1 damaged, first frame 4 (frame_9): " in said
     assert {path.name for path in tmp_path.iterdir()} == {"drive.poses.csv", "drive.poses.png"}
     assert (tmp_path / "drive.poses.png").read_bytes().startswith(b"\x89PNG")
@@ -490,7 +490,7 @@ def test_predict_command_writes_files_and_summary(drive, folder, tmp_path, monke
     assert [line["frame"] for line in lines] == [0, 1] and lines[1]["people"][0]["track"] == 0
     # a page for printed results
     assert main(["predict", str(drive), "--end", "0.1", "--out", "-", "--html"]) == 0
-    assert "2 frames, 4 people -> drive.poses.html" in capsys.readouterr().err
+    assert "2 frames, 4 poses -> drive.poses.html" in capsys.readouterr().err
     assert (tmp_path / "drive.poses.html").is_file()
 
 
@@ -518,7 +518,7 @@ def test_joint_tables_are_not_scans_and_unknown_world_warns(clouds, tmp_path, ca
     for _ in range(2):
         assert main([*words, str(tmp_path)]) == 0
         output = capsys.readouterr()
-        assert "2 frames, 4 people" in output.out + output.err
+        assert "2 frames, 4 poses" in output.out + output.err
         assert "the sensor's pose in the world is unknown in 2 of 2 frames" in output.err
     assert len(list(tmp_path.glob("*.poses.csv"))) == 1
 

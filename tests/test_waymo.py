@@ -100,7 +100,7 @@ def test_version_2_is_read_with_all_people(v2):
     assert [(one.reason, one.where.split("/")[-1]) for one in skipped] == [
         ("keypoints without a box", "ped-boxless"),
         ("no points in the box", "ped-far: the label counts 123"),
-        ("no joint is labelled", "ped-unlabeled"),
+        ("no joint is labeled", "ped-unlabeled"),
     ]
     assert source.about["settings"] == {"box_margin_m": 0.2} and source.about["licence"] and source.about["notes"]
     labels = Counter(int(label) for item in items for label in item.joint_labels)
@@ -294,7 +294,7 @@ def test_damaged_range_images_skip_all_people_and_name_file(copy, name, damage):
     path.write_bytes(data[: len(data) // 2] if damage == "cut" else data)
     items, skipped = everything(copy)
     found = Counter(one.reason for one in skipped)
-    assert not items and found["range image cannot be read"] == 5 and found["no joint is labelled"] == 1
+    assert not items and found["range image cannot be read"] == 5 and found["no joint is labeled"] == 1
     where = next(one.where for one in skipped if one.reason == "range image cannot be read")
     assert f"{name}/{SEGMENT}.parquet: cannot be read as Parquet" in where and "\n" not in where
 
@@ -347,8 +347,8 @@ _SHAPE, _POSE_SHAPE = (f"[{name}Component].range_image_return1.shape" for name i
         ("lidar_hkp", {_TIME: None}, "label in another format", 1),
         ("lidar_hkp", {"key.laser_object_id": None}, "label in another format", 1),
         ("lidar_hkp", {f"{_KEYPOINT}.keypoint_3d.location_m.y": [1.0]}, "label in another format", 1),
-        ("lidar_hkp", {f"{_KEYPOINT}.keypoint_3d.location_m.y": [np.nan] * 16}, "no joint is labelled", 1),
-        ("lidar_hkp", {f"{_KEYPOINT}.keypoint_3d.location_m.y": [1e300] * 16}, "no joint is labelled", 1),
+        ("lidar_hkp", {f"{_KEYPOINT}.keypoint_3d.location_m.y": [np.nan] * 16}, "no joint is labeled", 1),
+        ("lidar_hkp", {f"{_KEYPOINT}.keypoint_3d.location_m.y": [1e300] * 16}, "no joint is labeled", 1),
         ("lidar_box", {"[LiDARBoxComponent].box.center.x": 1e10}, "label in another format", 1),
         ("lidar_box", {"[LiDARBoxComponent].box.size.z": 0.0}, "label in another format", 1),
     ],

@@ -101,7 +101,7 @@ def _predict(options: argparse.Namespace) -> None:
     outputs: dict[Path, bytes] = {}
     if result is not None:
         is_csv = result.suffix.lower() == ".csv"
-        outputs[result] = (poses.to_dataframe().to_csv(index=False) if is_csv else poses.to_json()).encode()
+        outputs[result] = (poses.to_csv() if is_csv else poses.to_json()).encode()
     if picture is not None:
         outputs[picture] = poses.picture(title=file.name)
     if page is not None:

@@ -92,10 +92,10 @@ def _person(entry: dict[str, Any], skeleton: Skeleton, up: str, model: dict) -> 
     box = None if entry["box"] is None else read_boxes([entry])[0]
     pose = None
     if entry["joints"] is not None:
-        values = {name: np.array(entry[name], float) for name in _PER_JOINT if entry[name]}
+        values: dict[str, Any] = {name: np.array(entry[name], float) for name in _PER_JOINT if entry[name]}
         values |= {name: np.float64(entry[name]) for name in ("person", "second_person") if entry[name] is not None}
-        if "confidence" in values:
-            # networks without heatmaps have neither
+        if any(entry[name] for name in _PER_JOINT):
+            # networks without heatmaps have no such values
             values["in_range"] = np.array([joint not in entry["out_of_range"] for joint in skeleton.joints])
         pose = Pose(joints=np.array(entry["joints"], float), skeleton=skeleton, **values)
     return PersonPose(
