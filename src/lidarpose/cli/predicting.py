@@ -114,9 +114,9 @@ def _predict(options: argparse.Namespace) -> None:
     num_posed = sum(person.has_pose for person in poses)
     destination = f" -> {' and '.join(map(str, outputs))}" if outputs else ""
     if not poses:
-        tell(f"no boxes{destination}" if poses.scan is None else _none_found(destination, poses.warnings))
+        tell(_none_found(destination, poses.warnings) if "find" in poses.timing_ms else f"no boxes{destination}")
         return
-    search = f"searched in {poses.timing_ms['find'] / 1e3:.1f} s, " if poses.scan is not None else ""
+    search = f"searched in {poses.timing_ms['find'] / 1e3:.1f} s, " if "find" in poses.timing_ms else ""
     people = counted(len(poses), "person", "people")
     tell(f"{num_posed} of {people}, {search}{poses.timing_ms['per_person']:.0f} ms each{destination}")
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from lidarpose.errors import counted
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
-from lidarpose.io.files import check_suffix, encodable, lined_json, write_atomic
+from lidarpose.io.files import check_suffix, encodable, lined_json, shorten, write_atomic
 from lidarpose.sample import JOINT_COLUMNS, PER_JOINT, Box, Pose, facing_yaw
 from lidarpose.skeleton import Skeleton
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from lidarpose.viz.person_view import Panel
 
 SCHEMA = "lidarpose.poses/1"
+# maximum characters of an id in the view from above
+_LONGEST_NAME = 12
 # decimals of the values in files, by column of tables
 _DECIMALS = {"x": 4, "y": 4, "z": 4, "confidence": 3, "spread": 4, "visible": 3}
 _DECIMALS |= {"person_probability": 4, "second_person": 4, "score": 4}
@@ -201,8 +203,8 @@ class PersonPose:
 class Poses(Sequence[PersonPose]):
     """All people of one call: a sequence of `PersonPose` in the order of the boxes or arrays.
 
-    If people were detected in a scan, the result holds the whole scan. To store many results without the memory of
-    their scans, use `dataclasses.replace(poses, scan=None)`.
+    The result of a scan with boxes or detected people holds the whole scan. To store many results without the memory
+    of their scans, use `dataclasses.replace(poses, scan=None)`.
 
     Args:
         people: one entry per person, also for people without a pose.
@@ -212,7 +214,7 @@ class Poses(Sequence[PersonPose]):
         warnings: messages for the user about the whole input.
         timing_ms: duration of each step in milliseconds, by name.
         up: up axis of the input frame, used for drawing.
-        scan: (n, 3) m, the points in which people were detected, None without detection.
+        scan: (n, 3) m, the points around the boxes or detected people; None for crops.
         origin: (3,) m, the sensor position of that scan, None if unknown.
     """
 
@@ -333,7 +335,7 @@ class Poses(Sequence[PersonPose]):
     def picture(self, path: str | Path | None = None, *, title: str = "") -> Picture:
         """Front and side views of all people on one PNG; also written to `path` if given.
 
-        If people were detected in a scan, a bird's-eye view of the scan is placed above them.
+        For a scan with boxes or detected people, a bird's-eye view of the scan is placed above them.
         """
         from lidarpose.viz.bird_eye import draw_scan_and_people
         from lidarpose.viz.draw import draw_people
@@ -347,7 +349,7 @@ class Poses(Sequence[PersonPose]):
     def html(self, path: str | Path | None = None, *, title: str = "") -> str:
         """An HTML page with interactive 3D views of all people; also written to `path` if given.
 
-        If people were detected in a scan, a view of the scan is placed above them.
+        For a scan with boxes or detected people, a view of the scan is placed above them.
         """
         from lidarpose.viz.html import render_report, write_report
 
@@ -359,7 +361,7 @@ class Poses(Sequence[PersonPose]):
         return render_report(panels, title=title, summary=[], scans=scans)
 
     def _panels(self) -> "tuple[list[Panel], ScanPanel | None]":
-        """The panels to draw: one per person, and the scan if people were detected in it."""
+        """The panels to draw: one per person, and the scan around them if there is one."""
         from lidarpose.viz.person_view import Panel
 
         upright_people = [_upright(person, self.up) for person in self.people]
@@ -370,7 +372,7 @@ class Poses(Sequence[PersonPose]):
         return panels, None if self.scan is None else self._from_above(self.scan, upright_people)
 
     def _distance(self, person: PersonPose) -> float | None:
-        """Distance of the person from the sensor, m; NaN if the sensor position is unknown, None without detection or
+        """Distance of the person from the sensor, m; NaN if the sensor position is unknown, None without a scan or
         points."""
         if self.scan is None or not len(person.points):
             return None
@@ -382,12 +384,12 @@ class Poses(Sequence[PersonPose]):
 
         R_level_input = rotation_from_up(self.up)
         posed = [person for person in people if person.has_pose]
-        label = f"{counted(len(people), 'person', 'people')} found" if people else "no people found"
+        label = counted(len(people), "person", "people") if people else "no people"
         return ScanPanel(
             points=points @ R_level_input.T,
             boxes=[box for person in people if (box := person.box or _box_around(person))],
             poses=Pose(joints=np.stack([person.joints for person in posed]), skeleton=self.skeleton) if posed else None,
-            names=[str(person.id) for person in posed],
+            names=[shorten(str(person.id), _LONGEST_NAME) for person in posed],
             label=label,
             sensor=None if self.origin is None else tuple((R_level_input @ self.origin)[:2].tolist()),
         )

@@ -147,8 +147,9 @@ def pose_scan(
         warnings=tuple(warnings),
         timing_ms={"crop": (crop_end - start) * 1e3, "predict": predict_ms, "per_person": per_person},
         up=scan.up,
-        scan=None if scan.detected_rows is None else scan.points,
-        origin=None if scan.detected_rows is None else scan.origin,
+        # the surroundings of the boxes, for drawing
+        scan=None if scan.boxes is None else scan.points,
+        origin=None if scan.boxes is None else scan.origin,
     )
 
 
