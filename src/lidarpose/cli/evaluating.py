@@ -72,6 +72,8 @@ _TITLES = {
     **{"pck_10cm": "within 10 cm", "mpjpe_p95": "95th percentile of people's errors"},
     **{"person_auroc": "AUROC of person", "second_person_auroc": "AUROC of a second person"},
 }
+# names of conditions in files -> as printed
+_CONDITIONS = {"company": "second person", "crop": "poor box"}
 
 
 def add(commands) -> None:
@@ -239,7 +241,8 @@ def _named(row, setting) -> str:
     if row.group == "plain":
         words += f", {row.of}"
     elif row.group != "all":
-        words += f", {row.group.removesuffix(', m')} {row.of}{' m' if row.group.endswith(', m') else ''}"
+        value = _CONDITIONS.get(row.of, row.of) if row.group == "condition" else row.of
+        words += f", {row.group.removesuffix(', m')} {value}{' m' if row.group.endswith(', m') else ''}"
     if row.arithmetic != "lidarpose":
         words += ", released arithmetic"
     if row.method != setting.method:
