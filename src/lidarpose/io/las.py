@@ -8,7 +8,7 @@ import struct
 
 import numpy as np
 
-from lidarpose.errors import missing_extra
+from lidarpose.errors import needs_extra
 from lidarpose.io.files import FormatError, check_unpacked
 from lidarpose.io.text import check_bytes
 
@@ -60,10 +60,8 @@ class _Unseekable(io.RawIOBase):
 def _unpack(data: bytes, start: int, size: int, num_points: int) -> bytes:
     """The point records of a LAZ file, decompressed as in a LAS file. lazrs does not validate the sizes that a file
     announces, so this module does."""
-    try:
+    with needs_extra("reading .laz"):
         import lazrs
-    except ModuleNotFoundError as error:
-        raise missing_extra(error, "reading .laz") from None
     offset = struct.unpack_from("<H", data, 94)[0]
     for _ in range(struct.unpack_from("<I", data, 100)[0]):
         if offset + 54 > min(start, len(data)):
