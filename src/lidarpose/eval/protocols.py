@@ -272,14 +272,12 @@ class EvalSetup:
             return {}
         labeled_samples = [person.sample for person in samples]
         runs = _runs(labeled_samples) if self.dataset.limit is None else np.arange(len(labeled_samples))[:, None]
-        surroundings = {
-            name: [getattr(sample, name) for sample in labeled_samples] for name in ("background", "neighbors")
-        }
-        surroundings = {
-            name: [np.zeros((0, 3)) if cloud is None else cloud for cloud in clouds]
-            for name, clouds in surroundings.items()
-        }
-        return {"clips": Clips(windows=np.concatenate([clip_windows(run) for run in runs]), **surroundings)}
+        background, neighbors = (
+            [np.zeros((0, 3)) if (cloud := getattr(sample, name)) is None else cloud for sample in labeled_samples]
+            for name in ("background", "neighbors")
+        )
+        windows = np.concatenate([clip_windows(run) for run in runs])
+        return {"clips": Clips(windows=windows, background=background, neighbors=neighbors)}
 
     def _prediction_columns(self, estimates, index) -> dict:
         """Columns of the scored joints of a pose, or of person `index` of many."""

@@ -84,9 +84,8 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
     program = trace(network)
     module = program.module()
     check(network, lambda arrays: [value.detach().numpy() for value in module(*map(torch.as_tensor, arrays.values()))])
-    with atomic_path(out) as path:
-        with path.open("wb") as file:
-            torch.export.save(program, file, extra_files=metadata)
+    with atomic_path(out) as path, path.open("wb") as file:
+        torch.export.save(program, file, extra_files=metadata)
 
 
 def export_detector(network: DetectorNet, out: str | os.PathLike, *, card: dict) -> None:
