@@ -1,5 +1,5 @@
-# make demo: people seen by three LiDARs, true and predicted. make test: the tests, two files at a time; make test-long: the
-# rest of what a change must pass. All set up .venv first.
+# make demo: synthesizes people scanned by three LiDARs and draws true and predicted poses. make test: the default tests, in
+# two processes. make test-long: the longer tests of CI. All targets set up .venv first.
 PYTHON ?= python3
 PIP = .venv/bin/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
@@ -11,19 +11,19 @@ demo: .venv/synth
 test: .venv/test
 	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist loadfile
 
-# the tests that take more than a second each, mostly runs that are killed, taken up and scored
+# tests that take more than a second each, mostly training runs that are interrupted, resumed and evaluated
 test-long: .venv/test
 	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist loadfile -m long
 
-# the tests that take more than ten seconds each: README's figures, exports, the wheel, the types of the pages' snippets
+# tests that take more than ten seconds each: figures of the README, exports, the wheel, types of snippets in the docs
 test-slow: .venv/test
 	OMP_NUM_THREADS=1 .venv/bin/python -m pytest -n 2 --dist loadfile -m slow
 
-# damaged and hostile files for the readers, about ten minutes, other ones each time
+# random damaged files for all readers, different ones in each run, about ten minutes
 fuzz: .venv/test
 	OMP_NUM_THREADS=1 FUZZ_EXAMPLES=7500 .venv/bin/python -m pytest tests/test_fuzz.py
 
-# style, then types; "lint" is its older name
+# style and types; "lint" is an alias
 check: .venv/test
 	$(PIP) ruff mypy
 	.venv/bin/ruff check . && .venv/bin/ruff format --check . && .venv/bin/mypy
@@ -37,7 +37,7 @@ docs: .venv/docs
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
 
-# predicting and the demo need no torch: the install is far smaller without
+# prediction and the demo do not need torch, which is a large download
 .venv/synth: pyproject.toml constraints.txt | .venv/bin/python
 	$(PIP) --editable '.[synth]'
 	touch $@

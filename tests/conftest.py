@@ -1,4 +1,4 @@
-"""Settings of every test, and fixtures of several files. Hypothesis measures no time: a busy machine is no fault."""
+"""Settings and fixtures of all tests. Hypothesis has no deadline, because a busy machine would exceed it."""
 
 import pytest
 from hypothesis import settings
@@ -17,7 +17,7 @@ def smpl(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def one_thread():
-    """torch on one thread, whose sums do not depend on the machine."""
+    """One thread for torch, so that sums do not depend on the machine."""
     import torch
 
     threads = torch.get_num_threads()

@@ -1,6 +1,6 @@
-"""Tiny datasets in the on-disk layouts of the real ones, of synthesized people, for the tests of their readers.
+"""Writers of tiny synthetic datasets in the on-disk layouts of the real ones, for the tests of their readers.
 
-Each writer returns what a reader must give: (sequence, frame, track) -> joints (J, 3) m in the reader's frame.
+Each writer returns the expected output of a reader: (sequence, frame, track) -> joints (J, 3) m in its frame.
 """
 
 import json
@@ -30,7 +30,7 @@ class People:
     joints: np.ndarray
 
     def cloud(self, frame, rng, count=150, sensor=(0.0, 0.0, 0.0)):
-        """Points (count, 3) of the side that faces the sensor."""
+        """Points (count, 3) on the side that faces the sensor."""
         at = self.vertices[frame]
         toward = np.asarray(sensor) - at.mean(0)
         near = at[np.argsort(-(at @ toward))[: len(at) // 2]]
@@ -38,13 +38,13 @@ class People:
 
 
 def write_smpl(path, seed=0):
-    """A file of a body that is no one's."""
+    """Write a SMPL file of a random body."""
     np.savez(path, **synthetic(seed=seed))
     return path
 
 
 def person(smpl, frames=4, seed=0, at=(8.0, 2.0, 0.0), betas=None):
-    """A person of a model file, about `at` m."""
+    """Motion of a random person of a model file, near `at` m."""
     rng = np.random.default_rng(seed)
     rotations, way = motion_files.a_clip(frames, seed)
     pose = motion_files.to_smpl(rotations)
@@ -79,7 +79,7 @@ def write_pcd(path, points, *, text=False):
 
 
 def write_humanm3(root, smpl, *, sequences=("train/basketball1", "test/plaza/seg0"), frames=3, first=7, digits=4):
-    """Two people a frame, and ground; labels named by so many digits (0: as few as there are)."""
+    """Two people per frame, and ground points. digits: width of the numbers in names of label files (0: not padded)."""
     truth = {}
     for k, sequence in enumerate(sequences):
         rng = np.random.default_rng(k)
@@ -99,7 +99,7 @@ def write_humanm3(root, smpl, *, sequences=("train/basketball1", "test/plaza/seg
 
 
 def write_humanm3_database(root, truth, *, cameras=4, name="train.pkl"):
-    """The authors' database of what `write_humanm3` wrote: everybody once a camera, paths of another machine."""
+    """The authors' database of the files of `write_humanm3`: each person once per camera, paths of another machine."""
     db = []
     for sequence, frame in dict.fromkeys((sequence, frame) for sequence, frame, _ in truth):
         joints = np.stack([joints for (s, f, _), joints in truth.items() if (s, f) == (sequence, frame)])
@@ -113,7 +113,7 @@ def write_humanm3_database(root, truth, *, cameras=4, name="train.pkl"):
 
 
 def write_lidarhuman26m(root, smpl, *, sequences=("5", "7"), frames=3, R_sensor_level=None):
-    """R_sensor_level (3, 3): how the LiDAR is mounted, level by default; what is returned is level."""
+    """R_sensor_level (3, 3): rotation of the mounted LiDAR, level by default. The returned joints are level."""
     R = np.eye(3) if R_sensor_level is None else R_sensor_level
     truth = {}
     for sequence in sequences:
@@ -143,8 +143,8 @@ def quaternion(matrix):
 
 
 def sloper4d_labels(smpl, sequence, *, frames=4, without=(1,), total=None, refined=True, gender="male"):
-    """(label file's content, what a reader must give). The LiDAR walks, and tilts as a head does; frames in `without`
-    have no cloud."""
+    """(content of the label file, expected joints). The LiDAR moves and tilts as on a head; frames in `without` have no
+    cloud."""
     rng = np.random.default_rng(len(sequence))
     one = person(smpl, frames, seed=3, at=(103.0, -50.0, 2.0))
     numbers = [100 + 5 * f for f in range(frames)]
@@ -154,7 +154,7 @@ def sloper4d_labels(smpl, sequence, *, frames=4, without=(1,), total=None, refin
         heading, pitch, roll = 0.4 + 0.1 * f, 0.25, -0.1
         turns = [axis_angle_to_matrix(vector) for vector in ([0, 0, heading], [0, pitch, 0], [roll, 0, 0])]
         R_world_sensor = turns[0] @ turns[1] @ turns[2]
-        # a quaternion and its negative are one rotation
+        # a quaternion and its negative are the same rotation
         way.append([f, *place, *(-1) ** f * quaternion(R_world_sensor), 1641234567.5 + 0.05 * f])
         if f in without:
             continue
@@ -192,7 +192,7 @@ def write_sloper4d(root, smpl, *, sequences=("seq002_football_001", "seq009_runn
 
 
 def write_lipd(root, smpl, *, name="LIPD_train.pkl", frames=3):
-    """Three ways of saying where joints are, and one that does not say it; a cloud in a file."""
+    """Entries with each of three encodings of positions, one without positions, and one cloud in a separate file."""
     rng, entries, truth = np.random.default_rng(0), [], {}
     one = person(smpl, frames, seed=1)
     for f in range(frames):
@@ -215,7 +215,7 @@ def write_lipd(root, smpl, *, name="LIPD_train.pkl", frames=3):
 
 
 def write_freemotion(root, smpl, *, name="fm_test2.pkl", frames=2, noise=False):
-    """Everybody seen by three LiDARs; with `noise` as the authors' script makes it of NoiseMotion."""
+    """Each person is seen by three LiDARs. noise: the layout that the authors' script writes for NoiseMotion."""
     rng, entries, truth = np.random.default_rng(0), [], {}
     root.mkdir(parents=True, exist_ok=True)
     one = person(smpl, 3 * frames if noise else frames, seed=1)
@@ -237,7 +237,7 @@ def write_freemotion(root, smpl, *, name="fm_test2.pkl", frames=2, noise=False):
 # --- ITOP
 
 
-# of the file's 15 joints: the torso is none of SMPL's, the head's middle is put above SMPL's head
+# the 15 joints of the file; SMPL has no torso joint, and the center of the head is placed above SMPL's head
 ITOP_JOINTS = (*ITOP14.joints[:8], "torso", *ITOP14.joints[8:])
 
 
@@ -249,15 +249,15 @@ def itop_joints(joints):
 
 
 def write_itop(root, smpl, *, parts=("side/test", "side/train"), frames=3, invalid=(), mirrored=False):
-    """A person on the floor of a room, a wall and a chair behind; frames in `invalid` were not checked. mirrored: x is
-    left. The camera is 1.2 m above the floor, of the top view 2.9 m."""
+    """A person on the floor of a room with a wall and a chair. Frames in `invalid` are marked as not valid. mirrored: x
+    is left. The camera is 1.2 m above the floor, in the top view 2.9 m."""
     import h5py
 
     root.mkdir(parents=True, exist_ok=True)
     truth, sign = {}, 1 if mirrored else -1
     for k, part in enumerate(parts):
         view, rng = part.split("/")[0], np.random.default_rng(k)
-        # the side view's camera looks along x; the top view's down, with x up in its image
+        # the camera of the side view looks along x, that of the top view down, with x up in its image
         at, floor, camera_of = (
             ((2.6, 0.0), -1.2, lambda p: np.stack([sign * p[..., 1], p[..., 2], p[..., 0]], -1))
             if view == "side"

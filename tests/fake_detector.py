@@ -1,4 +1,4 @@
-"""A detector that needs no weights: real proposals, scored by height and width alone."""
+"""A detector without weights: real proposals, scored by height and width."""
 
 import numpy as np
 
@@ -6,14 +6,14 @@ from lidarpose.models.detector.candidates import CELL
 from lidarpose.models.detector.detector import Detector
 
 HEADER = {"version": "fake", "default_score": 0.85, "calibration": [[-6, 0, 6], [0.01, 0.5, 0.99]]}
-# slices from 0.2 to 2.1 m above the ground, and the distance of a cell's middle from the candidate's axis, m
+# slices from 0.2 to 2.1 m above the ground; distance of a cell's center from the candidate's axis, m
 BODY = slice(7, 26)
 AXIS = (np.arange(24) - 11.5) * CELL
 NEAR = np.hypot(*np.meshgrid(AXIS, AXIS, indexing="ij")) < 0.9
 
 
 def score(arrays):
-    """Columns as tall as people, with room around them, are people: the network's outputs (K, 6)."""
+    """Network outputs (K, 6): columns as tall as a person with free space around them get a high score."""
     filled = (arrays["fine"][:, BODY] > 0) & NEAR
     outputs = np.zeros((len(filled), 6))
     for row, cells in zip(outputs, filled, strict=True):
@@ -26,7 +26,7 @@ def score(arrays):
 
 
 class FakeDetector(Detector):
-    """Remembers what it was asked."""
+    """Records its calls."""
 
     def __init__(self):
         super().__init__(score)

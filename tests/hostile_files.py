@@ -1,6 +1,6 @@
-"""Small files of every kind that the readers take, as bytes, how to damage them, and what an error must be like.
+"""Small valid files of all kinds that the readers accept, functions that damage them, and a check of error messages.
 
-Writers are literal, so that they share nothing with the readers.
+The writers are literal, so that they share no code with the readers.
 """
 
 import io
@@ -21,7 +21,7 @@ KITTI = b"Pedestrian 0 0 -0.2 712 143 810 307 1.89 0.48 1.2 1.84 1.47 8.41 0.01\
 
 
 def refusal(call, *args, words=(), **options) -> str:
-    """The message of the InputError that a call raises: one printable line, with the words."""
+    """Assert that a call raises an InputError of one printable line that contains `words`; return the line."""
     with pytest.raises(InputError) as caught:
         call(*args, **options)
     error, message = caught.value, str(caught.value)
@@ -36,7 +36,7 @@ def refusal(call, *args, words=(), **options) -> str:
 
 
 def with_changed_bytes(data: bytes, random: np.random.Generator, most: int, count: int = 60):
-    """Copies of a file with up to `most` bytes less one replaced by random ones."""
+    """Copies of a file with 1 to `most` - 1 bytes replaced by random ones."""
     for _ in range(count):
         broken = np.frombuffer(data, np.uint8).copy()
         at = random.integers(0, len(data), random.integers(1, most))
@@ -64,7 +64,7 @@ def ply_header(points=3, form="binary_little_endian", kind="float", names="x y z
 
 
 def lzf_body(content):
-    """LZF without any back reference, in runs of at most 32 literal bytes."""
+    """LZF data without back references, in runs of at most 32 literal bytes."""
     runs = [content[i : i + 32] for i in range(0, len(content), 32)]
     packed = b"".join(bytes([len(run) - 1]) + run for run in runs)
     return struct.pack("<II", len(packed), len(content)) + packed
@@ -99,7 +99,7 @@ _TEXT = "".join(f"{x} {y} {z} {i}\n" for x, y, z, i in POINTS.tolist())
 
 
 def las(points=POINTS, *, version="1.2", kind=0, packed=False, step=1e-3, shift=(0.0, 0.0, 0.0)) -> bytes:
-    """A LAS or LAZ file by laspy."""
+    """A LAS or LAZ file written by laspy."""
     header = laspy.LasHeader(point_format=kind, version=version)
     header.scales, header.offsets = np.full(3, step), np.array(shift)
     cloud = laspy.LasData(header)
@@ -161,7 +161,7 @@ DATA = {
 
 
 def old_array(values: np.ndarray, code: bytes, module: bytes = b"numpy.core.multiarray") -> bytes:
-    """As Python 2 and an old numpy wrote an array: its bytes as a string."""
+    """A pickled array as Python 2 and an old numpy wrote it: its bytes as a string."""
     content = values.tobytes()
     return (
         b"c" + module + b"\n_reconstruct\ncnumpy\nndarray\nK\x00\x85U\x01b\x87R(K\x01"
@@ -176,7 +176,7 @@ def old_array(values: np.ndarray, code: bytes, module: bytes = b"numpy.core.mult
 PICKLES = {f"protocol {p}.pkl": pickle.dumps(DATA, p) for p in (0, 2, 4, 5)}
 PICKLES["python 2.pkl"] = b"\x80\x02" + old_array(np.arange(3.0), b"f8") + b"."
 
-# instructions in any order, with small arguments: reaches what random bytes hardly ever do
+# pickle opcodes with small arguments, for use in any order: they reach states that random bytes rarely reach
 PICKLE_PIECES = [
     b"cnumpy\nndarray\n", b"cnumpy\ndtype\n", b"cnumpy.core.multiarray\n_reconstruct\n",
     b"cnumpy.core.multiarray\nscalar\n",
@@ -197,7 +197,7 @@ PICKLE_PIECES = [
 
 @st.composite
 def damaged(draw, files: dict[str, bytes]) -> tuple[str, bytes]:
-    """The name and the content of one of the files, some of its bytes cut off, changed, inserted or repeated."""
+    """Name and content of one of the files, with some bytes cut off, changed, inserted or repeated."""
     name = draw(st.sampled_from(sorted(files)))
     content = files[name]
     odd = st.binary(max_size=6) | st.sampled_from([b"9" * 25, b"\n", b" ", b"-", b",", b'"', b"nan", b"\xff" * 8])

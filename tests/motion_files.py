@@ -1,4 +1,4 @@
-"""Tiny files of motion in the layouts of others, written from poses of our body, for the tests of their readers."""
+"""Writers of tiny motion files in other formats, from poses of this package's body, for the tests of their readers."""
 
 import json
 
@@ -10,13 +10,13 @@ from lidarpose.geometry import UP_AXES, rotation_about, rotation_vector
 from lidarpose.skeleton import SMPL24
 
 J = {name: i for i, name in enumerate(SMPL24.joints)}
-# the joints that retargeting places well: hands and feet have directions alone
+# joints that retargeting places accurately; of hands and feet only the directions are known
 MAIN = [J[name] for name in J if not name.endswith(("foot", "hand"))]
 C = UP_AXES["y"]
 
 
 def check_rotations(rotations, atol=1e-5):
-    """Rotations (..., 3, 3) float32 are orthonormal and not reflected."""
+    """Assert that rotations (..., 3, 3) are float32 and orthonormal, without reflection."""
     assert rotations.dtype == np.float32
     product = rotations @ np.swapaxes(rotations, -1, -2)
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=atol)
@@ -24,7 +24,7 @@ def check_rotations(rotations, atol=1e-5):
 
 
 def a_clip(frames=6, seed=0):
-    """Rotations (F, 24, 3, 3) of several poses that face anywhere, and a walk of the pelvis (F, 3) m, z up."""
+    """Rotations (F, 24, 3, 3) of random poses in random headings, and a random path of the pelvis (F, 3) m, z up."""
     rng = np.random.default_rng(seed)
     rotations = sampling.sample_rotations(rng, frames, mix={"walk": 2, "idle": 2, "run": 1}).rotations.astype(float)
     rotations[:, 0] = rotation_about("z", rng.uniform(-3, 3, frames)) @ rotations[:, 0]
@@ -33,14 +33,14 @@ def a_clip(frames=6, seed=0):
 
 
 def joints_of(rotations, translation=None):
-    """(F, 24, 3) m of the mean adult, the pelvis at `translation` (F, 3) or at the origin."""
+    """Joints (F, 24, 3) m of the mean adult, with the pelvis at `translation` (F, 3) or at the origin."""
     rest = rig.mean_adult_joints()[None]
     way = np.zeros((len(rotations), 3)) if translation is None else np.asarray(translation, float)
     return rig.forward_kinematics(SMPL24.parents, rest, np.asarray(rotations, float), way)[1]
 
 
 def to_smpl(rotations, up="z"):
-    """Our rotations as SMPL's axis-angles (F, 72) in a world whose axis `up` is upwards."""
+    """Rotations of this package as SMPL's axis-angles (F, 72) in a world whose axis `up` points up."""
     local = C.T @ rotations @ C
     local[:, 0] = UP_AXES[up].T @ rotations[:, 0] @ C
     return rotation_vector(local.reshape(-1, 3, 3)).reshape(-1, 72)
@@ -65,7 +65,7 @@ def write_pose_json(folder, rotations, translation, *, up="z", first=1):
     return folder
 
 
-# what other skeletons call SMPL's joints: those of the limbs in this order, in a pattern of the side
+# names of SMPL's joints in other skeletons: limb joints in this order, to be put in a pattern with the side
 _LIMBS = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist", "hand")
 _CENTRAL = dict(pelvis="Hips", spine1="LowerBack", spine2="Spine", spine3="Spine1", neck="Neck", head="Head")
 
@@ -94,8 +94,8 @@ NAMES = {
 
 
 def bvh_text(rotations, translation, *, names=SMPL_NAMES, order="ZXY", unit=0.01, up="y", fps=30.0, drop=()):
-    """A BVH of the mean adult: `unit` meters a number, rotations in channels of this order; joints in `drop` (with all
-    below them) are left out."""
+    """BVH text of the mean adult: `unit` meters per number, rotation channels in the given order, without the joints in
+    `drop` and their descendants."""
     world = UP_AXES[up]
     rest = rig.mean_adult_joints() @ C / unit
     local = C.T @ rotations @ C
@@ -127,7 +127,7 @@ def bvh_text(rotations, translation, *, names=SMPL_NAMES, order="ZXY", unit=0.01
 
 
 def to_euler(matrix, order):
-    """Angles (F, 3) whose rotations about the axes `order`, multiplied in this order, are matrix (F, 3, 3)."""
+    """Angles (F, 3) about the axes `order` whose rotations, multiplied in this order, give matrix (F, 3, 3)."""
     i, j, k = ("XYZ".index(axis) for axis in order)
     sign = 1.0 if (j - i) % 3 == 1 else -1.0
     second = np.arcsin(np.clip(sign * matrix[:, i, k], -1, 1))
@@ -136,7 +136,7 @@ def to_euler(matrix, order):
     return np.stack([first, second, third], -1)
 
 
-# CMU's bones by the joint of SMPL's at their end; a bone turns as the joint at its start, which is that joint's parent
+# CMU's bone that ends at each SMPL joint; a bone has the rotation of the joint at its start, the parent of that joint
 _BONES = dict(
     pelvis="root", spine1="lowerback", spine2="upperback", spine3="midback", neck="thorax", head="lowerneck",
     hip="hipjoint", knee="femur", ankle="tibia", foot="foot", collar="inner", shoulder="clavicle", elbow="humerus",
@@ -149,7 +149,7 @@ def _bone(joint):
     return side[:1] + _BONES[name]
 
 
-# bone, its parent, the joints at its start and its end; the trunk's before those with a side
+# bone, its parent, the joints at its start and its end; bones of the trunk come first
 _PARENTS = {end: SMPL24.joints[p] for end, p in zip(J, SMPL24.parents, strict=True) if p >= 0}
 _ENDS = sorted(_PARENTS, key=lambda end: "_" in end)
 _ASF = [(_bone(end), _bone(_PARENTS[end]), _PARENTS[end], end) for end in _ENDS]
@@ -158,7 +158,7 @@ ASF_ENDS = {bone: end for bone, _, _, end in _ASF if end}
 
 
 def asf_text(*, length=0.45, seed=0, angle="deg"):
-    """The mean adult as CMU's skeleton: y up, every bone's axes turned at random."""
+    """The mean adult as CMU's skeleton: y up, with random axes of each bone."""
     rng = np.random.default_rng(seed)
     scale = length / 0.0254
     rest = rig.mean_adult_joints() @ C
@@ -174,7 +174,7 @@ def asf_text(*, length=0.45, seed=0, angle="deg"):
         lines += ["  begin", f"     id {k}", f"     name {bone}"]
         lines += ["     direction " + " ".join(f"{v:.8f}" for v in way / size), f"     length {size:.8f}"]
         lines += ["     axis " + " ".join(f"{v:.8f}" for v in shown) + "  XYZ"]
-        if start != "pelvis":  # what starts there goes with the root
+        if start != "pelvis":  # bones that start at the pelvis have the rotation of the root
             lines += ["    dof rx ry rz", "    limits (-160 20)", "           (-70 70)", "           (-60 70)"]
         lines += ["  end"]
     lines += [":hierarchy", "  begin"]
@@ -199,7 +199,7 @@ def amc_text(rotations, translation, axes, *, length=0.45):
 
 
 def _xyz(matrix):
-    """Angles (F, 3) about x, y, z of rotations R_z R_y R_x."""
+    """Angles (F, 3) about x, y, z that give rotations R_z R_y R_x."""
     return to_euler(matrix, "ZYX")[:, ::-1]
 
 

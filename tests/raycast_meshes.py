@@ -1,10 +1,10 @@
-"""Made-up meshes for the tests of the casters, vertices (V, 3) m and faces (F, 3), and what equal hits are."""
+"""Meshes for the tests of ray casting, as vertices (V, 3) m and faces (F, 3), and the comparison of hits."""
 
 import numpy as np
 
 
 def sphere(rings: int = 16, radius: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """A closed mesh: rings of 2 * rings vertices and two poles."""
+    """A closed sphere: rings of 2 * rings vertices and two poles."""
     around = 2 * rings
     polar = np.pi * np.arange(1, rings) / rings
     angle = np.pi * np.arange(around) / rings
@@ -28,14 +28,14 @@ def sphere(rings: int = 16, radius: float = 1.0) -> tuple[np.ndarray, np.ndarray
 
 
 def body(rng: np.random.Generator, rings: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """A closed, bumpy, self-hiding mesh of a person's size around the origin."""
+    """A closed, bumpy, self-occluding mesh of a person's size around the origin."""
     vertices, faces = sphere(rings)
     bumps = 1 + 0.3 * np.sin(vertices @ rng.normal(0, 4, (3, 3))).sum(1, keepdims=True) / 3
     return vertices * bumps * [0.3, 0.4, 0.9], faces
 
 
 def soup(rng: np.random.Generator, count: int, spread: float, size: float) -> tuple[np.ndarray, np.ndarray]:
-    """Loose triangles around the sensor."""
+    """Separate random triangles around the sensor."""
     vertices = rng.normal(0, spread, (count, 1, 3)) + rng.normal(0, size, (count, 3, 3))
     return vertices.reshape(-1, 3), np.arange(3 * count).reshape(count, 3)
 
@@ -53,7 +53,7 @@ def ground(half: float, z: float, x: float = 0.0) -> tuple[np.ndarray, np.ndarra
 
 
 def assert_same(got, want):
-    """The same hits (range float32, face int32), the same ranges; other faces only at ties."""
+    """Assert equal hits (range float32, face int32) and ranges; faces may differ only at ties."""
     distance, face = got
     expected, expected_face = want
     assert distance.dtype == np.float32 and face.dtype == np.int32 and distance.shape == expected.shape

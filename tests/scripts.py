@@ -1,4 +1,4 @@
-"""Scripts of benchmarks/, examples/ and tools/ as modules."""
+"""Import of scripts of benchmarks/, examples/ and tools/ as modules."""
 
 import importlib.util
 import sys
@@ -7,10 +7,10 @@ from types import ModuleType
 
 
 def load_script(path: Path | str) -> ModuleType:
-    """path: absolute, or from the root of the repository."""
+    """path: absolute, or relative to the root of the repository."""
     path = Path(__file__).parents[1] / path
     spec = importlib.util.spec_from_file_location(path.stem, path)
-    # dataclasses look their module up
+    # dataclasses look up their module in sys.modules
     module = sys.modules[path.stem] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

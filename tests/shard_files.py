@@ -1,4 +1,4 @@
-"""Shards of rows that are at hand, for tests."""
+"""Shards of given rows, and random samples."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""The losses and the choices of people that benchmarks/ablations.py tries; results that benchmarks store."""
+"""Losses and data of the variants in benchmarks/ablations.py; stored results of benchmarks."""
 
 import sys
 from argparse import Namespace
@@ -42,7 +42,7 @@ def terms_of(objective, people):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_new_loss_reaches_all_weights(ablations, people, name):
+def test_variant_losses_give_gradients_to_all_weights(ablations, people, name):
     variant = ablations.VARIANTS[name]
     objective = variant.objective(config=preset("tiny"), made=variant.network)
     torch.manual_seed(0)
@@ -52,7 +52,7 @@ def test_every_new_loss_reaches_all_weights(ablations, people, name):
         assert value.grad is not None and value.grad.isfinite().all(), weight
 
 
-def test_a_mirrored_person_twice_is_the_person(objectives, people):
+def test_mirrored_twice_restores_example(objectives, people):
     one = people[0]
     image = objectives.mirrored(one)
     assert np.array_equal(
@@ -63,7 +63,7 @@ def test_a_mirrored_person_twice_is_the_person(objectives, people):
         assert np.array_equal(getattr(again, name), getattr(one, name)), name
 
 
-def test_mirrored_pairs_ask_for_the_mirror_image_of_the_pose(objectives, people):
+def test_mirrored_pairs_consistency_loss_measures_asymmetry(objectives, people):
     objective = objectives.MirroredPairs(config=preset("tiny"))
     arrays = objective.collate(people)
     joints = torch.as_tensor(arrays["joints"])
@@ -81,23 +81,23 @@ def test_mirrored_pairs_ask_for_the_mirror_image_of_the_pose(objectives, people)
     assert found["consistency"] == pytest.approx(0, abs=1e-6) and found["mpjpe"] == pytest.approx(0, abs=1e-6)
     moved = joints.clone()
     moved[: len(joints) // 2, :, 1] += 0.1
-    # each of the two is drawn to the other: 0.1 m apart
+    # the two predictions are 0.1 m apart
     found = objective.terms(Perfect(moved), arrays)["consistency"]
     assert found == pytest.approx(0.1 * objectives.CONSISTENCY, rel=1e-4)
 
 
-def test_mirrored_pairs_are_validated_on_the_people_as_they_are(ablations, people):
-    """Of whom `collate` of training leaves out every other one."""
+def test_mirrored_pairs_validates_all_people_unmirrored(ablations, people):
+    """In training, `collate` leaves out every other person."""
     settings = recipe(Pretrain, people=64, workers=0, pictures=0)
     mirrored, base = (ablations.job(ablations.VARIANTS[name], settings) for name in ("mirrored pairs", "base"))
     torch.manual_seed(0)
     network = base.network().eval()
-    # an odd number of them too
+    # 7: an odd number of people is validated, too
     found, expected = (job.validate(job.objective, network, people[:7], 4) for job in (mirrored, base))
     assert found[0] == expected[0] and np.array_equal(found[1], expected[1])
 
 
-def test_the_worst_people_weigh_more(objectives, people):
+def test_hardest_people_weights_large_errors_more(objectives, people):
     config = preset("tiny")
     plain = terms_of(objectives.VariantObjective(config=config), people)
     found = terms_of(objectives.HardestPeople(config=config), people)
@@ -105,7 +105,7 @@ def test_the_worst_people_weigh_more(objectives, people):
     assert found["joints"] > plain["joints"]
 
 
-def test_things_near_a_joint_are_nobodys_and_unknown_points_teach_nothing(objectives, people):
+def test_point_joints_losses_of_clutter_and_unlabeled_points(objectives, people):
     config = preset("tiny")
     objective = objectives.PointJoints(config=config, made=objectives.with_point_joints)
     arrays = objective.collate(people)
@@ -117,7 +117,7 @@ def test_things_near_a_joint_are_nobodys_and_unknown_points_teach_nothing(object
     assert unknown["offset"] == 0 and unknown["label"] == 0
 
 
-def test_local_refinement_begins_as_the_votes_alone(objectives, people):
+def test_local_refinement_starts_equal_to_votes(objectives, people):
     config = preset("tiny")
     objective = objectives.PointJoints(config=config, made=objectives.with_local_refinement)
     arrays = objective.collate(people)
@@ -135,7 +135,7 @@ def test_local_refinement_begins_as_the_votes_alone(objectives, people):
     assert torch.equal(refined, seen["vote"])
 
 
-def test_local_refinement_goes_on_from_trained_weights(objectives, people):
+def test_local_refinement_of_trained_weights_keeps_outputs(objectives, people):
     trained = objectives.load_checkpoint(objectives.bundled_path("tiny"))[0]
     larger = objectives.grown(trained, objectives.with_local_refinement).eval()
     objective = objectives.VariantObjective(config=trained.config)
@@ -146,11 +146,11 @@ def test_local_refinement_goes_on_from_trained_weights(objectives, people):
     assert torch.equal(before.part, after.part[..., : trained.config.parts])
 
 
-def test_hard_activities_come_more_often_than_they_are_drawn(ablations):
+def test_hard_kinds_variant_prefers_hard_activities(ablations):
     settings = recipe(Pretrain, people=1024, seed=3, workers=0, pictures=0)
     job = ablations.job(ablations.VARIANTS["hard kinds"], settings)
     base = ablations.job(ablations.VARIANTS["base"], settings)
-    # twice as many people are drawn, and as many steps of the curriculum
+    # twice as many people are drawn, so the curriculum has twice as many steps
     assert job.source.easy == 2 * base.source.easy
     weights = {k: ablations.KIND_WEIGHTS.get(job.source.kind(k), 1.5) for k in range(512)}
     shown = [job.source.chosen(k) for k in range(256)]
@@ -161,7 +161,7 @@ def test_hard_activities_come_more_often_than_they_are_drawn(ablations):
 # ---- stored results
 
 
-def test_a_run_of_other_motion_or_weights_is_not_taken_for_this_one(ablations, tmp_path):
+def test_ablations_each_rejects_scores_of_other_options(ablations, tmp_path):
     options = Namespace(seeds="1", out=tmp_path, people=64, motion="a.npz", subjects="002", init="")
     runs = []
 
@@ -176,13 +176,13 @@ def test_a_run_of_other_motion_or_weights_is_not_taken_for_this_one(ablations, t
     for other in ({"motion": "b.npz"}, {"subjects": "005"}, {"init": str(tmp_path / "weights")}):
         with pytest.raises(SystemExit, match=r"base-64-1/scores\.json is of \{.*: delete it$"):
             ablations.each(["base"], Namespace(**vars(options) | other), scored)
-    # nor one of before, of which nothing says what it is of
+    # scores without recorded options are rejected, too
     (tmp_path / "base-64-1" / "scores.json.of.json").unlink()
     with pytest.raises(SystemExit, match="unknown options"):
         ablations.each(["base"], options, scored)
 
 
-def test_stored_clips_are_of_the_options_and_weights(tmp_path, monkeypatch):
+def test_clips_rejects_store_of_other_options_or_weights(tmp_path, monkeypatch):
     clips = benchmark("clips")
     made = []
     monkeypatch.setattr(clips, "make_clips", lambda *arguments: made.append(arguments) or {"true": np.zeros(1)})
@@ -198,7 +198,7 @@ def test_stored_clips_are_of_the_options_and_weights(tmp_path, monkeypatch):
             clips.main()
 
 
-def test_stored_boxes_are_of_the_networks_that_found_them(tmp_path, monkeypatch):
+def test_tracks_rejects_stored_boxes_of_other_networks(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "trackeval", ModuleType("trackeval"))
     tracks = benchmark("tracks")
     monkeypatch.setattr(tracks, "recording", lambda seed, index: [])

@@ -1,4 +1,4 @@
-"""Clouds that are not one scan of an upright sensor around one person: merged, accumulated, hung, sparse, crowded."""
+"""Acquisition conditions: merged sensors, accumulated frames, inverted mounts, sparse sensors, crowded crops."""
 
 import pickle
 from dataclasses import replace
@@ -26,7 +26,7 @@ from lidarpose.train.augment import Augmentation, add_disturbances, augmented
 
 SEED = 11
 WILD, WIDE = SCENES["wild"], SCENES["wide"]
-# a flat ground, all that a sensor sees, no errors
+# flat ground, no masked points, no slope, no clothes
 CLEAN = replace(
     SCENES["paper"],
     sensors=("os1-64",),
@@ -39,7 +39,7 @@ SHARES = ("merged", "accumulated", "inverted", "integration", "sparse", "crowded
 
 
 def drawn(config, acquisition, bodies, row, block=None, seed=0):
-    """A scene, drawn without errors of the sensor."""
+    """A random scene without sensor noise."""
     scene = generator._draw_scene(
         config, bodies, row, block or bodies, row, 1.0, np.random.default_rng(seed), acquisition
     )
@@ -48,16 +48,16 @@ def drawn(config, acquisition, bodies, row, block=None, seed=0):
     return replace(scene, **exact, views=views)
 
 
-def walkers(count, last=MOST_FRAMES - 1):
-    """People who walk on, their last frame on the origin."""
+def walkers(count):
+    """Moving bodies that walk and end at the origin."""
     everybody = draw_moving_bodies(None, 0.0, 40, MOST_FRAMES, np.random.default_rng(3), to_last=True)
     return [one for one in everybody if one.kinds[0] == "walk" and one.joints[0, 0, 0] < -0.3][:count]
 
 
-# --- which conditions hold
+# --- shares of conditions
 
 
-def test_people_without_conditions_are_those_of_the_same_scene_without_shares():
+def test_people_without_conditions_equal_those_of_plain_scene():
     wide, wild = Generator(scene=replace(WIDE, unusual=0.0, box_window=0.0, apart=0.0)), Generator(scene=WILD)
     held = 0
     for index in range(64):
@@ -68,7 +68,7 @@ def test_people_without_conditions_are_those_of_the_same_scene_without_shares():
             np.testing.assert_array_equal(person.sample.points, same.sample.points)
             assert repr(person.facts) == repr(same.facts)
         assert not same.sample.conditions
-        # nothing of it holds where nothing hides people
+        # no conditions at hard=0
         assert not wide.person(SEED, index, hard=0.0).sample.conditions
     assert 8 < held < 35
     again = pickle.loads(pickle.dumps(wide))
@@ -76,7 +76,7 @@ def test_people_without_conditions_are_those_of_the_same_scene_without_shares():
         np.testing.assert_array_equal(again.person(SEED, index).sample.points, wide.person(SEED, index).sample.points)
 
 
-def test_unusual_poses_are_people_of_clips_and_accumulated_frames_too():
+def test_unusual_poses_apply_to_clips_and_accumulated_frames():
     everybody = WIDE.changed(["unusual=1", "accumulated=0.5"])
     usual = {name for name, weight in zip(KINDS, UNUSUAL, strict=True) if not weight}
     generator = Generator(scene=everybody, measure=False)
@@ -89,13 +89,13 @@ def test_unusual_poses_are_people_of_clips_and_accumulated_frames_too():
     assert 0.25 < np.mean([kind not in usual for kind in shared]) < 0.35
 
 
-def test_every_share_is_as_often_as_it_says():
+def test_draw_acquisition_matches_configured_shares():
     draws = np.random.default_rng(0).random((4000, generator.ACQUISITION_DRAWS))
     for hard in (1.0, 0.5):
         found = [name for one in draws for name in draw_acquisition(WIDE.eased(hard), one).conditions]
         shares = {name: found.count(name) / len(draws) for name in set(found)}
-        # accumulated and integrated are drawn of who is not merged; a fifth of the sensors are rosettes, a third of the
-        # times 0.1 s
+        # accumulated and integrated are drawn only if not merged; a fifth of the sensors are rosettes, a third of the
+        # integration times are 0.1 s
         expected = {"merged": 0.06, "accumulated": 0.056, "inverted": 0.08, "sparse": 0.12, "crowded": 0.05}
         expected["integrated"] = 0.5 * 0.2 * 2 / 3 * 0.94 * 0.94 * (1 - 0.12 * hard)
         assert shares == pytest.approx({name: hard * share for name, share in expected.items()}, abs=0.012)
@@ -108,14 +108,14 @@ def test_every_share_is_as_often_as_it_says():
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", SHARES)
-def test_a_share_of_one_holds_for_everybody_and_their_source_says_so(name):
+def test_share_of_one_applies_condition_to_all_people(name):
     config = WILD.changed((f"{name}=1",))
     if name == "integration":
         config = replace(config, sensors=("livox-mid360",))
     people = [Generator(scene=config).person(SEED, index) for index in range(12 if name == "integration" else 6)]
     word = "integrated" if name == "integration" else name
     held = [word in person.sample.conditions for person in people]
-    # a frame of a rosette is one of three lengths
+    # a frame of a rosette has one of three integration times
     assert all(held) if name != "integration" else 3 < sum(held) < 12
     for person in people:
         sample, facts = person.sample, person.facts
@@ -133,9 +133,9 @@ def test_a_share_of_one_holds_for_everybody_and_their_source_says_so(name):
 
 
 @pytest.mark.long
-def test_merged_clouds_have_the_far_side_of_the_body():
+def test_merged_clouds_cover_far_side_of_body():
     def far_side(config):
-        """The share of the trunk's points that lie behind its middle as the first sensor sees it."""
+        """Mean share of the trunk's points behind its center, seen from the first sensor."""
         shares = []
         for index in range(30):
             sample = Generator(scene=config, measure=False).person(SEED, index).sample
@@ -150,18 +150,18 @@ def test_merged_clouds_have_the_far_side_of_the_body():
     assert single < 0.08 and merged > 0.25
 
 
-def test_merged_sensors_stand_around_and_see_the_same_body():
+def test_merged_sensors_surround_and_hit_the_same_body():
     block = draw_bodies(None, 0.0, 8, SEED, 0)
     scene = drawn(CLEAN, Acquisition(sensors=("os1-64", "vlp-32c", "os1-64"), distance=(3.0, 15.0)), block, 2)
     angles = []
     for view in (*scene.views,):
         assert -1 <= view.lag <= 1 and 3 <= view.scene.place.distance <= 15
-        # its frame's axes are the first one's
+        # its frame has the axes of the first sensor's frame
         np.testing.assert_allclose(view.scene.place.feet + view.at, scene.place.feet, atol=1e-9)
         angles.append(np.arctan2(*-view.scene.place.feet[1::-1]))
     toward = np.arctan2(*-scene.place.feet[1::-1])
     assert np.sort(np.mod(np.array(angles) - toward, 2 * np.pi)) == pytest.approx([2.09, 4.19], abs=0.45)
-    # who stands still: all points lie on one body, on the ground, or nowhere
+    # without motion, all points lie on one body or on the ground
     still = replace(block, moved=lambda row: (block.vertices[row], block.joints[row]))
     scan = simulate(scene, still, 2, np.random.default_rng(0))
     body = scene.body_place.of_body(block.vertices[2])
@@ -174,7 +174,7 @@ def test_merged_sensors_stand_around_and_see_the_same_body():
     np.testing.assert_allclose(scan.points[scan.part == 0, 2], scene.place.feet[2], atol=1e-3)
 
 
-def test_merged_sensors_that_turn_twice_as_fast_give_two_scans():
+def test_merged_double_rate_sensors_give_two_scans():
     block = draw_bodies(None, 0.0, 8, SEED, 0)
     names = ("os1-64", "vlp-32c", "livox-mid360")
     once, twice = (
@@ -190,7 +190,7 @@ def test_merged_sensors_that_turn_twice_as_fast_give_two_scans():
         and first.scene.sensor.columns * 2 == once.views[0].scene.sensor.columns
     )
     assert rosette.scene.sensor is once.views[1].scene.sensor
-    # so that there are about as many points on the person, in two moments
+    # the two scans have about as many points on the person as the single one
     counts = []
     for scene in (once, twice):
         scene = replace(scene, views=tuple(view for view in scene.views if view.scene.sensor.name == "vlp-32c"))
@@ -198,7 +198,7 @@ def test_merged_sensors_that_turn_twice_as_fast_give_two_scans():
     assert counts[1] == pytest.approx(counts[0], rel=0.3)
 
 
-def test_a_sensor_that_lags_sees_the_person_move():
+def test_scene_meshes_move_body_by_lag():
     block = draw_bodies(None, 0.0, 64, SEED, 0)
     row = block.kinds.index("walk")
     scene = drawn(CLEAN, Acquisition(), block, row)
@@ -213,7 +213,7 @@ def test_a_sensor_that_lags_sees_the_person_move():
 
 
 @pytest.mark.parametrize("speed", [0.0, 10.0])
-def test_accumulated_frames_smear_who_walks_and_nothing_else(speed):
+def test_accumulated_frames_smear_only_moving_people(speed):
     wider = []
     for bodies in walkers(4):
         scene = drawn(CLEAN, Acquisition(sensors=("os1-64",), frames=5, speed=speed), bodies, MOST_FRAMES - 1)
@@ -221,7 +221,7 @@ def test_accumulated_frames_smear_who_walks_and_nothing_else(speed):
         np.testing.assert_allclose([view.at[0] for view in scene.views], -speed / 10 * np.arange(1, 5), atol=1e-9)
         one = simulate(replace(scene, views=()), bodies, MOST_FRAMES - 1, np.random.default_rng(0))
         scan = simulate(scene, bodies, MOST_FRAMES - 1, np.random.default_rng(0))
-        # the last frame is the single scan
+        # points of the last frame are those of the single scan
         np.testing.assert_array_equal(scan.points[: len(one.points)], one.points)
         np.testing.assert_allclose(scan.points[scan.part == 0, 2], scene.place.feet[2], atol=1e-3)
         ahead = rotation_about("z", scene.place.yaw)[:, 0]
@@ -231,7 +231,7 @@ def test_accumulated_frames_smear_who_walks_and_nothing_else(speed):
     assert np.mean(wider) > 0.4
 
 
-def test_a_sensor_that_drives_does_not_come_through_the_person():
+def test_with_views_keeps_moving_sensor_away_from_person():
     (bodies,) = walkers(1)
     scene = drawn(CLEAN, Acquisition(sensors=("os1-64",), frames=5, speed=15.0), bodies, MOST_FRAMES - 1)
     for feet in ([-3.0, 0.2, -1.0], [3.0, 0.2, -1.0], [-3.0, 2.0, -1.0]):
@@ -240,21 +240,21 @@ def test_a_sensor_that_drives_does_not_come_through_the_person():
         assert min(view.scene.place.distance for view in views) > 1.5
 
 
-def test_moving_bodies_end_where_they_are_told_to():
+def test_draw_moving_bodies_to_last_ends_at_origin():
     first, last = (
         draw_moving_bodies(None, 0.0, 6, 4, np.random.default_rng(4), to_last=to_last) for to_last in (False, True)
     )
     for a, b in zip(first, last, strict=True):
         assert b.heading[-1] == 0 and a.heading[0] == pytest.approx(0, abs=0.2)
         np.testing.assert_allclose(b.joints[-1, 0, :2], 0, atol=1e-5)
-        # the same motion, turned and moved
+        # the same motion, rotated and translated
         turn = rotation_about("z", a.heading[-1])
         way = (a.joints - a.joints[-1, 0] * [1, 1, 0]) @ turn
         np.testing.assert_allclose(b.joints, way, atol=1e-4)
 
 
 @pytest.mark.parametrize("frames", [2, 5])
-def test_integration_gives_as_many_times_the_points(frames):
+def test_integration_multiplies_points_by_frames(frames):
     block = draw_bodies(None, 0.0, 16, SEED, 0)
     still = replace(
         block,
@@ -277,13 +277,13 @@ def test_integration_gives_as_many_times_the_points(frames):
 
 
 @pytest.mark.parametrize("name", ["vlp-32c", "hdl-64e", "livox-mid360", "livox-avia"])
-def test_an_inverted_sensor_sees_its_rings_mirrored(name):
+def test_draw_place_inverted_flips_and_aims_sensor(name):
     device = sensor(name)
     for seed in range(40):
         rng = np.random.default_rng(seed)
         place = draw_place(replace(CLEAN, distance=(3.0, 12.0)), device, 1.7, 0.3, 1.0, rng, inverted=True)
         assert 2 <= -place.feet[2] <= 5
-        # its up is the ground's down, or, tilted to the person, leans to it
+        # its z axis points down, possibly tilted toward the person
         R = place.R_sensor_level
         assert np.linalg.det(R) == pytest.approx(1) and R[2, 2] < 0
         azimuth = np.arctan2(place.feet[1], place.feet[0])
@@ -291,18 +291,18 @@ def test_an_inverted_sensor_sees_its_rings_mirrored(name):
         for height in (0.0, 0.85, 1.7):
             x, y, z = place.to_sensor((place.feet + [0, 0, height])[None])[0]
             elevation.append(np.arctan2(z, np.hypot(x, y)))
-        # what is above is seen by lower rings
+        # higher points are on lower rings
         assert elevation[0] > elevation[1] > elevation[2]
         middle = (device.elevations[0] + device.elevations[-1]) / 2
         fits = device.elevations[0] - 1e-9 <= elevation[2] and elevation[0] <= device.elevations[-1] + 1e-9
-        # bent by what a slope about one point is not
+        # the elevation is approximate, because a pitch does not change all elevations equally
         assert fits or elevation[1] == pytest.approx(middle, abs=0.12)
-        if np.allclose(R[2], [0, 0, -1]):
-            mirrored = [np.cos(azimuth), -np.sin(azimuth), 0]
-            np.testing.assert_allclose(R @ [np.cos(azimuth), np.sin(azimuth), 0], mirrored, atol=1e-9)
+        # left and right are exchanged, also if the sensor is pitched toward the person
+        direction = R @ [np.cos(azimuth), np.sin(azimuth), 0]
+        np.testing.assert_allclose(direction[:2] / np.hypot(*direction[:2]), [np.cos(azimuth), -np.sin(azimuth)])
 
 
-def test_points_of_an_inverted_sensor_lie_on_its_rings_and_stand_upright():
+def test_inverted_sensor_points_are_on_rings_and_upright():
     device = sensor("vlp-32c")
     block = draw_bodies(None, 0.0, 8, SEED, 0)
     scene = drawn(replace(CLEAN, sensors=("vlp-32c",)), Acquisition(inverted=True), block, 3)
@@ -312,7 +312,7 @@ def test_points_of_an_inverted_sensor_lie_on_its_rings_and_stand_upright():
     body = scan.points[scan.part > 0]
     head, foot = (body[np.isin(scan.part[scan.part > 0], parts), 2] for parts in ([16], [8, 9, 11, 12]))
     assert head.min() > foot.max()
-    # the lowest ring sees highest
+    # the lowest ring hits the highest points
     ring = scan.ring[scan.part > 0]
     assert np.corrcoef(ring, body[:, 2])[0, 1] < -0.9
 
@@ -321,7 +321,7 @@ def test_points_of_an_inverted_sensor_lie_on_its_rings_and_stand_upright():
 
 
 @pytest.mark.long
-def test_crowded_crops_hold_two_and_the_center_says_who_is_meant():
+def test_crowded_crops_keep_center_of_labeled_person():
     others = []
     for index in range(40):
         sample = Generator(scene=replace(WILD, crowded=1.0), measure=False).person(SEED, index).sample
@@ -342,7 +342,7 @@ def test_crowded_crops_hold_two_and_the_center_says_who_is_meant():
 
 
 def seen_in(scene, block, row, box, window, **changes):
-    """How many beams meet the second person, and anything in a box."""
+    """Number of beams that hit the second person, and of hits inside a box."""
     wider = replace(scene, config=replace(scene.config, **changes))
     hits, mesh = simulate_module._cast(wider, wider.meshes(block, row), 0, box=window)
     is_inside = box.contains(scene.place.to_level(hits.points))
@@ -351,7 +351,7 @@ def seen_in(scene, block, row, box, window, **changes):
 
 @pytest.mark.parametrize("name", ["os1-64", "livox-mid360"])
 @pytest.mark.parametrize("crowded", [True, False])
-def test_the_window_of_beams_holds_the_box_and_the_second_person(name, crowded):
+def test_beam_window_covers_box_and_second_person(name, crowded):
     block = draw_bodies(None, 0.0, 32, SEED, 0, moving=False)
     calm = replace(
         WIDE, sensors=(name,), distance=(3.0, 9.0), median_points=0, company=0.0, crop=replace(WIDE.crop, loose=1.0)
@@ -368,11 +368,13 @@ def test_the_window_of_beams_holds_the_box_and_the_second_person(name, crowded):
 
 
 @pytest.mark.parametrize("window", [0.0, 1.0])
-def test_the_window_is_about_the_box_of_the_sample_in_every_scan(window, monkeypatch):
-    boxes, cast = [], simulate_module._cast
+def test_beam_window_uses_sample_box_in_every_scan(window, monkeypatch):
+    boxes, from_feet, cast = [], [], simulate_module._cast
 
     def recorded(scene, meshes, frame, *, margin=0.0, box=None):
         boxes.append(box)
+        if box is not None:
+            from_feet.append(box.center - scene.place.feet)
         return cast(scene, meshes, frame, margin=margin, box=box)
 
     monkeypatch.setattr(simulate_module, "_cast", recorded)
@@ -382,17 +384,20 @@ def test_the_window_is_about_the_box_of_the_sample_in_every_scan(window, monkeyp
     )
     for draw in (lambda: [merged.person(SEED, 0)], lambda: clips.clip(SEED, 0, frames=2)):
         boxes.clear()
+        from_feet.clear()
         drawn_boxes = [person.sample.box for person in draw()]
         window_boxes = [box for box in boxes if box is not None]
         assert len(boxes) > 1 and bool(window_boxes) == bool(window)
-        # other sensors have it in frames of their own
+        # other sensors have the box in their own frames
         assert {tuple(box.size) for box in window_boxes} == {tuple(box.size) for box in drawn_boxes if window}
         assert not window or np.array_equal(window_boxes[0].center, drawn_boxes[0].center)
+        if window and len(drawn_boxes) == 1:
+            np.testing.assert_allclose(from_feet, [from_feet[0]] * len(from_feet), atol=1e-9)
 
 
 @pytest.mark.long
-def test_second_people_stand_clear_of_the_first():
-    """As seen along the line between them: no vertex of the other is before one of the first that is near that line."""
+def test_apart_separates_second_person_from_first():
+    """Along the line between them, vertices of the second person are behind nearby vertices of the first."""
     block, depths, ways = draw_bodies(None, 0.0, 64, SEED, 0, moving=False), {}, []
     for apart in (0.0, 1.0):
         config, depths[apart] = replace(CLEAN, apart=apart), []
@@ -406,16 +411,16 @@ def test_second_people_stand_clear_of_the_first():
                 for point in near
                 if (np.linalg.norm(body - point, axis=1) < 0.06).any()
             ]
-            # how much of the other lies inside the first one's surface
+            # share of the second person's vertices inside the first person's surface
             depths[apart].append(np.mean(np.array(beyond) < 0) * len(beyond) / len(other) if beyond else 0.0)
             ways.append(other.mean(0))
     assert np.mean(np.array(depths[0.0]) > 0.02) > 0.15 and np.mean(np.array(depths[1.0]) > 0.02) < 0.03
     moved = np.linalg.norm(np.array(ways[40:]) - ways[:40], axis=1)
-    # who stood clear stays, and nobody goes far
+    # people without overlap stay in place, others move only a little
     assert np.median(moved) < 0.15 and moved.max() < 1.2 and (moved == 0).sum() > 5
 
 
-def test_a_box_of_two_holds_both_and_its_center_is_nearer_to_the_first():
+def test_box_of_two_contains_both_with_center_nearer_first():
     rng, shares = np.random.default_rng(0), []
     for _ in range(300):
         body, other = (rng.uniform(-1, 1, (50, 3)) * [0.3, 0.4, 0.9] + [9, 3, 0] for _ in range(2))

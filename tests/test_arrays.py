@@ -1,4 +1,4 @@
-"""Indices at equal steps. What comes from other libraries is tested where it comes in."""
+"""Evenly spaced indices. Arrays of other libraries are tested with the functions that accept them."""
 
 import numpy as np
 from hypothesis import given

@@ -1,4 +1,4 @@
-"""The networks that benchmarks measure beside this package's own do what they say."""
+"""Networks of benchmarks/backbones.py."""
 
 import numpy as np
 import pytest
@@ -31,17 +31,17 @@ def run(network, clouds):
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
-def test_has_about_as_many_parameters_as_asked_for(kind):
+def test_of_parameters_matches_requested_count(kind):
     for size in ("tiny", "small"):
         due = backbones.count(PoseNet(preset(size)))
         assert backbones.count(kind.of_parameters(due)) == pytest.approx(due, rel=0.1)
-    # the draft is the one that was measured
+    # the size of the draft that was measured
     assert backbones.count(backbones.Draft()) == pytest.approx(1.2e6, rel=0.1)
     with pytest.raises(ValueError, match="within a tenth"):
         backbones.PointNet2.of_parameters(100)
 
 
-def test_joints_do_not_depend_on_batch_mates_and_are_finite_for_few_points(network):
+def test_joints_independent_of_batch_and_finite_for_few_points(network):
     clouds = [person(n, n) for n in SIZES]
     together = run(network, clouds)
     assert together.shape == (len(SIZES), 26, 3)
@@ -51,8 +51,8 @@ def test_joints_do_not_depend_on_batch_mates_and_are_finite_for_few_points(netwo
         assert run(network, few).isfinite().all()
 
 
-def test_every_parameter_learns(network):
-    """All of it is computed with, so its cost is what is measured."""
+def test_all_parameters_receive_gradients(network):
+    """So that the measured cost is that of the whole network."""
     network.train()
     joints = network(network.prepare([person(n, n) for n in (200, 60)]))
     joints.square().mean().backward()
@@ -62,7 +62,7 @@ def test_every_parameter_learns(network):
     assert idle == []
 
 
-def test_far_points_are_in_no_ball_and_near_ones_are():
+def test_grouped_collects_points_within_radius():
     points = torch.tensor([[[0.0, 0, 0], [0.1, 0, 0], [1, 0, 0], [9, 9, 9]]])
     valid = torch.tensor([[True, True, True, False]])
     groups = backbones.grouped(points, valid, centers=4, neighbors=3, radius=0.2)
@@ -78,7 +78,7 @@ def test_draft_pools_each_voxel_into_its_own_parent():
         assert sorted(set(level.children.flatten().tolist())) == list(range(len(level.position)))
         for parent, children in enumerate(level.children):
             assert (level.parent[children] == parent).all()
-            # a parent lies at the mean of its points, so within its children's box
+            # a parent is at the mean of its points, which is inside the box of its children
             inside = level.position[children]
             assert (inside.amin(0) <= above.position[parent] + 1e-5).all()
             assert (above.position[parent] <= inside.amax(0) + 1e-5).all()

@@ -1,4 +1,4 @@
-"""Two backends, one answer; and everything that needs no torch works without it."""
+"""The ONNX and torch backends: agreement, decoding, choice of backend, and use without torch."""
 
 import json
 import os
@@ -36,7 +36,7 @@ DAPT = Path(__file__).parent / "parity" / "dapt_tiny.safetensors"
 
 
 def blob(count, seed=0):
-    """Points about as wide and tall as a person."""
+    """Random points of about a person's width and height."""
     return np.random.default_rng(seed).normal(0, (0.15, 0.15, 0.4), (count, 3)) + (4.0, -3.0, 1.0)
 
 
@@ -45,25 +45,25 @@ def models():
     return {name: load(backend=name, threads=1 if name == "onnx" else None, tta=1) for name in ("onnx", "torch")}
 
 
-# ---- one answer
+# ---- agreement
 
 
 def ties(model, clouds, centers, origin):
-    """(B, J, 3) bool: heatmaps whose two highest bins are equal but for rounding, which then decides. Between the
-    runtimes the difference of two neighboring bins differs by 5e-6 at most."""
+    """(B, J, 3) bool: heatmaps whose two highest bins are equal except for rounding. Between the runtimes, the
+    difference of two neighboring bins differs by at most 5e-6."""
     view = np.stack([view_features(center, origin) for center in centers])
     raw = model.backend.run([cloud - center for cloud, center in zip(clouds, centers, strict=True)], view)
     highest = np.sort(np.stack(raw.heatmaps, 2), -1)
     return highest[..., -1] - highest[..., -2] < 1e-5
 
 
-def test_backends_agree_on_people_of_all_sizes(models):
-    # each once: single points about themselves are all one person, whose ties would count as often
+def test_backends_agree_for_crops_of_all_sizes(models):
+    # each size once: all centered crops of one point are the same, and their ties would count several times
     sizes = np.unique(np.geomspace(1, 5000, 290).round().astype(int))
     assert len(sizes) >= 200
     clouds = [blob(size, seed) for seed, size in enumerate(sizes)]
     equal = 0
-    # together with others of about their size: rows are padded to the largest
+    # batches of similar sizes, because rows are padded to the largest
     for start in range(0, len(sizes), 10):
         group = clouds[start : start + 10]
         centers = np.stack([cloud.mean(0) for cloud in group])
@@ -80,21 +80,21 @@ def test_backends_agree_on_people_of_all_sizes(models):
 
 
 @pytest.mark.long
-def test_backends_agree_to_the_end(models):
-    # the second pass is centered on what the first one found: differences must not grow
+def test_backends_agree_after_second_pass(models):
+    # the second pass is centered on the result of the first, which must not increase differences
     clouds = [blob(size, seed) for seed, size in enumerate((5, 6, 9, 17, 40, 99, 300, 1200, 5000) * 2)]
     ours, due = (models[name].predict(clouds, sensor_origin=(0, 0, 0)) for name in ("onnx", "torch"))
     for a, b in zip(ours, due, strict=True):
         assert np.abs(a.joints - b.joints).max() < 1e-4 and a.warnings == b.warnings
     assert (ours.model["backend"], due.model["backend"]) == ("onnx", "torch")
-    # the bundled twins are of one network
+    # the bundled ONNX file and checkpoint contain the same network
     onnx = models["onnx"]
     assert onnx.backend.source == content_digest(bundled_path(), expected="a checkpoint")
     assert onnx.header == models["torch"].header == read_header(bundled_path())
 
 
 @pytest.mark.parametrize("name", ["onnx", "torch"])
-def test_a_batch_is_as_one_by_one_in_another_process_too(models, name):
+def test_predict_is_equal_in_batches_and_after_pickling(models, name):
     clouds = [blob(40), blob(900, 1), blob(7, 2)]
     alone = [models[name].predict(cloud).joints for cloud in clouds]
     np.testing.assert_allclose(models[name].predict(clouds).to_numpy(), alone, atol=1e-4)
@@ -102,7 +102,7 @@ def test_a_batch_is_as_one_by_one_in_another_process_too(models, name):
     np.testing.assert_array_equal(other.predict(clouds[0]).joints, alone[0])
 
 
-def test_compiling_is_asked_for_and_a_failure_is_one_line(models, monkeypatch):
+def test_load_compile_uses_torch_compile_and_reports_failure(models, monkeypatch):
     asked = []
     monkeypatch.setattr(torch, "compile", lambda module, **settings: asked.append(settings) or module)
     compiled = load(compile=True, tta=1)
@@ -117,7 +117,7 @@ def test_compiling_is_asked_for_and_a_failure_is_one_line(models, monkeypatch):
 
 
 @pytest.mark.slow
-def test_compiled_is_the_same(models):
+def test_compiled_network_gives_equal_joints(models):
     compiled = load(compile=True, tta=1)
     for count in (300, 60, 5):
         due = models["torch"].predict(blob(count)).joints
@@ -128,7 +128,7 @@ def test_compiled_is_the_same(models):
 
 
 @pytest.mark.parametrize("kind", layers.REACH)
-def test_numpy_and_torch_decode_alike(kind):
+def test_numpy_and_torch_decoders_agree(kind):
     bins = round(2 * layers.REACH[kind] / BIN)
     rng = np.random.default_rng(0)
     logits = rng.normal(0, 3, (50, 26, 3, bins)).astype(np.float32)
@@ -143,7 +143,7 @@ def test_numpy_and_torch_decode_alike(kind):
 
 
 def raw_of(logits, **more):
-    """What a network says whose heatmaps are `logits` (B, J, 3, W)."""
+    """Random raw outputs with the heatmaps `logits` (B, J, 3, W)."""
     rng = np.random.default_rng(1)
     shape = logits.shape[:2]
     names = ("confidence", "log_spread", "visible")
@@ -153,7 +153,7 @@ def raw_of(logits, **more):
 
 
 @pytest.mark.long
-def test_decoders_differ_and_each_is_taken(models):
+def test_predictor_uses_selected_decoder(models):
     cloud = blob(400)
     center = cloud.mean(0)
     raw = models["onnx"].backend.run([cloud - center], np.zeros((1, 5), np.float32))
@@ -163,13 +163,13 @@ def test_decoders_differ_and_each_is_taken(models):
         joints[name] = model.outputs([cloud], center[None], None).joints
         np.testing.assert_allclose(joints[name], estimates(raw, decode.decoder(name), BODY26).joints, atol=1e-6)
         assert load(decode=name).model["decode"] == model.predict(cloud).model["decode"] == name
-    # a peak's bin and what is refined about it are less than the window apart
+    # a refined peak is near the highest bin
     assert 0 < np.abs(joints["window"] - joints["argmax"]).max() < 4 * BIN
     assert 0 < np.abs(joints["dark"] - joints["argmax"]).max() <= BIN
     np.testing.assert_array_equal(joints["window"], models["onnx"].outputs([cloud], center[None], None).joints)
 
 
-def test_extreme_outputs_stay_in_their_ranges():
+def test_estimates_of_extreme_outputs_stay_in_range():
     huge = np.resize(np.array([-1e4, 1e4, 0.0], np.float32), (1, 26))
     logits = np.zeros((1, 26, 3, 24), np.float32)
     logits[..., 5] = 1e4
@@ -177,15 +177,15 @@ def test_extreme_outputs_stay_in_their_ranges():
     for value in (out.confidence, out.visible):
         np.testing.assert_array_equal(value, np.resize([0, 1, 0.5], (1, 26)))
     assert np.isfinite(out.spread).all() and (out.spread >= 0).all() and np.isfinite(out.joints).all()
-    # a network without heatmaps knows no range
+    # without heatmaps, in_range is None
     raw = raw_of(np.zeros((2, 26, 3, 0), np.float32))
     out = estimates(raw, decode.window, BODY26)
     np.testing.assert_array_equal(out.joints, raw.vote)
     assert out.in_range is None and out.confidence.shape == (2, 26)
 
 
-def test_confidence_read_off_heatmaps():
-    # bins of 2 cm; three quarters of every other joint's weight at bin 50, a quarter 30 cm off; the others are sure
+def test_estimates_take_confidence_from_heatmaps():
+    # bins of 2 cm; every other joint has 3/4 of its weight at bin 50 and 1/4 30 cm away, the others all of it at bin 50
     sure = np.full((1, 26, 100), -1e4, np.float32)
     sure[..., 50] = 0
     logits = sure.copy()
@@ -199,7 +199,7 @@ def test_confidence_read_off_heatmaps():
 
 
 class Scripted:
-    """A backend that says what it is told: joints are its heatmaps' peaks."""
+    """A backend with fixed outputs: joints at the bins `mode` of its heatmaps, relative to `joints`."""
 
     name, batch = "scripted", 64
 
@@ -220,13 +220,13 @@ class Scripted:
 
 
 def one_pass(backend):
-    """A predictor that answers with the pass about the pelvis alone."""
+    """A predictor whose result is the pass centered on the pelvis, without test-time augmentation."""
     model = Predictor(backend, name="x")
     model._averaged, model._first = False, IDENTITY
     return model
 
 
-def test_joints_at_the_end_of_the_range_are_named():
+def test_predict_reports_joints_out_of_heatmap_range():
     mode = np.full((26, 3), 10)
     ends = {("left_wrist", 0): 0, ("head", 2): 23, ("nose", 1): 0, ("neck", 1): 23, ("left_hand", 0): 0}
     for (joint, axis), end in ends.items():
@@ -239,44 +239,44 @@ def test_joints_at_the_end_of_the_range_are_named():
     entry = json.loads(pose.to_json())["people"][0]
     assert entry["out_of_range"] == pose.out_of_range and len(entry["visible"]) == 24
     assert all(0 <= value <= 1 for value in entry["visible"])
-    # by several looks, of whom the first is mirrored
+    # with test-time augmentation, whose first pass is mirrored
     mode[:] = 10
     for joint in ("left_wrist", "right_wrist", "head"):
         mode[BODY26.index(joint), 2] = 23
     for tta in (1, 4):
         pose = Predictor(Scripted(mode), name="x", tta=tta).predict(blob(30))
         assert set(pose.out_of_range) == {"left_wrist", "right_wrist", "head"}
-    # nothing is said where all are in range
+    # no warning if all joints are in range
     pose = Predictor(Scripted(np.full((26, 3), 10)), name="x").predict(blob(30))
     assert pose.warnings == () and pose.out_of_range == [] and pose.in_range.all()
-    # nor of a person without joints
+    # no warning for a person without joints
     pose = Predictor(Scripted(mode), name="x").predict(blob(3))
     assert pose.visible is None and pose.in_range is None and pose.out_of_range == []
     entry = json.loads(pose.to_json())["people"][0]
     assert entry["joints"] is None and entry["visible"] == entry["out_of_range"] == entry["confidence"] == []
 
 
-def test_the_second_pass_is_centered_on_the_pelvis_to_a_centimeter():
+def test_second_pass_is_centered_on_pelvis_rounded_to_1_cm():
     joints = np.zeros((26, 3), np.float32)
     joints[0] = 0.1234, -0.0567, 0.301
     scripted = Scripted(np.full((26, 3), 11), joints)
     one_pass(scripted).predict(blob(30))
     first, second = scripted.centers[:2]
     moved = second - first
-    # a bin's middle is half a bin from the vote
+    # the center of a bin is half a bin from the vote
     np.testing.assert_allclose(moved, np.round((joints[:1] - BIN / 2) / 0.01) * 0.01, atol=1e-6)
-    # shown mirrored, the first answer is brought back
+    # the result of a mirrored first pass is mirrored back
     Predictor(scripted, name="x").predict(blob(30))
     mirror = [1, -1, 1]
     moved = scripted.centers[-1] - scripted.centers[-2] * mirror
     np.testing.assert_allclose(moved, np.round((joints[:1] - BIN / 2) * mirror / 0.01) * 0.01, atol=1e-6)
 
 
-# ---- which backend
+# ---- choice of backend
 
 
 @pytest.mark.long
-def test_backends_are_chosen(tmp_path):
+def test_load_chooses_backend(tmp_path):
     path = tmp_path / "mine.safetensors"
     path.write_bytes(bundled_path("tiny").read_bytes())
     (tmp_path / "mine.onnx").write_bytes(bundled_path("tiny", ".onnx").read_bytes())
@@ -315,21 +315,21 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_wrong_choice_is_one_line(case):
+def test_load_rejects_invalid_options(case):
     settings, words = BAD[case]
     with pytest.raises(InputError) as raised:
         load(**settings)
     assert words in str(raised.value) and "\n" not in str(raised.value)
 
 
-def test_threads():
+def test_load_sets_onnx_threads():
     assert 1 <= usable_threads() <= 8
     for asked, used in ((3, 3), (None, usable_threads())):
         assert load(threads=asked).backend.threads == used
 
 
 @given(st.integers(0, 200), st.integers(1, 16))
-def test_people_are_spread_evenly_over_threads(count, threads):
+def test_person_parts_are_even_over_threads(count, threads):
     rows = [range(count)[part] for part in person_parts(count, threads)]
     assert [row for part in rows for row in part] == list(range(count))
     sizes = [len(part) for part in rows]
@@ -338,7 +338,7 @@ def test_people_are_spread_evenly_over_threads(count, threads):
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_people_of_a_batch_are_posed_as_alone(threads):
+def test_onnx_backend_batch_equals_single_people(threads):
     backend = OnnxBackend(weights_file("tiny.onnx"), threads=threads)
     rng = np.random.default_rng(0)
     clouds = [rng.normal(0, 0.3, (n, 3)) for n in (5, 400, 0, 60, 61, 62, 7, 200, 90, 30, 12)]
@@ -351,19 +351,19 @@ def test_people_of_a_batch_are_posed_as_alone(threads):
 
 
 @pytest.mark.parametrize("setting, most", [("1", 1), ("2,4", 2), ("0", 8), ("many", 8), ("", 8), ("99", 8)])
-def test_one_setting_bounds_the_threads_of_all_networks(monkeypatch, setting, most):
+def test_usable_threads_respects_omp_num_threads(monkeypatch, setting, most):
     monkeypatch.setattr(onnx.os, "sched_getaffinity", lambda _: range(64), raising=False)
     monkeypatch.setenv("OMP_NUM_THREADS", setting)
     assert usable_threads() == most
 
 
-def test_devices_are_taken_as_torch_s_and_none_is_the_cpu():
+def test_load_accepts_torch_device_and_none():
     for device in (torch.device("cpu"), None):
         assert load("tiny", device=device).backend.name == "onnx"
 
 
-def test_a_runtime_that_cannot_be_loaded_is_not_the_file_s_fault(monkeypatch):
-    # a network that is open needs nothing of it
+def test_load_reports_broken_onnx_runtime(monkeypatch):
+    # a cached network would not load the runtime
     bundled_backend.cache_clear()
     import_module = mock.Mock()
     monkeypatch.setattr(onnx, "import_module", import_module)
@@ -393,7 +393,7 @@ def dapt(released):
     return load(released)
 
 
-def test_a_released_network_predicts_its_own_skeleton(dapt):
+def test_dapt_predicts_its_own_skeleton(dapt):
     assert dapt.backend.name == "torch" and dapt.skeleton is WAYMO14
     people = dapt.predict([blob(80), blob(3), blob(20, 1)])
     assert people.skeleton is WAYMO14 and [person.joints is None for person in people] == [False, True, False]
@@ -405,7 +405,7 @@ def test_a_released_network_predicts_its_own_skeleton(dapt):
         dapt.predict(blob(80), skeleton="smpl24")
 
 
-def test_a_released_networks_joints_are_brought_in_order(dapt):
+def test_dapt_joints_are_in_skeleton_order(dapt):
     network, config = dapt.backend.network, dapt.header.config
     cloud = blob(60) - blob(60).mean(0)
     raw = network.outputs([cloud])
@@ -417,7 +417,7 @@ def test_a_released_networks_joints_are_brought_in_order(dapt):
     assert config.joints != WAYMO14.joints
 
 
-def test_a_released_network_is_centered_on_the_hips(dapt, monkeypatch):
+def test_dapt_second_pass_is_centered_on_hips(dapt, monkeypatch):
     transformed, calls = dapt._transformed, []
 
     def recorded(transform, clouds, centers, *rest):
@@ -428,20 +428,20 @@ def test_a_released_network_is_centered_on_the_hips(dapt, monkeypatch):
     monkeypatch.setattr(dapt, "_transformed", recorded)
     pose = dapt.predict(blob(200), skeleton="waymo14")
     (first, estimated), (second, answer) = calls[:2]
-    # as released: the first pass says where to look and nothing else
+    # as in the released code, the first pass is used only for the center
     np.testing.assert_allclose(pose.joints, answer.joints[0] + second[0], atol=1e-6)
     hips = estimated.joints[:, [WAYMO14.index("left_hip"), WAYMO14.index("right_hip")]].mean(1)
     np.testing.assert_allclose(second - first, hips, atol=0.00501)
 
 
-def test_far_points_do_not_reach_a_released_network(dapt):
+def test_dapt_ignores_far_points(dapt):
     cloud = blob(100)
     far = np.concatenate([cloud, cloud[:1] + (0, 0, 900.0)])
     a, b = (dapt.outputs([points], cloud.mean(0)[None], None).joints for points in (cloud, far))
     np.testing.assert_allclose(a, b, atol=1e-6)
 
 
-def test_a_network_that_only_regresses(tmp_path):
+def test_dapt_regression_network_has_no_confidence(tmp_path):
     torch.manual_seed(0)
     small = {"encoder_depths": (1, 1), "encoder_channels": (16, 16), "encoder_heads": (2, 2), "decoder_depths": (1,)}
     small |= {"decoder_channels": (16,), "decoder_heads": (2,), "anchor_channels": (16, 16), "strides": (4,)}
@@ -457,7 +457,7 @@ def test_a_network_that_only_regresses(tmp_path):
 @pytest.mark.parametrize(
     "settings, words", [({"backend": "onnx"}, "not run as ONNX"), ({"compile": True}, "not supported")]
 )
-def test_what_a_released_network_cannot_do_is_one_line(released, settings, words):
+def test_load_rejects_options_not_supported_by_dapt(released, settings, words):
     with pytest.raises(InputError, match=words):
         load(released, **settings)
 
@@ -466,7 +466,7 @@ def test_what_a_released_network_cannot_do_is_one_line(released, settings, words
 
 
 def program(modules, code, cwd):
-    """Runs a program in which `modules` cannot be imported, beside a file crop.npy."""
+    """Run code in a process that cannot import `modules`, in the folder `cwd` with a file crop.npy."""
     np.save(cwd / "crop.npy", blob(300))
     head = f"import sys\nsys.modules.update(dict.fromkeys({modules!r}))\nfrom lidarpose.cli import main\n"
     command = [sys.executable, "-c", head + textwrap.dedent(code)]
@@ -477,7 +477,7 @@ EXTRAS = ("torch", "accelerate", "onnx", "onnxscript", "numba", "threadpoolctl",
 
 
 @pytest.mark.long
-def test_the_base_install_predicts_and_informs(tmp_path):
+def test_base_install_runs_predict_and_info(tmp_path):
     code = """
         import numpy as np
         assert main(["predict", "crop.npy", "--crop", "--picture", "--decode", "dark"]) == 0
@@ -494,7 +494,7 @@ def test_the_base_install_predicts_and_informs(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"crop.npy", "crop.poses.json", "crop.poses.png"}
 
 
-# command -> the extra that it needs, and one that is wrong all the same
+# command -> the extra that it needs; the command DAMAGED fails with or without extras
 LACKING = {
     "predict crop.npy --backend torch": "train",
     "predict crop.npy --device cuda": "train",
@@ -508,7 +508,7 @@ DAMAGED = "predict crop.npy --weights bad.safetensors"
 
 
 @pytest.mark.long
-def test_what_needs_an_extra_names_it_in_one_line(tmp_path):
+def test_commands_name_missing_extra(tmp_path):
     (tmp_path / "bad.safetensors").write_bytes(b"no weights at all")
     code = f"""
         for words in {[*LACKING, DAMAGED]!r}:
@@ -533,7 +533,7 @@ def test_what_needs_an_extra_names_it_in_one_line(tmp_path):
 
 
 @pytest.mark.long
-def test_predicting_and_the_demo_load_nothing_that_they_do_not_need(tmp_path):
+def test_predict_and_demo_do_not_import_unneeded_modules(tmp_path):
     heavy = ("torch", "numba", "pandas", "matplotlib", "tqdm", "onnx", "scipy", "sympy")
     code = f"""
         main(["predict", "crop.npy", "--crop"])
@@ -545,13 +545,13 @@ def test_predicting_and_the_demo_load_nothing_that_they_do_not_need(tmp_path):
     assert done.stdout.strip() == "" and done.returncode == 0, done.stderr
 
 
-def test_missing_extra_leaves_other_modules_alone():
+def test_missing_extra_ignores_other_modules():
     error = ModuleNotFoundError("No module named 'lidarpose.nothing'", name="lidarpose.nothing")
     assert missing_extra(error, "this") is error
     assert isinstance(missing_extra(ModuleNotFoundError(name="torch.nn"), "this"), MissingExtra)
 
 
-def test_poses_of_another_skeleton_keep_what_is_known(models):
+def test_pose_to_skeleton_keeps_per_joint_fields(models):
     pose = models["onnx"].predict(blob(300), skeleton="body26").pose
     picked = pose.to(SMPL24)
     pick = BODY26.map_to(SMPL24)
@@ -563,8 +563,8 @@ def test_poses_of_another_skeleton_keep_what_is_known(models):
         replace(pose, in_range=pose.visible)
 
 
-def test_the_runtime_notes_nothing_of_the_machine(tmp_path):
-    """ONNX Runtime writes its telemetry into the home folder as soon as it opens a network."""
+def test_onnx_runtime_writes_no_telemetry(tmp_path):
+    """By default, ONNX Runtime writes telemetry into the home folder when it opens a network."""
     code = "import lidarpose, numpy; lidarpose.load('tiny', tta=1).predict(numpy.ones((9, 3)))"
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("ORT_", "XDG_"))}
     subprocess.run([sys.executable, "-c", code], env=environment | {"HOME": str(tmp_path)}, check=True, timeout=120)

@@ -1,4 +1,4 @@
-"""What stands still about a fixed sensor is learned; who moves, or waits and leaves, is not."""
+"""Background of a fixed sensor: static surfaces are learned, people who move or leave are not."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ def recording():
     return street(5, 3, sensor="os1-64", people=(4, 6), frames=20).frames
 
 
-def test_what_stands_still_is_learned_and_who_moves_is_kept(recording):
+def test_learn_background_separates_static_and_moving_points(recording):
     background = learn_background([frame.points for frame in recording])
     moved = [np.linalg.norm(a.center - b.center) for a, b in zip(recording[0].boxes, recording[-1].boxes, strict=True)]
     movers = [k for k, way in enumerate(moved) if way > 0.5]
@@ -25,12 +25,12 @@ def test_what_stands_still_is_learned_and_who_moves_is_kept(recording):
             assert (~static)[frame.person == k].mean() > 0.6, k
 
 
-def test_one_array_is_one_scan():
+def test_learn_background_accepts_one_array():
     wall = np.random.default_rng(0).uniform((5, -3, 0), (5.01, 3, 3), (400, 3))
     np.testing.assert_array_equal(learn_background(wall), learn_background([wall]))
 
 
-def test_who_waits_and_leaves_is_not_static(monkeypatch):
+def test_learn_background_excludes_person_who_leaves(monkeypatch):
     rng = np.random.default_rng(0)
     wall = rng.uniform((5, -3, 0), (5.01, 3, 3), (4000, 3))
     person = rng.uniform((3, 0, 0), (3.4, 0.4, 1.7), (400, 3))
@@ -39,7 +39,7 @@ def test_who_waits_and_leaves_is_not_static(monkeypatch):
     background = learn_background(scans)
     assert is_static(wall, background).all() and not is_static(person, background).any()
     assert is_static(person, learn_background(scans[:12])).all()
-    # of many scans some are read, from the first to the last
+    # of many scans, a subset that spans the first to the last is used
     monkeypatch.setattr("lidarpose.inference.background._MOST_SCANS", 5)
     few = learn_background(scans[8:14] + scans[14:] * 3)
     assert is_static(wall, few).all() and not is_static(person, few).any()

@@ -1,4 +1,4 @@
-"""PRN and LPFormer as networks like any other: batches, losses, checkpoints, commands; and that they learn."""
+"""Training of PRN and LPFormer: batches, losses, configurations, checkpoints, commands, overfitting."""
 
 import json
 from dataclasses import replace
@@ -28,7 +28,7 @@ from lidarpose.train.recipes import Finetune, Pretrain, recipe
 from lidarpose.train.validation import update_batch_norms, validate
 
 PRN, LPFORMER = PrnConfig(), LpformerConfig(grid=32)
-# the neck of the paper's Table 1 on a narrow Point Transformer V3
+# the PRN neck of the paper's Table 1 on a narrow Point Transformer V3
 NECK = replace(PRETRAINED["paper-tiny"][0], neck="prn", parts=0, drop_path=0.0)
 BOTH = pytest.mark.parametrize("config", [PRN, LPFORMER], ids=["prn", "lpformer"])
 
@@ -41,13 +41,13 @@ def person(n, seed=0):
     return Example(points=points, part=np.zeros(n, int), joints=joints, visible=visible, view=view, seed=seed)
 
 
-# ---- what a network reads
+# ---- inputs
 
 
-def test_clouds_are_about_the_middle_of_their_extent_and_know_the_sensor():
+def test_pad_clouds_centers_on_extent_and_keeps_sensor_position():
     rng = np.random.default_rng(0)
     clouds = [rng.uniform((-0.2, -0.3, -1), (0.4, 0.1, 0.9), (n, 3)) for n in (50, 7, 0)]
-    # beyond the window
+    # outside the window
     clouds[1] = np.concatenate([clouds[1], [[9.0, 0, 0]]])
     origin = np.array([4.0, -3.0, 1.0])
     view = np.stack([view_features(np.zeros(3), origin), *np.zeros((2, 5))])
@@ -61,7 +61,7 @@ def test_clouds_are_about_the_middle_of_their_extent_and_know_the_sensor():
     assert not arrays["center"][1:].any()
 
 
-def test_points_are_there_once_or_as_published_drawn_again():
+def test_pad_clouds_samples_without_or_with_replacement():
     rng = np.random.default_rng(0)
     clouds, view = [rng.normal(0, 0.3, (n, 3)) for n in (300, 1500)], np.zeros((2, 5))
     once = pad_clouds(clouds, view, PrnConfig(), [5, 6])
@@ -70,17 +70,17 @@ def test_points_are_there_once_or_as_published_drawn_again():
     distinct = [[len(np.unique(points[valid], axis=0)) for points, valid in zip(a["points"], a["valid"], strict=True)]
                 for a in (once, again)]  # fmt: skip
     assert once["valid"].sum(1).tolist() == [300, MOST_POINTS] and distinct[0] == [300, MOST_POINTS]
-    # every point of a small cloud; of a large one about 1 - exp(-1024 / 1500) of its points
+    # all points of a small cloud are drawn, of a large one a share of about 1 - exp(-1024 / 1500)
     assert again["valid"].sum(1).tolist() == [MOST_POINTS] * 2 and distinct[1][0] == 300 and 650 < distinct[1][1] < 830
     assert not np.array_equal(again["points"], pad_clouds(clouds, view, published, [7, 8])["points"])
     fewer = pad_clouds(clouds, view, PrnConfig(most_points=128), [5, 6])
     assert fewer["valid"].sum(1).tolist() == [128, 128]
 
 
-# ---- what is minimized
+# ---- losses
 
 
-def test_labels_are_the_nearest_labelled_joint_within_reach():
+def test_point_labels_give_nearest_known_joint_within_radius():
     points = torch.tensor([[[0.0, 0, 0], [0.3, 0, 0], [1.0, 0, 0], [0.0, 0, 0]]])
     joints = torch.tensor([[[0.01, 0, 0], [0.2, 0, 0], [0.45, 0, 0]]])
     valid, known = torch.tensor([[True, True, True, False]]), torch.tensor([[False, True, True]])
@@ -91,7 +91,7 @@ def test_labels_are_the_nearest_labelled_joint_within_reach():
 
 @pytest.mark.long
 @BOTH
-def test_joints_without_a_label_teach_nothing_and_answers_are_in_the_cloud_s_frame(config):
+def test_baseline_objective_masks_unlabeled_joints(config):
     objective = BaselineObjective(config=config)
     torch.manual_seed(0)
     network = objective.network().eval()
@@ -107,7 +107,7 @@ def test_joints_without_a_label_teach_nothing_and_answers_are_in_the_cloud_s_fra
     total(terms).backward()
     gradients = [value.grad for value in network.parameters() if value.requires_grad]
     assert all(gradient is not None and gradient.isfinite().all() for gradient in gradients)
-    # joints that the network lacks are NaN; a cloud that is moved has its answers moved
+    # joints that the network lacks are NaN; predictions move with the cloud
     joints = objective.joints(network, arrays)
     assert np.isnan(joints).all((0, 2)).sum() == 26 - len(config.joints)
     step = np.float32([0.3, -0.2, 0.1])
@@ -116,7 +116,7 @@ def test_joints_without_a_label_teach_nothing_and_answers_are_in_the_cloud_s_fra
 
 
 @pytest.mark.long
-def test_the_second_softmax_flattens_the_loss_of_parts():
+def test_second_softmax_bounds_part_loss_from_below():
     torch.manual_seed(0)
     terms = {}
     for second in (False, True):
@@ -124,11 +124,11 @@ def test_the_second_softmax_flattens_the_loss_of_parts():
         torch.manual_seed(0)
         terms[second] = objective.terms(objective.network().eval(), objective.collate([person(30)]))
     assert terms[True]["joints"] == terms[False]["joints"] and terms[True]["part"] != terms[False]["part"]
-    # of probabilities, whatever they are, no loss is below log(1 + 15 / e)
+    # the cross entropy of a softmax over probabilities of 16 classes is at least log(1 + 15 / e)
     assert terms[True]["part"] > np.log(1 + 15 / np.e) - 1e-3
 
 
-def test_distances_are_divided_by_all_joints_where_that_is_asked_for():
+def test_divide_by_all_joints_scales_joint_loss():
     example = replace(person(30), joints=np.where(np.arange(26)[:, None] % 2, np.nan, person(30).joints))
     terms = {}
     for divide in (False, True):
@@ -141,7 +141,7 @@ def test_distances_are_divided_by_all_joints_where_that_is_asked_for():
     torch.testing.assert_close(terms[True], terms[False] * labels.mean(), rtol=1e-5, atol=0, check_dtype=False)
 
 
-def test_parts_are_those_before_scaling_where_that_is_asked_for():
+def test_labels_before_scaling_scales_label_radius():
     one = person(300)
     visible = np.ones(26, np.float32)
     sample = LabeledSample(
@@ -159,7 +159,7 @@ def test_parts_are_those_before_scaling_where_that_is_asked_for():
         arrays = {name: torch.as_tensor(array) for name, array in objective.collate([shown]).items()}
         known = arrays["joints"].isfinite().all(-1)
         labels[before] = point_labels(arrays["points"], arrays["valid"], arrays["joints"], known, arrays["radius"])
-    # offsets lead to the joints either way
+    # the option does not change offsets
     torch.testing.assert_close(labels[True][1], labels[False][1])
     distance = labels[True][1].norm(dim=-1)
     for before, radius in ((False, LABEL_RADIUS), (True, LABEL_RADIUS * shown.scale)):
@@ -170,14 +170,14 @@ def test_parts_are_those_before_scaling_where_that_is_asked_for():
 # ---- fast paths
 
 
-def test_missing_neighbors_of_zeros_take_part_until_the_last_step():
+def test_grouped_attention_missing_in_softmax_as_published():
     torch.manual_seed(0)
     attention = GroupedVectorAttention(12, 3).train()
     x, xyz = torch.randn(5, 12), torch.randn(5, 3)
     neighbors = torch.tensor([[0, 1, 2], [1, -1, -1], [2, 4, -1], [3, 0, -1], [4, 2, 0]])
     attention.missing_in_softmax = True
     out = attention(x, xyz, neighbors)
-    # as the published code: zeros in place of what is missing, a mask after the softmax
+    # as in the published code: missing neighbors are zeros, with a mask after the softmax
     exists = (neighbors >= 0)[..., None]
     gathered = {name: getattr(attention, name)(x)[neighbors] * exists for name in ("key", "value")}
     offset = (xyz[neighbors] - xyz[:, None]) * exists
@@ -191,7 +191,7 @@ def test_missing_neighbors_of_zeros_take_part_until_the_last_step():
     assert (attention(x, xyz, neighbors)[1] - out[1]).abs().max() > 1e-3
 
 
-def test_attention_in_groups_as_by_definition():
+def test_grouped_attention_equals_definition():
     torch.manual_seed(0)
     attention = GroupedVectorAttention(12, 3).eval()
     x, xyz = torch.randn(9, 12), torch.randn(9, 3)
@@ -207,7 +207,7 @@ def test_attention_in_groups_as_by_definition():
     assert torch.allclose(attention(x, xyz, neighbors), torch.stack(rows), atol=1e-6)
 
 
-def test_attention_of_the_first_rows_alone_is_that_of_all():
+def test_bare_attention_queries_gives_first_rows():
     torch.manual_seed(0)
     attention = BareAttention(12, heads=3).eval()
     x, valid = torch.randn(2, 10, 12), torch.arange(10) < torch.tensor([[10], [6]])
@@ -236,12 +236,12 @@ def test_attention_of_the_first_rows_alone_is_that_of_all():
         (lambda: Pretrain(betas=(0.9, 1.0)), "betas must be two numbers"),
     ],
 )
-def test_what_cannot_be_is_refused(make, message):
+def test_configs_and_recipes_reject_invalid_values(make, message):
     with pytest.raises(InputError, match=message):
         make()
 
 
-def test_options_by_name():
+def test_with_options_sets_fields_by_name():
     options = ("grid=32", "second_softmax", "sensor_position=true", "resample_with_replacement=false")
     options += ("attention_dropout=0.05", "width_divisor=4")
     expected = LpformerConfig(
@@ -250,7 +250,7 @@ def test_options_by_name():
     assert _with_options(LpformerConfig(), options) == expected
 
 
-def test_recipes_are_as_published():
+def test_baseline_recipes_match_published_values():
     prn, lpformer = (recipe(Pretrain, name) for name in ("prn", "lpformer"))
     assert (prn.rate, prn.optimizer, prn.decay, prn.batch, prn.schedule) == (5e-4, "adam", 0, 64, "constant")
     assert (lpformer.rate, lpformer.betas, lpformer.batch, lpformer.decay) == (5e-4, (0.85, 0.95), 16, 0.01)
@@ -261,14 +261,14 @@ def test_recipes_are_as_published():
 
 
 @pytest.mark.long
-def test_all_networks_are_listed(capsys):
+def test_models_command_lists_all_networks(capsys):
     assert not main(["models", "--json"])
     rows = json.loads(capsys.readouterr().out)
     assert rows == networks()
     counts = {row["size"]: (row["joints"], row["frames"], row["parameters"]) for row in rows}
     assert counts["prn"] == (15, 1, 1_738_482) and counts["lpformer"] == (15, 1, 4_814_485)
     assert counts["lidarcap"] == (24, 16, 34_925_854) and counts["ne"] == (24, 16, 129_720_766)
-    # narrower ones for CPUs
+    # narrow sizes for CPUs
     assert counts["prn-small"][2] == 120_606 and counts["lpformer-small"][2] == 309_493
     assert counts["prn-tiny"][2] == 36_348 and counts["lpformer-tiny"][2] == 80_581
     assert counts["lidarcap-small"][2] == 576_798 and counts["ne-small"][2] == 2_072_910
@@ -280,7 +280,7 @@ def test_all_networks_are_listed(capsys):
 @pytest.mark.long
 @BOTH
 @pytest.mark.parametrize("skeleton", [WAYMO14, SMPL24])
-def test_weights_go_on_by_the_names_of_joints(config, skeleton, tmp_path):
+def test_with_joints_copies_weights_by_joint_name(config, skeleton, tmp_path):
     trained = BaselineObjective(config=config).network()
     other = replace(config, joints=skeleton.joints)
     network = with_joints(trained, other)
@@ -301,7 +301,7 @@ def test_weights_go_on_by_the_names_of_joints(config, skeleton, tmp_path):
 
 
 @pytest.mark.long
-def test_pretrain_predict_evaluate_and_finetune(tmp_path, capsys, monkeypatch):
+def test_prn_pretrain_evaluate_predict_and_finetune(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["--workers", "0", "--pictures", "0", "--validate", "1000"]
     narrow = ["--size", "prn-tiny", "--people", "16", "--batch", "8", "--scene", "paper"]
@@ -312,7 +312,7 @@ def test_pretrain_predict_evaluate_and_finetune(tmp_path, capsys, monkeypatch):
     assert {"joints", "vote", "part", "offset", "mpjpe"} <= line.keys() and line["validation_mm"] > 0
     assert not main(["evaluate", "run/model.safetensors", "bench", "--limit", "4"])
     assert "MPJPE" in capsys.readouterr().out
-    # the same answer as of the objective, in the frame of the cloud
+    # predict gives the objective's joints in the frame of the cloud
     example = person(60)
     cloud = np.float32(example.points) + [20, 0, 1]
     pose = load("run/model.safetensors", tta=1).predict(cloud)
@@ -320,7 +320,7 @@ def test_pretrain_predict_evaluate_and_finetune(tmp_path, capsys, monkeypatch):
     objective = BaselineObjective(config=header.config)
     expected = objective.joints(network, objective.collate([example]))[0, header.config.columns]
     np.testing.assert_allclose(pose.joints, expected + [20, 0, 1], atol=2e-3)
-    # and goes on, if it is what is asked for
+    # --init is accepted only for the same network and width, and not by pretrain
     assert main(["pretrain", "more", "--model", "prn", "--init", "run/model.safetensors"]) == 2
     assert "prn starts from random weights" in capsys.readouterr().err
     folder = tmp_path / "people"
@@ -343,7 +343,7 @@ def test_pretrain_predict_evaluate_and_finetune(tmp_path, capsys, monkeypatch):
 
 
 def _learned(objective, people, points, steps, rate):
-    """Error in mm, in evaluation mode, on the fixed people that are learned; the rate falls in the second half."""
+    """Train on a fixed batch, with a rate that falls in the second half; return its error in evaluation mode in mm."""
     source = SyntheticSource(scene="paper", seed=5, refined=0.0)
     examples = [e for e in map(source.example, range(3 * people)) if len(e.points) >= 30][:people]
     assert len(examples) == people
@@ -358,7 +358,7 @@ def _learned(objective, people, points, steps, rate):
         optimizer.zero_grad()
         total(objective.terms(network, arrays)).backward()
         optimizer.step()
-    # as the loop does before it validates and saves
+    # as the training loop does before it validates and saves
     update_batch_norms(network, objective, [arrays])
     return validate(objective, network, examples, people)[0]
 
@@ -373,6 +373,6 @@ def _learned(objective, people, points, steps, rate):
     ],
     ids=["prn", "neck-prn", "lpformer-small"],
 )
-def test_a_few_people_are_learned_by_heart(objective, people, points, steps, rate, most):
-    """The neck and LPFormer at widths for CPUs, whose attention drops nothing."""
+def test_networks_overfit_a_few_people(objective, people, points, steps, rate, most):
+    """The neck and LPFormer have widths for CPUs and no dropout in attention."""
     assert _learned(objective, people, points, steps, rate) < most

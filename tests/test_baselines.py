@@ -1,4 +1,4 @@
-"""The networks that the paper compares with: layer sizes as published, padding, order of points."""
+"""Networks of the baselines in the paper: parameter counts as published, padding, order of points."""
 
 from dataclasses import replace
 
@@ -43,7 +43,7 @@ PARAMETERS = {
 
 
 @pytest.mark.parametrize("name", PARAMETERS)
-def test_parameters_are_as_many_as_published(name):
+def test_parameter_counts_match_published_networks(name):
     make, count = PARAMETERS[name]
     with torch.device("meta"):
         assert sum(p.numel() for p in make().parameters()) == count
@@ -53,7 +53,7 @@ def test_parameters_are_as_many_as_published(name):
 
 
 def _cloud(seed: int, counts: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Points of people's size (B, N, 3), padded with numbers that would show, and valid (B, N)."""
+    """Points (B, N, 3) of a person's size, padded with nonzero numbers, and valid (B, N)."""
     rng = torch.Generator().manual_seed(seed)
     points = torch.randn(len(counts), max(counts), 3, generator=rng) * torch.tensor([0.25, 0.25, 0.5])
     valid = torch.arange(max(counts)) < torch.tensor(counts)[:, None]
@@ -61,7 +61,7 @@ def _cloud(seed: int, counts: tuple[int, ...]) -> tuple[torch.Tensor, torch.Tens
 
 
 @pytest.mark.parametrize("as_published", [False, True])
-def test_farthest_points_as_by_definition(as_published):
+def test_farthest_points_equals_definition(as_published):
     points, valid = _cloud(0, (40, 23))
     indices = farthest_points(points, valid, 30, as_published=as_published)
     for cloud, chosen, count in zip(points, indices.tolist(), (40, 23), strict=True):
@@ -75,7 +75,7 @@ def test_farthest_points_as_by_definition(as_published):
 
 
 @pytest.mark.parametrize("as_published", [False, True])
-def test_balls_as_by_definition(as_published):
+def test_ball_query_equals_definition(as_published):
     points, valid = _cloud(1, (50, 31))
     index = ball_query(points[:, :7], points, valid, 0.4, 12, as_published=as_published)
     for b, count in enumerate((50, 31)):
@@ -86,7 +86,7 @@ def test_balls_as_by_definition(as_published):
             assert index[b, m].tolist() == (expected + [expected[0]] * 12)[:12]
 
 
-def test_neighbors_as_by_definition():
+def test_nearest_neighbors_equals_definition():
     points, valid = _cloud(2, (30, 5))
     index = nearest_neighbors(points, valid, 8)
     for b, count in enumerate((30, 5)):
@@ -98,15 +98,15 @@ def test_neighbors_as_by_definition():
 # ---- rotations
 
 
-def test_rotations_are_proper_and_published_as_columns():
+def test_rotations_from_6d_are_proper_and_in_published_layout():
     rotations = rotations_from_6d(torch.randn(50, 6))
     assert torch.allclose(rotations @ rotations.mT, torch.eye(3).expand(50, 3, 3), atol=1e-5)
     assert torch.allclose(torch.linalg.det(rotations), torch.ones(50), atol=1e-5)
-    # a 3x2 matrix, row by row
+    # the six numbers are a 3x2 matrix, row by row
     assert torch.allclose(rotations_from_6d(torch.tensor([1.0, 0, 0, 1, 0, 0])), torch.eye(3))
 
 
-def test_kinematics_follow_the_tree():
+def test_forward_kinematics_rotates_only_descendants():
     offsets = torch.randn(24, 3)
     turn = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     rotations = torch.eye(3).expand(24, 3, 3).clone()
@@ -125,7 +125,7 @@ def _descends(joint: int, ancestor: int) -> bool:
     return joint == ancestor
 
 
-def test_graph_is_normalized_and_splits_by_the_root():
+def test_tree_partition_is_normalized_and_splits_by_depth():
     graph = tree_partition(SMPL24.parents)
     assert torch.allclose(graph.sum((0, 1)), torch.ones(24))
     knee, hip, ankle = 4, 1, 7
@@ -140,8 +140,8 @@ def kinds(layers):
     ]
 
 
-def test_layers_stand_in_the_published_order():
-    """What counting parameters does not see."""
+def test_layer_order_and_dropout_match_published_code():
+    """Properties that parameter counts do not show."""
     config = {"lpformer": LpformerConfig(), "lidarcap": LidarcapConfig(), "ne": NeConfig()}
     assert kinds(build(config["lpformer"]).parts) == ["Linear", "ReLU", "Linear", "Linear"]
     for name in ("lidarcap", "ne"):
@@ -151,7 +151,7 @@ def test_layers_stand_in_the_published_order():
     exchange = CloudExchange(16, 8)
     assert kinds(exchange.mlp) == ["Linear", "GELU", "Dropout 0.1", "Linear", "Dropout 0.1"]
     assert all(attention.dropout == 0 for attention in exchange.attention)
-    # what is dropped of attention's output, besides whole clips
+    # dropout on the output of attention, besides the drop path of whole clips
     clouds = torch.randn(3, 64, 16, 16)
     assert exchange.drop_path.probability == 0.2
     exchange.drop_path.probability = 0.0
@@ -165,17 +165,17 @@ def test_layers_stand_in_the_published_order():
 
 
 def _network(name: str) -> torch.nn.Module:
-    """The network `name` with fixed weights, in evaluation mode, whose every branch has a part in the answer."""
+    """Network `name` with fixed weights, in evaluation mode, scaled so that each branch affects the output."""
     torch.manual_seed(3)
     configs = {"prn": PrnConfig(), "lpformer": LpformerConfig(grid=32)}
     network = PointNet2(64) if name == "pointnet++" else build(configs.get(name) or PRETRAINED[name][0])
     if name.startswith("prn"):
-        # random parts are so unsure that no point would vote
+        # with random part logits, no point would be confident enough to vote
         network.vote.parts[-1].weight.mul_(100)
     if name.startswith("lpformer"):
-        # its volume begins as good as empty
+        # its volume is nearly zero at initialization
         network.volume.last.weight.mul_(1000)
-    # before their batch norms have seen anybody, deep layers answer with next to nothing
+    # without statistics in batch norms, deep layers give nearly zero
     for module in network.modules():
         if isinstance(module, torch.nn.modules.batchnorm._BatchNorm):
             module.momentum = 1.0
@@ -184,8 +184,8 @@ def _network(name: str) -> torch.nn.Module:
 
 
 def _run(network: torch.nn.Module, points: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
-    """Joints (B, J, 3), and features (B, C) of a part of a network; clips show a cloud in every frame, NE also upside
-    down and shifted as what is about the person."""
+    """Joints (B, J, 3), or features (B, C) of a part of a network. Clip networks get the cloud in each frame; NE also
+    gets it negated and shifted as background and neighbors."""
     if not hasattr(network, "decode"):
         outputs = network(points, valid)
         return getattr(outputs, "joints", outputs)
@@ -204,27 +204,27 @@ def _run(network: torch.nn.Module, points: torch.Tensor, valid: torch.Tensor) ->
 @pytest.mark.parametrize(
     "name", ["prn", "prn-small", "lpformer", "lpformer-small", "pointnet++", "lidarcap-small", "ne-small"]
 )
-def test_order_and_padding_change_nothing(name):
+def test_networks_ignore_point_order_and_padding(name):
     network = _network(name)
     points, valid = _cloud(4, (150, 90, 8))
     expected = _run(network, points, valid)
     assert len(expected) == 3 and expected.isfinite().all()
     assert name == "pointnet++" or expected.shape[-2:] == ((24 if hasattr(network, "decode") else 15), 3)
-    # sums in another order differ by so much
+    # tolerance for sums in another order
     near = 2e-5 * float(expected.abs().max())
-    # people are told apart
+    # outputs differ between people
     assert (expected[0] - expected[1]).abs().max() > 100 * near
     order = torch.randperm(150, generator=torch.Generator().manual_seed(5))
     assert torch.allclose(_run(network, points[:, order], valid[:, order]), expected, atol=near)
     more = torch.cat([points, torch.full((3, 40, 3), 0.2)], 1)
     wide = torch.cat([valid, torch.zeros(3, 40, dtype=torch.bool)], 1)
     assert torch.allclose(_run(network, more, wide), expected, atol=near)
-    # nor do batch mates
+    # the other people of the batch have no effect
     assert torch.allclose(_run(network, points[2:, :8], valid[2:, :8]), expected[2:], atol=near)
 
 
 @torch.no_grad()
-def test_points_that_are_sure_vote():
+def test_offset_head_averages_votes_of_confident_points():
     torch.manual_seed(0)
     head = OffsetHead(6, 3, background=3).eval()
     head.parts[-1].weight.mul_(100)
@@ -240,13 +240,13 @@ def test_points_that_are_sure_vote():
             assert torch.allclose(voted[k, joint], expected, atol=1e-5)
             votes += len(own)
     assert 0 < votes < 3 * 40
-    # nobody votes: the middle
+    # without votes, joints are at the center
     head.parts[-1].weight.zero_()
     assert not head(features, Rows(xyz=xyz, person=person, count=torch.tensor([30, 10])))[0].any()
 
 
 @torch.no_grad()
-def test_weights_fit_every_grid_and_a_point_reads_its_own_cell():
+def test_lpformer_weights_fit_any_grid_and_points_read_own_cell():
     torch.manual_seed(0)
     networks = {grid: Lpformer(LpformerConfig(grid=grid, width_divisor=8)).eval() for grid in (64, 32)}
     networks[32].load_state_dict(networks[64].state_dict())
@@ -255,7 +255,7 @@ def test_weights_fit_every_grid_and_a_point_reads_its_own_cell():
         joints = network(points, valid).joints
         assert joints.shape == (2, 15, 3) and joints.isfinite().all()
         assert network.occupancy(points, valid).shape == (2, 1, grid, grid, grid)
-    # a volume that says where a cell is: x, y and z of its middle
+    # a volume that contains x, y and z of each cell's center
     network, middle = networks[32], (torch.arange(32) + 0.5) / 16 - 1
     z, y, x = torch.meshgrid(middle, middle, middle, indexing="ij")
     known, read = torch.stack([x, y, z, z * 0])[None].expand(2, -1, -1, -1, -1), {}
@@ -272,7 +272,7 @@ def test_weights_fit_every_grid_and_a_point_reads_its_own_cell():
 
 @pytest.mark.long
 @torch.no_grad()
-def test_clips_do_not_mix():
+def test_lidarcap_clips_are_independent():
     points, valid = _cloud(6, (40,) * 2 * CLIP_FRAMES)
     points, valid = points.unflatten(0, (2, CLIP_FRAMES)), valid.unflatten(0, (2, CLIP_FRAMES))
     torch.manual_seed(0)
@@ -283,7 +283,7 @@ def test_clips_do_not_mix():
 
 @torch.no_grad()
 @pytest.mark.parametrize("across_batch", [False, True])
-def test_ne_exchanges_over_frames_and_as_published_over_the_batch(across_batch):
+def test_ne_exchange_across_batch_mixes_clips(across_batch):
     points, valid = _cloud(7, (20,) * 2 * CLIP_FRAMES)
     points, valid = points.unflatten(0, (2, CLIP_FRAMES)), valid.unflatten(0, (2, CLIP_FRAMES))
     clouds = {name: (points + k, valid) for k, name in enumerate(CLOUDS)}

@@ -1,4 +1,4 @@
-"""The frozen benchmarks: nothing may ever change them, and what they say of themselves is so."""
+"""The frozen benchmarks: their files, composition and scores."""
 
 import hashlib
 import json
@@ -33,7 +33,7 @@ def bench(which="bench"):
 
 
 @pytest.mark.parametrize("which, digest", [("bench", "8abcafc6628c"), ("bench-2", "872355263c4f")])
-def test_the_file_is_the_frozen_one_and_a_damaged_one_is_named(which, digest, monkeypatch, tmp_path):
+def test_load_bench_verifies_frozen_file(which, digest, monkeypatch, tmp_path):
     data, (name, sha256) = bench_path(which).read_bytes(), BENCHES[which]
     assert hashlib.sha256(data).hexdigest() == sha256
     assert sha256.startswith(digest) and len(data) < 6.3e6
@@ -44,7 +44,7 @@ def test_the_file_is_the_frozen_one_and_a_damaged_one_is_named(which, digest, mo
         load_bench(which)
 
 
-def test_parts_are_equal():
+def test_bench_slices_have_equal_sizes():
     people, columns = bench().people, bench().columns
     assert len(people) == 2000 and [len(rows) for rows in bench().clips] == [16] * 60
     for name, values in (("condition", 5), ("poses", 2), ("sensor", 8)):
@@ -57,7 +57,7 @@ def test_parts_are_equal():
         assert (columns["frame"][rows] == np.arange(16)).all() and len(set(columns["sensor"][rows])) == 1
 
 
-def test_parts_of_the_second_are_equal():
+def test_bench_2_slices_have_expected_sizes():
     people, columns = bench("bench-2").people, bench("bench-2").columns
     assert len(people) == 3000 and len(columns["clip"]) == 3500 and not bench("bench-2").clips
     rows = pd.DataFrame({name: columns[name][people] for name in ("condition", "poses", "family", "sensor")})
@@ -67,7 +67,7 @@ def test_parts_of_the_second_are_equal():
     families = rows[rows.poses == "hdm05"].groupby("family").size()
     assert len(families) == 11 and families.min() > 85
     assert set(rows[rows.poses == "idle"].family) == {"idle"} and len(set(rows.sensor)) == 12
-    # of two people there are two, of one alone none
+    # crowded people have points of another person, clean ones have none
     two = columns["others"][people] >= 15
     assert two[rows.condition == "crowded"].mean() > 0.8 and not two[rows.condition == "clean"].any()
     box, joints = columns["box"][people], bench("bench-2").joints[people]
@@ -76,7 +76,7 @@ def test_parts_of_the_second_are_equal():
     assert points.min() >= 20 and points.max() <= 1200
 
 
-def test_objects_are_no_people():
+def test_bench_2_objects_are_not_people():
     objects, columns = bench("bench-2").objects, bench("bench-2").columns
     assert len(objects) == 500 and not set(objects) & set(bench("bench-2").people) and not len(bench().objects)
     assert set(columns["condition"][objects]) == {"object"} and len(set(columns["family"][objects])) > 30
@@ -87,7 +87,7 @@ def test_objects_are_no_people():
 
 
 class Knowing:
-    """A model that says where somebody's pelvis is about, and whether somebody is there, by the number of points."""
+    """A model with all joints at the mean point and a probability of a person that is a function of the points."""
 
     skeleton, backend = BODY26, SimpleNamespace(batch=64)
     model = {"name": "knowing"}
@@ -106,10 +106,10 @@ class Knowing:
 
 
 @pytest.mark.long
-def test_the_second_is_scored_by_condition_family_and_sensor():
+def test_evaluate_bench_2_scores_slices():
     model = Knowing()
     result = evaluation.evaluate(model, "bench-2", limit=600)
-    # objects are shown to who has something to say of them
+    # objects are predicted only by models that give the probability of a person
     assert model.shown == result.counts["people"] == 600
     rows = open_eval_dataset("bench-2", limit=600)
     for group, of in (("condition", "merged"), ("family", "kick"), ("sensor", "vlp-16"), ("poses", "hdm05")):
@@ -119,7 +119,7 @@ def test_the_second_is_scored_by_condition_family_and_sensor():
 
 
 @pytest.mark.long
-def test_people_are_told_from_objects_by_who_says_so(tmp_path):
+def test_evaluate_bench_2_gives_auroc_of_people_against_objects(tmp_path):
     run = evaluation.run(Knowing(lambda cloud: np.exp(-len(cloud) / 100)), ["bench-2"], limit=300)
     result = run.scores.results[0]
     assert run.evaluations[0].predictions.person.max() <= 1
@@ -135,7 +135,7 @@ def test_people_are_told_from_objects_by_who_says_so(tmp_path):
 
 
 @pytest.mark.long
-def test_the_command_prints_slices_of_the_second(capsys, tmp_path):
+def test_evaluate_command_prints_slices_of_bench_2(capsys, tmp_path):
     assert not main(["evaluate", "tiny", "bench-2", "--limit", "30", "--out", str(tmp_path / "out")])
     text = capsys.readouterr().out
     assert "lidarpose-bench-2: MPJPE" in text and "30 of 3,000 people" in text
@@ -145,7 +145,7 @@ def test_the_command_prints_slices_of_the_second(capsys, tmp_path):
     assert result["setting"]["dataset"] == "lidarpose-bench-2"
 
 
-def test_points_lie_in_their_box_and_bodies_about_their_joints():
+def test_bench_points_are_in_box_and_near_joints():
     for row in bench().people[::37]:
         points, joints, box = bench().points[row], bench().joints[row], bench().columns["box"][row]
         box = Box(center=box[:3], size=box[3:6], yaw=box[6])
@@ -154,7 +154,7 @@ def test_points_lie_in_their_box_and_bodies_about_their_joints():
         assert np.median(nearest) < 0.5
 
 
-def test_baselines_know_no_points():
+def test_mean_poses_have_expected_errors_and_facing():
     baselines = mean_poses(bench())
     people, pick = bench().people, BODY26.map_to(HUMAN15)
     true, alike = (baselines[name] - bench().joints for name in ("mean pose, true facing", "mean pose"))
@@ -165,7 +165,7 @@ def test_baselines_know_no_points():
     assert 0.4 < (turn["mean pose"] < 0).mean() < 0.6
 
 
-def test_facing_turns_with_the_person():
+def test_facing_rotates_with_person():
     joints = bench().joints[bench().people[:50]]
     turn = facing(joints @ rotation_about("z", 0.7).T) - facing(joints)
     np.testing.assert_allclose(np.cos(turn), np.cos(0.7), atol=1e-5)
@@ -173,7 +173,7 @@ def test_facing_turns_with_the_person():
     np.testing.assert_allclose(np.cos(facing(mirrored) - facing(joints)), -1, atol=1e-5)
 
 
-def test_plain_people_are_whole_and_of_many_points():
+def test_plain_people_are_visible_with_many_points():
     rows = np.array([one.row for one in open_eval_dataset("bench") if one.plain and not one.moving])
     columns = bench().columns
     assert len(rows) == 706 and columns["num_points"][rows].min() >= 100

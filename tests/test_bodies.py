@@ -1,4 +1,4 @@
-"""Captured poses and clips among the synthesized people."""
+"""Synthesized bodies from captured poses and clips."""
 
 from dataclasses import replace
 
@@ -21,8 +21,8 @@ JOINTS = {name: i for i, name in enumerate(BODY26.joints)}
 
 
 def motion(frames=40, fps=10.0, jump=0.0, turn=0.0, names=("001_01",)):
-    """Somebody with the left arm raised ahead who goes to where the first pose's left is at 1 m/s and turns at `turn`
-    rad/s; every 0.8 s they jump."""
+    """Motion of a person with the left arm raised forward, who moves along y at 1 m/s, turns at `turn` rad/s and jumps
+    `jump` m every 0.8 s."""
     rotations = np.tile(np.eye(3, dtype=np.float32), (frames, 24, 1, 1))
     for name, by in (("left_shoulder", ("z", -1.2)), ("right_shoulder", ("x", 1.2)), ("left_elbow", ("z", -0.5))):
         rotations[:, SMPL24.index(name)] = rotation_about(*by)
@@ -38,7 +38,7 @@ def motion(frames=40, fps=10.0, jump=0.0, turn=0.0, names=("001_01",)):
     )  # fmt: skip
 
 
-def test_captured_people_are_varied_by_their_mirror_image(monkeypatch):
+def test_vary_mirrors_captured_poses(monkeypatch):
     monkeypatch.setattr(bodies, "_VARIATION", 0.0)
     bank = PoseBank.of_motion(motion())
     both = np.stack([bank.rotations, bank.moved], 1)
@@ -52,18 +52,18 @@ def test_captured_people_are_varied_by_their_mirror_image(monkeypatch):
             p = joints_of(varied[k, frame][None])[0]
             off = [np.abs(p - there).max() for there in (known, across)]
             assert min(off) < 0.03
-        # who is mirrored goes right
+        # mirrored people move to the right
         np.testing.assert_allclose(way[k, 0], [0, -0.1 if off[1] < off[0] else 0.1, 0], atol=1e-5)
         mirrored += off[1] < off[0]
     assert 0.2 < mirrored / len(varied) < 0.8
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
-def test_poses_are_captured_as_often_as_asked_for(share):
+def test_draw_bodies_uses_requested_share_of_captured_poses(share):
     bank = PoseBank.of_motion(motion())
     drawn = draw_bodies(bank, share, 120, SEED, 0)
     captured = np.array(drawn.kinds) == "captured"
-    # the prior's own kind after captured motion has that name too
+    # the prior has a kind of the same name, fitted to captured motion
     prior = np.array(draw_bodies(None, 0.0, 120, SEED, 0).kinds) == "captured"
     # children's steps are shorter
     step = np.array([drawn.moved(row)[1][0] for row in range(120)]) - drawn.joints[:, 0]
@@ -74,8 +74,8 @@ def test_poses_are_captured_as_often_as_asked_for(share):
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
-def test_clips_are_captured_as_often_as_asked_for_and_jumps_leave_the_ground(share):
-    # four times as many frames a second as a clip has
+def test_draw_moving_bodies_captured_share_and_jumps(share):
+    # four times the frame rate of a clip
     bank = PoseBank.of_motion(motion(frames=160, fps=40.0, jump=0.5))
     for seed in range(3):
         somebody = draw_moving_bodies(bank, share, 1, 9, np.random.default_rng(seed))[0]
@@ -83,16 +83,16 @@ def test_clips_are_captured_as_often_as_asked_for_and_jumps_leave_the_ground(sha
         high = somebody.vertices[..., 2].min(1)
         if share:
             assert somebody.kinds[0] == "captured" and ((aside > 0.04) & (aside < 0.14)).all()
-            # one frame in eight, less what a taller body may rise
+            # one frame in eight is a jump, whose height depends on the body
             assert 1 <= (high > 0.4).sum() <= 2 and np.abs(high[high < 0.4]).max() < 1e-4
         else:
             assert not ((aside > 0.04) & (aside < 0.14)).all()
-        # where a frame ends the next one begins
+        # a frame ends with the pose of the next frame
         np.testing.assert_array_equal(somebody.moved(0)[0], somebody.vertices[1])
         np.testing.assert_array_equal(somebody.moved(0)[1], somebody.joints[1])
 
 
-def test_captured_clips_are_played_faster_and_slower():
+def test_pose_bank_clip_tempo_changes_speed():
     bank = PoseBank.of_motion(motion(frames=60))
     own = bank.clip(9, np.random.default_rng(0))
     np.testing.assert_array_equal(own[0], bank.clip(9, np.random.default_rng(0), tempo=0.0)[0])
@@ -105,11 +105,11 @@ def test_captured_clips_are_played_faster_and_slower():
             rotations @ rotations.swapaxes(-1, -2), np.broadcast_to(np.eye(3), rotations.shape), atol=1e-5
         )
         steps = np.linalg.norm(np.diff(place[:, :2], axis=0), axis=1)
-        # somebody who moves evenly still does
+        # constant speed stays constant
         np.testing.assert_allclose(steps, steps.mean(), rtol=1e-3)
         speeds.append(steps.mean() / pace)
     assert np.exp(-0.41) < min(speeds) < 0.75 and 1.3 < max(speeds) < np.exp(0.41)
-    # as long as the whole clip: nothing is left to play faster
+    # a request for the whole clip cannot be sped up
     whole = bank.clips.length[0]
     assert all(len(bank.clip(whole, np.random.default_rng(seed), tempo=0.4)[0]) == whole for seed in range(8))
     moved = {draw_moving_bodies(bank, 1.0, 1, 8, np.random.default_rng(2), tempo=t)[0].joints[-1, 0, 1] for t in (0, 1)}
@@ -117,7 +117,7 @@ def test_captured_clips_are_played_faster_and_slower():
 
 
 @pytest.mark.parametrize("turn", [0.8, -0.8])
-def test_a_clip_s_boxes_turn_with_the_person(turn):
+def test_moving_body_boxes_turn_with_person(turn):
     bank = PoseBank.of_motion(motion(turn=turn))
     for seed in range(3):
         somebody = draw_moving_bodies(bank, 1.0, 1, 8, np.random.default_rng(seed))[0]
@@ -132,7 +132,7 @@ def test_a_clip_s_boxes_turn_with_the_person(turn):
             np.testing.assert_allclose(somebody.extent[frame][1], local.max(0), atol=1e-5)
 
 
-def test_a_bank_is_of_the_subjects_asked_for(monkeypatch):
+def test_pose_bank_from_clips_selects_subjects(monkeypatch):
     both = motion(frames=40, names=("001_01", "002_01"))
     monkeypatch.setattr(bodies, "load_motion", lambda path: both)
     assert PoseBank.from_clips("x").clips.names == both.names
@@ -140,7 +140,7 @@ def test_a_bank_is_of_the_subjects_asked_for(monkeypatch):
     assert one.clips.names == ("002_01",) and len(one.rotations) == 19
 
 
-def test_people_without_clothes_wear_none(monkeypatch):
+def test_generator_without_clothes_gives_bare_bodies(monkeypatch):
     bare, dressed = (Generator(scene=replace(SCENES["paper"], clothes=share))._bodies(SEED, 0) for share in (0.0, 1.0))
     assert np.abs(dressed.vertices - bare.vertices).max() > 0.01
     np.testing.assert_array_equal(bare.joints[..., :2], dressed.joints[..., :2])
@@ -149,19 +149,19 @@ def test_people_without_clothes_wear_none(monkeypatch):
 
 
 def folded_arms(frames=12):
-    """Somebody whose hands and wrists are in the belly of anybody who is not thin, and who breathes."""
+    """Motion of a person with folded arms, whose hands and wrists are inside the belly of most bodies."""
     someone = motion(frames=frames)
     for side, sign in (("left", 1), ("right", -1)):
         down = -sign * (1.35 + 0.05 * np.sin(np.arange(frames)))
         someone.rotations[:, SMPL24.index(f"{side}_shoulder")] = rotation_about("x", down)
-        # the forearms go level across the belly
+        # the forearms are level in front of the belly
         across = rotation_about("x", sign * 1.35) @ rotation_about("z", -sign * (np.pi - 0.45))
         someone.rotations[:, SMPL24.index(f"{side}_elbow")] = across
     return someone
 
 
 def wrists_inside(body, rows):
-    """How far (rows, 2) m the wrists are behind the front of the trunk at their height: above 0 inside."""
+    """Depth (rows, 2) m of the wrists behind the front of the trunk at their height, positive inside."""
     depths = []
     trunk = np.isin(body.face_part, [1 + SMPL24.index(name) for name in ("pelvis", "spine1", "spine2", "spine3")])
     for row in rows:
@@ -173,38 +173,38 @@ def wrists_inside(body, rows):
     return np.array(depths).reshape(-1, 2)
 
 
-def test_captured_arms_are_outside_the_drawn_body():
+def test_clear_limbs_moves_captured_arms_out_of_body():
     bank = PoseBank.of_motion(folded_arms())
     before, after = (draw_bodies(bank, 1.0, 60, SEED, 0, clear_limbs=on) for on in (False, True))
     inside, left = (wrists_inside(people, range(60)).max(1) for people in (before, after))
     assert (inside > 0.04).mean() > 0.5 and (left > 0.04).mean() < 0.05
-    # everything else is as it was, up to where the soles are, and the arms of those who had room
+    # other joints stay, except for the height of the soles
     hidden = [JOINTS[f"{side}_{name}"] for side in ("left", "right") for name in ("elbow", "wrist", "hand")]
     others = np.setdiff1d(np.arange(26), hidden)
     np.testing.assert_allclose(after.joints[:, others], before.joints[:, others], atol=0.06)
     moved = np.linalg.norm(after.joints - before.joints, axis=-1)[:, hidden]
     assert (moved < 0.3).all()
-    # folded arms stay folded: hands in front of the trunk, no farther away than a hand is thick
+    # arms stay folded: hands are in front of the trunk and within the thickness of a hand
     wrists = after.joints[:, [JOINTS["left_wrist"], JOINTS["right_wrist"]]]
     assert (wrists[..., 0].min(1) > before.joints[:, JOINTS["spine1"], 0]).all() and np.median(left) > -0.06
-    # a pose goes on as it did
+    # the motion within a frame stays the same
     for row in range(5):
         way = [people.moved(row)[1] - people.joints[row] for people in (before, after)]
         np.testing.assert_allclose(way[0], way[1], atol=0.03)
 
 
-def test_people_with_room_about_them_keep_their_pose():
-    # arms ahead and hanging, away from the body
+def test_clear_limbs_keeps_poses_without_contact():
+    # one arm forward and one hanging, both away from the body
     bank = PoseBank.of_motion(motion())
     before, after = (draw_bodies(bank, 0.5, 60, SEED, 0, clear_limbs=on) for on in (False, True))
     same = np.abs(after.joints - before.joints).max((1, 2)) == 0
     assert same.mean() > 0.7
-    # who is not captured stays as the prior drew them
+    # poses of the prior are not changed
     prior = np.isnan(before.places[:, 0])
     assert same[prior].all() and 0.3 < prior.mean() < 0.7
 
 
-def test_corrected_clips_move_evenly():
+def test_clear_limbs_keeps_clips_smooth():
     bank = PoseBank.of_motion(folded_arms(40))
     hands = [JOINTS[f"{side}_hand"] for side in ("left", "right")]
     for seed in range(3):
@@ -216,7 +216,7 @@ def test_corrected_clips_move_evenly():
         assert (wrists_inside(after, range(9)) < 0.04).all()
 
 
-def test_shanks_stand_apart():
+def test_cleared_separates_shanks():
     rig = load_rig()
     people = rig.rest(np.zeros((2, rig.coefficients.shape[1])))
     pose = np.tile(np.eye(3, dtype=np.float32), (2, 1, 24, 1, 1))
@@ -231,7 +231,7 @@ def test_shanks_stand_apart():
     np.testing.assert_array_equal(after[1], pose[1])
 
 
-def test_limbs_are_cleared_in_wide_alone():
+def test_clear_limbs_is_enabled_only_in_wide_scene():
     assert {name for name, scene in SCENES.items() if scene.clear_limbs} == {"wide"}
     bank = PoseBank.of_motion(folded_arms())
     off, on = (

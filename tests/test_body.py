@@ -1,4 +1,4 @@
-"""The shipped body: its mesh, its joints, its shapes, and how a pose moves it."""
+"""The bundled body model: mesh, joints, shapes and posing."""
 
 from importlib import resources
 
@@ -49,14 +49,14 @@ def random_rotations(seed, n, spread=0.6):
 
 
 def posed(rig, rest, **flexed):
-    """`rest` with named joints turned: joint=(axis, degrees)."""
+    """`rest` with named joints rotated: joint=(axis, degrees)."""
     rotations = np.broadcast_to(np.eye(3), (len(rest.vertices), 24, 3, 3)).copy()
     for joint, (axis, degrees) in flexed.items():
         rotations[:, SMPL24.index(joint)] = rotation_about(axis, np.radians(degrees))
     return pose_bodies(rig, rest, rotations, np.zeros((len(rotations), 3)))
 
 
-def test_asset_is_small_and_arrays_are_read_only(rig):
+def test_body_asset_is_small_and_read_only(rig):
     assert len(resources.files("lidarpose.body").joinpath("assets/body.npz").read_bytes()) <= 400_000
     assert load_rig() is rig
     with pytest.raises(ValueError, match="read-only"):
@@ -71,12 +71,12 @@ def test_mesh_is_one_closed_surface_wound_outwards(rig):
     assert len(np.unique(directed)) == len(directed), "two faces run along an edge in the same direction"
     assert set(directed.tolist()) == set(reverse.tolist()), "an edge has a face on one side only"
     assert sorted(np.unique(rig.faces)) == list(range(count))
-    # a closed surface in one piece without handles, hence Euler's 2
+    # the Euler characteristic of one closed surface without handles is 2
     assert count - len(edges) // 2 + len(rig.faces) == 2
     assert 2000 <= len(rig.faces) <= 3000
 
 
-def test_weights_and_parts(rig):
+def test_rig_weights_and_parts_are_consistent(rig):
     np.testing.assert_allclose(rig.weight.sum(1), 1, atol=1e-6)
     assert (np.diff(rig.weight, axis=1) <= 0).all(), "the kernel stops at the first zero"
     np.testing.assert_allclose(rig.dense_weight.sum(1), 1, atol=1e-6)
@@ -95,7 +95,7 @@ def test_weights_and_parts(rig):
     assert middle[rig.face_part == 1 + J("left_hand"), 1].min() > 0.5
 
 
-def test_pivots_are_those_of_smpl(mean_adult):
+def test_mean_adult_joints_match_smpl(mean_adult):
     at = dict(zip(BODY26.joints, mean_adult.joints[0], strict=True))
     apart = lambda a, b: np.linalg.norm(at[a] - at[b])  # noqa: E731
     assert np.abs(at["pelvis"]).max() == 0
@@ -107,7 +107,7 @@ def test_pivots_are_those_of_smpl(mean_adult):
     assert (np.diff(heights) > 0).all()
 
 
-def test_rest_pose_is_a_t_pose_that_faces_x(rig, mean_adult):
+def test_rest_pose_is_t_pose_facing_x(rig, mean_adult):
     joints = mean_adult.joints[0]
     for side, sign in (("left", 1), ("right", -1)):
         arm = joints[[J(f"{side}_{j}") for j in ("shoulder", "elbow", "wrist", "hand")]]
@@ -123,7 +123,7 @@ def test_rest_pose_is_a_t_pose_that_faces_x(rig, mean_adult):
     assert np.ptp(hand[:, 0]) > 1.3 * np.ptp(hand[:, 2])
 
 
-def test_left_mirrors_right(rig, some):
+def test_rest_bodies_are_symmetric(rig, some):
     mirrored = some.joints[:, BODY26.flip] * [1, -1, 1]
     assert np.abs(mirrored - some.joints).max() < 0.01
     faces = rig.faces
@@ -131,11 +131,11 @@ def test_left_mirrors_right(rig, some):
         other = vertices * np.float32([1, -1, 1])
         middle = np.concatenate([vertices, vertices[faces].mean(1)])
         gap = np.linalg.norm(other[:, None] - middle, axis=-1).min(1)
-        # to the nearest corner or middle of a face, so a few cm where faces are large
+        # distance to the nearest vertex or center of a face: a few cm where faces are large
         assert np.median(gap) < 0.012 and gap.max() < 0.06
 
 
-def test_every_shape_has_flat_soles_and_the_height_and_volume_of_a_person(rig):
+def test_shapes_have_flat_soles_and_correct_height_and_volume(rig):
     rest = rig.rest(rig.coefficients)
     assert np.abs(volume(rig, rest.vertices) * 980 / rig.height**2 / rig.bmi - 1).max() < 0.12
     np.testing.assert_allclose(np.ptp(rest.vertices[..., 2], axis=1), rig.height, atol=0.02)
@@ -152,7 +152,7 @@ def test_every_shape_has_flat_soles_and_the_height_and_volume_of_a_person(rig):
 
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 2**31), st.floats(0, 1.5))
-def test_kernels_equal_their_references(seed, spread):
+def test_body_kernels_equal_references(seed, spread):
     rig = load_rig()
     rng = np.random.default_rng(seed)
     rest = rig.rest(sample_people(rng, 3).coefficients)
@@ -162,7 +162,7 @@ def test_kernels_equal_their_references(seed, spread):
         assert a.dtype == b.dtype == np.float32
         np.testing.assert_allclose(a, b, atol=1e-5)
     normals = vertex_normals_reference(rig.faces, fast[0])
-    # float32 sums of slivers' cross products: directions agree to a fraction of a degree
+    # rounding of float32 in thin triangles: directions agree to a fraction of a degree
     assert ((normals_of(rig, fast[0]) * normals).sum(-1) > 1 - 1e-4).all()
     offset = rng.uniform(0, 0.03, normals.shape[:2]).astype(np.float32)
     clothed, low, high = fast[0].copy(), *np.empty((2, 3, 3), np.float32)
@@ -175,7 +175,7 @@ def test_kernels_equal_their_references(seed, spread):
     np.testing.assert_allclose(offset, folded, atol=1e-6)
 
 
-def test_poses_are_rigid_and_follow_forward_kinematics(rig, some):
+def test_pose_bodies_is_rigid_and_follows_forward_kinematics(rig, some):
     for posed_body, rest in zip(posed(rig, some), (some.vertices, some.joints), strict=True):
         np.testing.assert_allclose(posed_body, rest, atol=1e-6)
     rotations, move = random_rotations(5, 6, 1.0), np.random.default_rng(5).normal(0, 3, (6, 3))
@@ -192,7 +192,7 @@ def test_poses_are_rigid_and_follow_forward_kinematics(rig, some):
     np.testing.assert_allclose(*length, atol=1e-5)
 
 
-def test_signs_of_rotations(rig, mean_adult):
+def test_pose_bodies_bends_joints_in_expected_directions(rig, mean_adult):
     rest = mean_adult.joints[0]
     _, (sitting,) = posed(rig, mean_adult, left_hip=("y", -90), left_knee=("y", 90))
     assert sitting[J("left_knee"), 0] > rest[J("left_hip"), 0] + 0.3
@@ -204,18 +204,18 @@ def test_signs_of_rotations(rig, mean_adult):
 
 
 @pytest.mark.parametrize("flexed", [dict(left_hip=("y", -90), left_knee=("y", 90)), dict(left_shoulder=("x", -80))])
-def test_flexing_keeps_most_of_the_volume(rig, some, flexed):
+def test_pose_bodies_keeps_most_of_volume(rig, some, flexed):
     vertices, _ = posed(rig, some, **flexed)
     assert (np.abs(volume(rig, vertices) / volume(rig, some.vertices) - 1) < 0.06).all()
 
 
-def test_normals_point_outwards(rig, some):
+def test_vertex_normals_point_outward(rig, some):
     normals = normals_of(rig, some.vertices)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-5)
     assert (volume(rig, some.vertices + 0.005 * normals) > 1.05 * volume(rig, some.vertices)).all()
 
 
-def test_people_are_those_of_a_street(rig):
+def test_sample_people_matches_population_statistics(rig):
     people, again = (sample_people(np.random.default_rng(3), 4000) for _ in range(2))
     adult = people.age >= 18
     assert 0.09 < 1 - adult.mean() < 0.15
@@ -234,7 +234,7 @@ def test_people_are_those_of_a_street(rig):
     np.testing.assert_allclose(np.ptp(rest.vertices[..., 2], axis=1), people.height[:200], atol=0.02)
 
 
-def test_clothes(rig):
+def test_clothing_thickness_is_plausible_and_smooth(rig):
     worn = clothing(np.random.default_rng(4), 400)
     np.testing.assert_array_equal(worn, clothing(np.random.default_rng(4), 400))
     assert worn.shape == (400, len(rig.template)) and worn.dtype == np.float32
@@ -247,10 +247,10 @@ def test_clothes(rig):
     hands = dense[:, [J("left_hand"), J("right_hand")]].sum(1) > 0.9
     face = (dense[:, J("head")] > 0.9) & (rig.template[:, 0] > rig.joint_template[J("head_center"), 0] + 0.07)
     assert worn[:, hands].mean() < 0.001 and worn[:, face].mean() < 0.004
-    # smooth: across an edge the cloth changes by far less than its thickness
+    # along an edge the thickness changes by far less than its value
     step = np.abs(worn[:, rig.faces[:, 0]] - worn[:, rig.faces[:, 1]])
     assert np.median(step) < 0.002
-    # folds are wider than 15 cm: a quarter of the shortest wave away, the cloth is still much as thick, without spikes
+    # folds are wider than 15 cm: within a quarter of the shortest wave the thickness changes little, without spikes
     trunk = np.flatnonzero(dense[:, [J(j) for j in ("spine1", "spine2", "spine3")]].sum(1) > 0.9)
     apart = np.linalg.norm(rig.template[trunk, None] - rig.template[None, trunk], axis=-1)
     a, b = np.nonzero((apart > 0) & (apart < 0.025))

@@ -1,4 +1,4 @@
-"""Boxes from JSON: what is accepted, and one line for each mistake."""
+"""Reading and writing of boxes: accepted input, and error messages of one line."""
 
 import copy
 import json
@@ -12,6 +12,7 @@ from hostile_files import KITTI, npy, refusal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import lidarpose
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix
 from lidarpose.io.boxes import Boxes, read_boxes
@@ -49,7 +50,7 @@ def _have_own_ids(people):
 @pytest.mark.long
 @settings(max_examples=80, deadline=None)
 @given(people=people.filter(_have_own_ids), bare=st.booleans(), bom=st.booleans())
-def test_file_and_structure_agree(tmp_path_factory, people, bare, bom):
+def test_read_boxes_gives_equal_boxes_from_file_and_structure(tmp_path_factory, people, bare, bom):
     path = tmp_path_factory.mktemp("boxes", numbered=True) / "boxes.json"
     content = people if bare else {"people": people, "frame": "lidar"}
     path.write_text(json.dumps(content), encoding="utf-8-sig" if bom else "utf-8")
@@ -64,14 +65,14 @@ def test_file_and_structure_agree(tmp_path_factory, people, bare, bom):
     assert content == before
 
 
-def test_arrays_and_numpy_numbers_are_numbers():
+def test_read_boxes_accepts_arrays_and_numpy_numbers():
     (box,) = read_boxes(
         [{"center": np.array([1, 2, 3]), "size": (np.float32(1), 2, np.int64(3)), "yaw": np.float64(1)}]
     )
     assert box.center.tolist() == [1, 2, 3] and box.size.tolist() == [1, 2, 3] and box.yaw == 1
 
 
-def test_found_boxes_are_read_as_they_were_written(tmp_path):
+def test_boxes_save_and_read_round_trip(tmp_path):
     box = Box(center=[1.0, -2.0, 0.25], size=[0.6, 0.7, 1.8], yaw=0.3, id=0, score=np.float32(0.75), mounted=True)
     for boxes in ([box], []):
         Boxes(boxes, source="a.pcd", warnings=["odd"], detector="1").save(tmp_path / "boxes.json")
@@ -81,7 +82,7 @@ def test_found_boxes_are_read_as_they_were_written(tmp_path):
     assert json.loads((tmp_path / "boxes.json").read_text())["warnings"] == ["odd"]
 
 
-def test_some_of_the_boxes_found_are_saved_alike(tmp_path):
+def test_boxes_slice_saves_same_document(tmp_path):
     found = Boxes([Box(center=[i, 0, 0], size=[1, 1, 2], id=i) for i in range(3)], source="a.pcd", detector="1")
     found[1:].save(tmp_path / "boxes.json")
     whole = found.to_dict()
@@ -89,7 +90,7 @@ def test_some_of_the_boxes_found_are_saved_alike(tmp_path):
     assert found[1].id == 1 and found[-1] is found[2]
 
 
-def test_what_is_up_is_read_from_files_of_ours_alone():
+def test_read_boxes_takes_up_only_from_own_files():
     ours = Boxes([], up="0.1,0.2,0.97").to_dict()
     assert read_boxes(ours).up == "0.1,0.2,0.97" and read_boxes({"people": []}).up == "z"
     assert read_boxes({"people": [], "up": [0, 0, 9]}).up == "z"
@@ -97,7 +98,7 @@ def test_what_is_up_is_read_from_files_of_ours_alone():
         assert "up: expected z, y, x" in refusal(read_boxes, ours | {"up": up})
 
 
-def test_scores_of_other_detectors_may_be_anything():
+def test_read_boxes_ignores_scores_of_other_detectors():
     for score in (12.5, -1, "high", None, math.nan, [1], True):
         assert read_boxes([{**PERSON, "score": score, "mounted": "no"}])[0].score is None
     assert read_boxes([{**PERSON, "score": 1}])[0].score == 1.0
@@ -106,7 +107,7 @@ def test_scores_of_other_detectors_may_be_anything():
             Box(center=[0, 0, 0], size=[1, 1, 1], score=score)
 
 
-def test_nobody_is_legal():
+def test_read_boxes_accepts_no_people():
     assert read_boxes([]) == read_boxes({"people": []}) == []
 
 
@@ -117,7 +118,7 @@ def fields(box):
     return [*box.center.tolist(), *box.size.tolist(), box.yaw]
 
 
-def test_rows_of_seven_numbers(tmp_path, monkeypatch):
+def test_read_boxes_accepts_rows_of_seven_numbers(tmp_path, monkeypatch):
     rows = np.array([ROW, [1, 2, 3, 0.5, 0.6, 1.7, -1]])
     (tmp_path / "boxes.npy").write_bytes(npy(rows))
     (tmp_path / "boxes.json").write_text(json.dumps(rows.tolist()))
@@ -134,7 +135,7 @@ def test_rows_of_seven_numbers(tmp_path, monkeypatch):
     assert read_boxes("boxes") == []
 
 
-def test_boxes_rows_and_objects_may_be_mixed():
+def test_read_boxes_accepts_mixed_entries():
     box = Box(center=[1, 2, 3], size=[1, 1, 2], id="b")
     (alone,) = read_boxes(box)
     mixed = read_boxes([PERSON, box, ROW, np.array(ROW)])
@@ -147,9 +148,9 @@ def rotation(axis, angle):
 
 
 @pytest.mark.parametrize("tracking", [False, True])
-def test_kitti_labels_come_in_the_frame_of_the_lidar(tmp_path, tracking):
-    """A label written from boxes that are known in the LiDAR's frame, by the forward transform."""
-    # the camera looks ahead: its x is the LiDAR's -y, its y is -z, its z is x; then a little askew
+def test_read_boxes_converts_kitti_labels_to_lidar_frame(tmp_path, tracking):
+    """The label is written from boxes in the LiDAR's frame by the forward transform."""
+    # the camera looks forward: its x, y, z are -y, -z, x of the LiDAR, slightly rotated
     R_cam_velo = rotation("x", 0.02) @ np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0.0]])
     t_cam_velo = np.array([0.03, -0.08, -0.27])
     rectify = rotation("y", 0.01) @ rotation("z", -0.008)
@@ -175,9 +176,10 @@ def test_kitti_labels_come_in_the_frame_of_the_lidar(tmp_path, tracking):
     texts = [f"{n} {' '.join(f'{v:.9e}' for v in m.ravel())}" for n, m in zip(names, matrices, strict=True)]
     calib.write_text("P0: 1 0 0\n" + "\n".join(texts) + "\n")
     boxes = read_boxes(label)
-    # a camera's vertical is not quite the LiDAR's: 4 cm and a degree at most
+    # the vertical axes of camera and LiDAR differ: 4 cm and a degree at most
     np.testing.assert_allclose([fields(box) for box in boxes], rows, atol=0.04)
     np.testing.assert_allclose([box.size for box in boxes], rows[:, 3:6], atol=1e-6)
+    np.testing.assert_allclose([box.center for box in boxes], rows[:, :3], atol=1e-5)
     assert [fields(box) for box in read_boxes(label, calib=calib)] == [fields(box) for box in boxes]
 
     for text, words in (
@@ -243,7 +245,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_structure(case):
+def test_read_boxes_rejects_bad_structure(case):
     content, words = BAD[case]
     refusal(read_boxes, content, words=["boxes: ", *words])
 
@@ -275,13 +277,13 @@ def test_bad_structure(case):
         (b'[{"center": [1, 2, 3], "size": [1, 1, 1], "id": {"\\n": 2}}]', ["people[0].id"]),
     ],
 )
-def test_bad_files(tmp_path, content, words):
+def test_read_boxes_rejects_bad_files(tmp_path, content, words):
     path = tmp_path / "boxes.json"
     path.write_bytes(content)
     refusal(read_boxes, path, words=[f"{path}: ", *words])
 
 
-def test_bad_paths(tmp_path):
+def test_read_boxes_rejects_bad_paths(tmp_path):
     for path, word in (
         (tmp_path / "gone.json", "no such file"),
         (tmp_path, "folder"),
@@ -291,7 +293,7 @@ def test_bad_paths(tmp_path):
         refusal(read_boxes, path, words=[word])
 
 
-def test_boxes_picked_from_found_ones_say_what_is_up():
+def test_selected_boxes_keep_up_axis():
     tilted = Boxes([Box(center=[5, 0, 0], size=[1, 1, 2], id=id) for id in "ab"], up="-y")
     for some in (
         [box for box in tilted if box.id == "a"],
@@ -319,7 +321,7 @@ def test_boxes_picked_from_found_ones_say_what_is_up():
         Box(center=[9, 0, 0], size=[1, 1, 2], up="upwards")
 
 
-def test_who_is_mounted_is_true_false_or_unknown():
+def test_box_mounted_is_true_false_or_none():
     box = Box(center=[0, 0, 0], size=[1, 1, 1], mounted=np.bool_(True))
     assert box.mounted is True and json.loads(Boxes([box]).to_json())["people"][0]["mounted"] is True
     entry = {"center": [0, 0, 0], "size": [1, 1, 1]}
@@ -328,7 +330,7 @@ def test_who_is_mounted_is_true_false_or_unknown():
         Box(center=[0, 0, 0], size=[1, 1, 1], mounted="yes")
 
 
-def test_tensors_of_any_precision_are_boxes_and_open_files_are_left_alone(tmp_path):
+def test_read_boxes_accepts_bfloat16_and_rejects_open_files(tmp_path):
     rows = torch.tensor([[5.0, 0, 0, 1, 1, 2, 0]], dtype=torch.bfloat16, requires_grad=True)
     assert read_boxes(rows)[0].center.tolist() == [5, 0, 0]
     (tmp_path / "b.json").write_text("[]")
@@ -338,12 +340,36 @@ def test_tensors_of_any_precision_are_boxes_and_open_files_are_left_alone(tmp_pa
         assert file.read() == "[]"
 
 
-def test_a_box_alone_says_what_is_up_and_a_document_says_it_once(tmp_path):
+def test_to_dict_gives_up_per_box_or_once_per_document(tmp_path):
     (box,) = boxes = Boxes([Box(center=[0, 0, 0], size=[1, 1, 2])], up="-y")
     assert box.to_dict()["up"] == "-y" and "up" not in boxes.to_dict()["people"][0]
     assert read_boxes([box.to_dict()]).up == read_boxes(boxes.to_dict()).up == "-y"
     assert "up" not in Box(center=[0, 0, 0], size=[1, 1, 2]).to_dict()
-    # other tools' keys are ignored
+    # other values of `up`, written by other tools, are ignored
     assert read_boxes([box.to_dict() | {"up": True}]).up == "z"
     with pytest.raises(InputError, match="b.txt: is written as JSON"):
         boxes.save(tmp_path / "b.txt")
+
+
+def test_boxes_rejects_rows():
+    with pytest.raises(InputError, match=r"expected objects of type Box, got list: convert with lidarpose.read_boxes"):
+        Boxes([[0, 0, 0, 1, 1, 2, 0]])
+
+
+def test_box_to_dict_keeps_known_values():
+    box = Box(center=np.zeros(3), size=np.ones(3), yaw=0.5, id="a", score=0.75, mounted=False, up="y")
+    assert vars(read_boxes([box.to_dict()])[0]).keys() == vars(box).keys()
+    result = read_boxes([box.to_dict()])[0]
+    assert (result.id, result.score, result.mounted, result.up) == ("a", 0.75, False, "y")
+    assert Box(center=np.zeros(3), size=np.ones(3)).to_dict().keys() == {"center", "size", "yaw"}
+
+
+def test_stated_up_axis_is_checked():
+    boxes = read_boxes({"schema": "lidarpose.boxes/1", "up": "z", "people": [[0, 0, 0, 1, 1, 2, 0]]})
+    assert boxes.has_up and boxes[:1].has_up and read_boxes(boxes).has_up
+    assert not read_boxes([[0, 0, 0, 1, 1, 2, 0]]).has_up
+    points = np.random.default_rng(0).normal(0, 0.3, (60, 3))
+    with pytest.raises(InputError, match="the up axis of the boxes is z, not y"):
+        lidarpose.predict(points, boxes=boxes, up="y")
+    # rows do not state an axis
+    assert len(lidarpose.predict(points, boxes=[[0, 0, 0, 1, 1, 2, 0]], up="y", model="tiny")) == 1

@@ -1,4 +1,4 @@
-"""What a detector's scores mean: fitted on the scans of another family than that of training."""
+"""Calibration of a detector's scores on scans of another family than that of training."""
 
 import json
 from dataclasses import replace
@@ -19,7 +19,7 @@ from lidarpose.synth.detection_scene import detection_scene
 from lidarpose.train.detector.calibrate import ScanTable, fit, logistic, monotone, passing_score
 
 
-def test_a_logistic_regression_finds_its_weights():
+def test_logistic_recovers_weights():
     rng = np.random.default_rng(0)
     features = rng.normal(size=(20_000, 2)) * [1, 10] + [0, 5]
     truth = 0.5 + features @ [2.0, -0.1]
@@ -28,7 +28,7 @@ def test_a_logistic_regression_finds_its_weights():
     np.testing.assert_allclose([bias, *weights], [0.5, 2.0, -0.1], rtol=0.1)
 
 
-def test_probabilities_rise_and_are_shares():
+def test_monotone_recovers_probabilities():
     rng = np.random.default_rng(0)
     logit = rng.normal(0, 3, 20_000)
     probability = 1 / (1 + np.exp(-logit - 1))
@@ -37,7 +37,7 @@ def test_probabilities_rise_and_are_shares():
     np.testing.assert_allclose(np.interp(logit, logits, shares), probability, atol=0.08)
 
 
-def test_a_person_is_found_once():
+def test_match_assigns_each_person_once():
     people = np.array([[1.0, 0.0, 0.9], [5.0, 0.0, 0.9]])
     centers = np.array([[1.2, 0.1, 0.9], [1.1, 0.0, 0.9], [5.6, 0.0, 0.9], [5.2, 0.0, 2.0], [9.0, 0.0, 0.9]])
 
@@ -50,15 +50,15 @@ def test_a_person_is_found_once():
     assert not matched(centers, people[:0]).any()
 
 
-def test_a_score_that_so_many_false_people_pass():
+def test_passing_score_gives_requested_false_positives():
     assert passing_score(np.array([0.2, 0.9, 0.6, 0.1]), 2) == pytest.approx(0.4)
-    # fewer than one a scan
+    # fewer than one false positive per scan
     assert passing_score(np.array([0.7, 0.3]), 5) == pytest.approx(0.5)
     assert passing_score(np.zeros(0), 5) == 0.5
 
 
 def made_tables(rng, scans):
-    """Scans of 2 people, each detected twice, and of 8 other detections."""
+    """Scans with 2 people, each detected twice, and 8 other detections."""
     tables = []
     for _ in range(scans):
         people = rng.uniform(-30, 30, (2, 2))
@@ -79,18 +79,18 @@ def made_tables(rng, scans):
     return tables
 
 
-def test_the_default_score_lets_one_false_person_a_scan_pass():
+def test_fit_default_score_gives_one_false_positive_per_scan():
     tables = made_tables(np.random.default_rng(0), 100)
     header = fit(tables)
     boxes = [box for table in tables for box in table.verify(header, header["default_score"]).boxes]
-    # of people one detection each: the other one is neither a person nor a mistake
+    # one detection per person: the duplicate is neither a true nor a false positive
     assert 70 <= sum(box.id >= 4 for box in boxes) <= 100 and 150 <= sum(box.id < 4 for box in boxes) <= 200
     assert set(header) == {"calibration", "verification", "default_score"}
     assert set(header["verification"]) == {"bias", "logit", "verifier", "log_points", "calibration"}
     assert json.loads(json.dumps(header)) == header
 
 
-def test_a_score_is_the_share_of_people_among_those_that_are_left():
+def test_fit_scores_equal_precision_after_suppression():
     header = fit(made_tables(np.random.default_rng(0), 400))
     boxes = [box for table in made_tables(np.random.default_rng(1), 400) for box in table.verify(header, 0.01).boxes]
     scores, labels = np.array([box.score for box in boxes]), np.array([box.id < 4 for box in boxes])
@@ -100,7 +100,7 @@ def test_a_score_is_the_share_of_people_among_those_that_are_left():
 
 
 @pytest.mark.long
-def test_scores_are_fitted_on_level_scans_as_detection_sees_them(tmp_path, monkeypatch):
+def test_calibrate_levels_tilted_scans(tmp_path, monkeypatch):
     scene = detection_scene(3, 12)
     R = rotation_about("y", np.radians(20.0))
     tilted = replace(scene, points=(scene.points @ R.T).astype(np.float32), origin=R @ scene.origin, up=R @ scene.up)
@@ -117,6 +117,6 @@ def test_scores_are_fitted_on_level_scans_as_detection_sees_them(tmp_path, monke
     network = DetectorNet(DetectorConfig(channels=(8, 8, 16), coarse_channels=(4, 8), hidden=16))
     save_checkpoint(tmp_path / module.MODEL, network, card={})
     module.calibrate(tmp_path, 1)
-    # within what a slope is told from
+    # within the accuracy of the leveling
     off = np.linalg.norm(seen[0] - scene.points, axis=1)
     assert np.median(off / np.maximum(np.linalg.norm(scene.points, axis=1), 1)) < 0.05

@@ -1,4 +1,4 @@
-"""Weights on disk: there and back, and one line for every fault."""
+"""Checkpoints: saving, loading, and error messages of one line."""
 
 import copy
 import json
@@ -49,7 +49,7 @@ def stored(network, tmp_path_factory):
 
 
 @pytest.mark.parametrize("half", [False, True])
-def test_there_and_back(network, tmp_path, half):
+def test_save_and_load_checkpoint_round_trip(network, tmp_path, half):
     path = tmp_path / "new" / "tiny.safetensors"
     save_checkpoint(path, network, card=CARD, half=half)
     loaded, header = load_checkpoint(path)
@@ -65,7 +65,7 @@ def test_there_and_back(network, tmp_path, half):
     assert (2 if half else 4) * count < size < (2 if half else 4) * count + 20_000
 
 
-def test_saving_leaves_the_network_and_an_older_file_in_peace(network, stored, tmp_path):
+def test_failed_save_checkpoint_keeps_network_and_old_file(network, stored, tmp_path):
     assert network.training and all(p.requires_grad for p in network.parameters())
     path = tmp_path / "a.safetensors"
     path.write_bytes(stored.read_bytes())
@@ -83,7 +83,7 @@ def assert_one_line(path, *words, read=load_checkpoint):
         assert word in message or re.search(word, message), message
 
 
-def test_no_such_file_and_a_folder(tmp_path):
+def test_load_checkpoint_rejects_missing_file_and_folder(tmp_path):
     assert_one_line(tmp_path / "none.safetensors", "does not exist")
     assert_one_line(tmp_path, "is a folder")
 
@@ -97,18 +97,18 @@ def test_no_such_file_and_a_folder(tmp_path):
         (lambda b: b + b"more", "but its header says {size:,}"),
         (lambda b: b"", "is empty"),
         (lambda b: b[:1000] + b"\x00}}{" + b[1004:], "at byte 1,000"),
-        # a high bit of an exponent: still a finite number
+        # a high bit of an exponent: the number is still finite
         (
             lambda b: b[:-1] + bytes([b[-1] ^ 0x08]),
             "does not match the SHA-256 digest in its header: get the file again",
         ),
-        (lambda b: b"hello world, this is text", "something else: give a checkpoint"),
+        (lambda b: b"hello world, this is text", "something else: give a file of weights"),
         (lambda b: b"\x80\x02}q\x00(X\x01\x00\x00\x00aK\x01u.", "something else"),
         (lambda b: b"\x1f\x8b" + bytes(50), "something else"),
         (lambda b: bytes(64), "something else"),
     ],
 )
-def test_a_damaged_file_names_the_byte(stored, tmp_path, change, words):
+def test_load_checkpoint_describes_damage(stored, tmp_path, change, words):
     path = tmp_path / "bad.safetensors"
     path.write_bytes(change(stored.read_bytes()))
     assert_one_line(path, words.format(size=stored.stat().st_size))
@@ -117,7 +117,7 @@ def test_a_damaged_file_names_the_byte(stored, tmp_path, change, words):
 @pytest.mark.long
 @settings(max_examples=120, deadline=None)
 @given(at=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
-def test_a_flipped_bit_is_noticed(stored, tmp_path_factory, at, bit):
+def test_load_checkpoint_detects_flipped_bits(stored, tmp_path_factory, at, bit):
     content = bytearray(stored.read_bytes())
     content[int(at * len(content))] ^= 1 << bit
     path = tmp_path_factory.mktemp("flip") / "x.safetensors"
@@ -129,14 +129,14 @@ def test_a_flipped_bit_is_noticed(stored, tmp_path_factory, at, bit):
         except InputError as error:
             assert str(path) in str(error) and "\n" not in str(error)
             return
-    # of the digest's own name, of a blank at the header's end, or one that JSON reads as the same: nothing is lost
+    # in the name of the digest, in padding or where JSON reads the same: the content must be unchanged
     due, expected = load_checkpoint(stored)
     assert header == expected
     for name, value in due.state_dict().items():
         assert torch.equal(network.state_dict()[name], value)
 
 
-def test_a_file_without_a_digest_loads_with_a_note(stored, tmp_path):
+def test_load_checkpoint_warns_without_digest(stored, tmp_path):
     older = rewritten(stored, tmp_path / "older.safetensors")
     with pytest.warns(UserWarning, match="older.safetensors: has no digest, so damage goes unnoticed"):
         network, header = load_checkpoint(older)
@@ -145,15 +145,15 @@ def test_a_file_without_a_digest_loads_with_a_note(stored, tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         same, _ = load_checkpoint(again)
-        # what has one keeps it
+        # an existing digest is kept
         assert with_digest(again.read_bytes()) == again.read_bytes()
         for name in BUNDLED:
             load_checkpoint(bundled_path(name))
     assert all(torch.equal(value, same.state_dict()[name]) for name, value in network.state_dict().items())
 
 
-def test_a_file_may_be_cut_off_once_it_is_read(network, stored, tmp_path):
-    """A mapped file would end the process."""
+def test_safetensors_file_survives_truncation_after_open(network, stored, tmp_path):
+    """With a memory-mapped file, the process would crash."""
     path = tmp_path / "x.safetensors"
     path.write_bytes(stored.read_bytes())
     file = SafetensorsFile.open(path)
@@ -164,7 +164,7 @@ def test_a_file_may_be_cut_off_once_it_is_read(network, stored, tmp_path):
     )
 
 
-def test_somebody_else_s_safetensors(tmp_path):
+def test_load_checkpoint_rejects_foreign_safetensors(tmp_path):
     path = tmp_path / "foreign.safetensors"
     for metadata in (None, {"format": "pt"}):
         save_file({"weight": torch.zeros(3)}, path, metadata=metadata)
@@ -172,7 +172,7 @@ def test_somebody_else_s_safetensors(tmp_path):
 
 
 def rewritten(stored, path, *, tensors=dict, header=lambda entry: entry, config=None):
-    """The stored file with other tensors, another header, or other entries of its configuration; without a digest."""
+    """Write the stored file with changed tensors, header or configuration, without a digest; return its path."""
     with safe_open(stored, framework="pt") as file:
         entry = json.loads(file.metadata()["lidarpose"])
     text = header(entry | {"config": entry["config"] | (config or {})})
@@ -195,16 +195,16 @@ def rewritten(stored, path, *, tensors=dict, header=lambda entry: entry, config=
             "tensor part.bias holds values that are not finite",
         ),
         (lambda t: t | {"part.bias": torch.zeros(25, dtype=torch.int32)}, "tensor part.bias holds .* not floats"),
-        # finite until they are float32
+        # finite as float64, but not as float32
         (lambda t: t | {"part.bias": torch.full((25,), 1e300, dtype=torch.float64)}, "part.bias .* not finite"),
     ],
 )
-def test_a_tensor_that_does_not_fit(stored, tmp_path, tensors, words):
+def test_load_checkpoint_rejects_mismatched_tensors(stored, tmp_path, tensors, words):
     assert_one_line(rewritten(stored, tmp_path / "x.safetensors", tensors=tensors), words)
 
 
-def test_nothing_is_allocated_for_what_a_header_says(stored, tmp_path):
-    """A network of gigabytes, or of thousands of layers, in a file of half a megabyte; no width that nobody trains."""
+def test_load_checkpoint_rejects_oversized_configurations(stored, tmp_path):
+    """Nothing is allocated for a header of gigabytes or thousands of layers in a file of half a megabyte."""
     for change, words in (
         ({"channels": [48, 64, 2**14]}, "get the file again"),
         ({"max_voxels": 10, "blocks": [1, 16_000, 1]}, "get the file again"),
@@ -215,7 +215,7 @@ def test_nothing_is_allocated_for_what_a_header_says(stored, tmp_path):
         assert_one_line(rewritten(stored, tmp_path / "x.safetensors", config=change), words)
 
 
-def test_weights_that_could_not_be_loaded_are_not_written(network, tmp_path):
+def test_save_checkpoint_rejects_overflow_in_float16(network, tmp_path):
     out = tmp_path / "x.safetensors"
     large = copy.deepcopy(network)
     with torch.no_grad():
@@ -249,7 +249,7 @@ def test_weights_that_could_not_be_loaded_are_not_written(network, tmp_path):
         (lambda h: "7", "cannot be read"),
     ],
 )
-def test_a_header_that_does_not_fit(stored, tmp_path, header, words):
+def test_load_checkpoint_rejects_invalid_headers(stored, tmp_path, header, words):
     change = header if callable(header) else lambda entry: entry | header
     path = rewritten(stored, tmp_path / "x.safetensors", header=change)
     for read in (load_checkpoint, read_header):
@@ -271,7 +271,7 @@ def test_a_header_that_does_not_fit(stored, tmp_path, header, words):
         ({"skeleton": "body27"}, "unknown skeleton 'body27'"),
     ],
 )
-def test_a_configuration_that_does_not_fit(stored, tmp_path, config, words):
+def test_read_header_rejects_invalid_configurations(stored, tmp_path, config, words):
     assert_one_line(rewritten(stored, tmp_path / "x.safetensors", config=config), words, read=read_header)
 
 
@@ -292,7 +292,7 @@ TINY_DAPT = Path(__file__).parent / "parity" / "dapt_tiny.safetensors"
 
 
 @pytest.mark.parametrize("half", [False, True])
-def test_the_papers_network_there_and_back(tmp_path, half):
+def test_dapt_checkpoint_round_trip(tmp_path, half):
     torch.manual_seed(1)
     joints = ("left_hip", *HUMAN15.joints[:1], *HUMAN15.joints[2:])
     network = DaptNet(DaptConfig(name="mine", joints=joints, coordinates=True, **SMALL))
@@ -306,7 +306,7 @@ def test_the_papers_network_there_and_back(tmp_path, half):
 
 
 @pytest.mark.parametrize("faulty", [False, True])
-def test_a_file_of_before_the_faults_had_names_of_their_own(tmp_path, faulty):
+def test_load_checkpoint_reads_old_legacy_setting(tmp_path, faulty):
     faults = {"stale_convolution": faulty, "grid_from_minimum": faulty}
     network = DaptNet(DaptConfig(name="mine", joints=HUMAN15.joints, coordinates=True, **faults, **SMALL))
     path = tmp_path / "dapt.safetensors"
@@ -322,7 +322,7 @@ def test_a_file_of_before_the_faults_had_names_of_their_own(tmp_path, faulty):
         assert load_checkpoint(path)[1].config == network.config
 
 
-def test_every_kind_of_network_is_one_entry_of_a_table():
+def test_networks_table_entries_are_complete():
     for kind, entry in NETWORKS.items():
         config, network = entry.part("config"), entry.part("network")
         assert config.kind == kind and issubclass(network, torch.nn.Module)
@@ -330,13 +330,13 @@ def test_every_kind_of_network_is_one_entry_of_a_table():
         assert {"name", "joints", "layers", "to_dict"} <= set(dir(config)) | set(config.__dataclass_fields__)
 
 
-def test_joints_that_make_up_no_skeleton():
+def test_header_rejects_joints_of_no_known_skeleton():
     header = Header(config=DaptConfig(name="legs", joints=("left_knee", "right_knee"), coordinates=True), card={})
     with pytest.raises(InputError, match="the network legs predicts left_knee, right_knee"):
         _ = header.skeleton
 
 
-def test_released_weights_come_in(tmp_path):
+def test_import_released_keeps_tensors(tmp_path):
     out = tmp_path / "in.safetensors"
     header = import_released(TINY_DAPT, out)
     loaded, again = load_checkpoint(out)
@@ -346,7 +346,7 @@ def test_released_weights_come_in(tmp_path):
         torch.testing.assert_close(value, released[name].to(value.dtype), rtol=0, atol=0)
 
 
-def test_a_refused_import_writes_nothing(tmp_path, stored):
+def test_import_released_writes_nothing_on_error(tmp_path, stored):
     with pytest.raises(InputError, match="is missing"):
         import_released(stored, tmp_path / "in.safetensors", config="waymo")
     with pytest.raises(InputError, match=r"give a name that ends in \.safetensors"):
@@ -361,7 +361,7 @@ def test_a_refused_import_writes_nothing(tmp_path, stored):
     assert [path.name for path in tmp_path.iterdir()] == ["whole.safetensors"]
 
 
-def test_loading_leaves_torch_s_random_numbers_and_default_type_alone(stored):
+def test_load_checkpoint_keeps_random_state_and_default_dtype(stored):
     torch.manual_seed(3)
     expected = torch.rand(3)
     torch.manual_seed(3)

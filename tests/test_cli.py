@@ -1,4 +1,4 @@
-"""The command line: what it writes, and one line with exit code 2 for whatever is wrong."""
+"""The command line: results, and errors of one line with exit code 2."""
 
 import argparse
 import functools
@@ -20,7 +20,7 @@ from safetensors.numpy import load_file, save_file
 
 import lidarpose
 from lidarpose import progress
-from lidarpose.cli import demo, main
+from lidarpose.cli import demo, main, predicting
 from lidarpose.errors import InputError
 from lidarpose.inference import predictor
 from lidarpose.models import BUNDLED, DEFAULT, bundled_path, weights_file
@@ -40,7 +40,7 @@ def points():
 
 @pytest.fixture(scope="module", autouse=True)
 def bundled_networks():
-    """A bundled network is loaded once for all commands of this process."""
+    """Load each bundled network once for all commands of this process."""
     cached = functools.cache(predictor.load)
 
     def load(weights=DEFAULT, **choices):
@@ -77,7 +77,7 @@ def write(path, content):
 
 
 def run(*arguments):
-    """The exit code, whether the command returns it or argparse raises it."""
+    """The exit code, returned by the command or raised by argparse."""
     try:
         return main([str(argument) for argument in arguments])
     except SystemExit as exit:
@@ -85,14 +85,14 @@ def run(*arguments):
 
 
 def one_line(capsys):
-    """The only line that a failure may leave, on stderr."""
+    """Assert that a failed command printed one line, on stderr, and return it."""
     captured = capsys.readouterr()
     assert captured.out == ""
     assert captured.err.startswith("lidarpose: error: ") and captured.err.count("\n") == 1, captured.err
     return captured.err
 
 
-# ---- what works
+# ---- valid commands
 
 
 def _ply(points):
@@ -108,7 +108,7 @@ FORMATS = {
 }
 
 
-def test_every_format_gives_the_same_pose(tmp_path, out, crop, points):
+def test_predict_gives_same_pose_for_all_formats(tmp_path, out, crop, points):
     results = []
     for name, (content, options) in {"crop.npy": (None, []), **FORMATS}.items():
         file = write(tmp_path / name, content(points)) if content else crop
@@ -126,12 +126,12 @@ def test_every_format_gives_the_same_pose(tmp_path, out, crop, points):
         ("--out - --picture", ["crop.poses.png"], True),
         ("--out a/one.JSON --picture", ["a/one.JSON", "a/one.png"], False),
         ("--out a.CSV --picture --html", ["a.CSV", "a.html", "a.png"], False),
-        # a folder is a folder whatever its name
+        # a path is a folder if it exists as one or ends with a slash, whatever its suffix
         ("--out b.json", ["b.json/crop.poses.json"], False),
         ("--out c.csv/", ["c.csv/crop.poses.json"], False),
     ],
 )
-def test_results_go_where_they_are_to_go(crop, tmp_path, monkeypatch, capsys, words, written, is_printed):
+def test_predict_writes_results_to_out(crop, tmp_path, monkeypatch, capsys, words, written, is_printed):
     here = tmp_path / "here"
     (here / "b.json").mkdir(parents=True)
     write(here / "crop.poses.json", "an older result")
@@ -155,15 +155,15 @@ def test_results_go_where_they_are_to_go(crop, tmp_path, monkeypatch, capsys, wo
             assert json.loads(content)["people"]
 
 
-def test_boxes_and_skeleton(crop, boxes, out, capsys):
+def test_predict_with_boxes_and_skeleton(crop, boxes, out, capsys):
     words = ["--skeleton", "waymo14", "--sensor-origin", "-1.5,0,2"]
     assert run("predict", crop, "--boxes", boxes, "--out", out, *words) == 0
     (person,) = json.loads((out / "crop.poses.json").read_text())["people"]
     assert person["id"] == "a" and len(person["joints"]) == 14
-    assert "1 of 1 people" in capsys.readouterr().err
+    assert "1 of 1 person" in capsys.readouterr().err
 
 
-def test_people_without_a_pose_are_no_error_and_share_a_warning_line(crop, tmp_path, out, capsys):
+def test_predict_combines_warnings_of_people_without_pose(crop, tmp_path, out, capsys):
     assert run("predict", write(tmp_path / "a.xyz", "0 0 0\n0 0 1\n"), "--out", out) == 0
     assert "person 0: no pose: under 5 points" in capsys.readouterr().err
     empty = [{"center": [90 + i, 0, 0], "size": [1, 1, 1], "id": f"p{i}"} for i in range(5)]
@@ -175,7 +175,7 @@ def test_people_without_a_pose_are_no_error_and_share_a_warning_line(crop, tmp_p
     assert [person["joints"] for person in people] == [None] * 5 and people[0]["warnings"]
 
 
-def test_info_is_short_long_or_json(capsys):
+def test_info_prints_short_verbose_and_json(capsys):
     printed = {}
     for flag in ("", "-v", "--json"):
         assert run("info", *flag.split()) == 0
@@ -199,7 +199,7 @@ def test_info_is_short_long_or_json(capsys):
     assert f"default --min-score {detector['default_score']:.2f}, calibrated on {counts}\n" in printed[""]
 
 
-def test_info_counts_the_people_of_all_runs(monkeypatch, capsys):
+def test_info_sums_people_of_all_runs(monkeypatch, capsys):
     before = {"people_seen": 1_000, "hours": 1.25}
     header = SimpleNamespace(card={"people_seen": 500, "hours": 0.5, "init_card": before})
     monkeypatch.setattr("lidarpose.models.checkpoint.read_header", lambda path: header)
@@ -208,7 +208,7 @@ def test_info_counts_the_people_of_all_runs(monkeypatch, capsys):
 
 
 @pytest.mark.long
-def test_backends_decoders_and_tta(crop, capsys):
+def test_predict_selects_backend_decoder_and_tta(crop, capsys):
     results = {}
     for words in ("", "--backend onnx", "--backend torch", "--decode argmax", "--decode dark", "--tta 2"):
         assert run("predict", crop, "--out", "-", *words.split()) == 0
@@ -231,8 +231,8 @@ def test_backends_decoders_and_tta(crop, capsys):
         (["runs/mine.safetensors", "--out", "deep/a.bin"], "mine", "onnx", "deep/a.bin"),
     ],
 )
-def test_export_names_its_file(tmp_path, monkeypatch, capsys, words, name, format, out):
-    # what it writes is tested elsewhere: making it takes long
+def test_export_chooses_output_file(tmp_path, monkeypatch, capsys, words, name, format, out):
+    # the content is tested elsewhere, because an export takes long
     def export(weights, out, *, format):
         called.append((Path(weights).stem, format, str(out)))
         Path(out).parent.mkdir(exist_ok=True)
@@ -246,7 +246,7 @@ def test_export_names_its_file(tmp_path, monkeypatch, capsys, words, name, forma
     assert f"{name}.safetensors -> {out} (1.50 MB)" in capsys.readouterr().err
 
 
-def test_released_weights_are_imported_and_predict(crop, tmp_path, monkeypatch, capsys):
+def test_predict_with_imported_released_weights(crop, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run("import", DAPT, "mine.safetensors") == 0
     assert "joints of waymo14 -> mine.safetensors" in capsys.readouterr().err
@@ -264,21 +264,21 @@ def test_released_weights_are_imported_and_predict(crop, tmp_path, monkeypatch, 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["crop.npy", "crop.poses.json", "mine.safetensors"]
 
 
-def test_a_calibration_of_boxes_may_lie_anywhere(crop, tmp_path, out, capsys):
+def test_predict_reads_kitti_calibration_from_calib_option(crop, tmp_path, out, capsys):
     label, calib = write(tmp_path / "label.txt", KITTI), write(tmp_path / "mine.txt", CALIBRATION)
     assert run("predict", crop, "--boxes", label, "--out", out) == 2
     assert "expected its calibration at" in one_line(capsys)
     assert run("predict", crop, "--boxes", label, "--calib", calib, "--out", out) == 0
     (person,) = json.loads((out / "crop.poses.json").read_text())["people"]
-    # 8.41 m ahead of the camera is so far along the LiDAR's x
+    # 8.41 m in front of the camera is 8.41 m along the LiDAR's x
     assert person["box"]["center"][0] == pytest.approx(8.41)
 
 
-# ---- what is wrong
+# ---- errors
 
 
-def test_what_is_read_is_never_written_over(crop, boxes, tmp_path, capsys):
-    """By whatever name: the boxes' own, a link's, a checkpoint's."""
+def test_commands_never_overwrite_input_files(crop, boxes, tmp_path, capsys):
+    """Given by the same path, by a link, or as a default name."""
     default = boxes.rename(tmp_path / "crop.poses.json")
     weights = tmp_path / "mine.safetensors"
     weights.write_bytes(bundled_path("tiny").read_bytes())
@@ -296,12 +296,12 @@ def test_what_is_read_is_never_written_over(crop, boxes, tmp_path, capsys):
         assert run(*words) == 2
         assert "is also an input file" in one_line(capsys)
         assert [path.read_bytes() for path in files] == before
-    # printed, the result harms nobody
+    # printing the result is allowed
     assert run("predict", crop, "--boxes", default, "--out", "-") == 0
 
 
 @pytest.mark.long
-def test_a_warning_of_a_file_is_a_line_without_our_source(crop, tmp_path, out):
+def test_warning_of_weights_file_is_one_line_without_source(crop, tmp_path, out):
     file = SafetensorsFile.open(bundled_path("tiny"))
     metadata = {name: text for name, text in file.metadata.items() if name != DIGEST}
     save_file(load_file(bundled_path("tiny")), tmp_path / "older.safetensors", metadata=metadata)
@@ -312,7 +312,7 @@ def test_a_warning_of_a_file_is_a_line_without_our_source(crop, tmp_path, out):
     assert subprocess.run([*command, "--quiet"], capture_output=True, text=True).stderr == ""
 
 
-def test_an_id_cannot_forge_a_line(crop, tmp_path, out, capsys):
+def test_warnings_escape_and_shorten_ids(crop, tmp_path, out, capsys):
     far = {"center": [500, 0, 0], "size": [1, 1, 1]}
     forged = write(
         tmp_path / "b.json", json.dumps([far | {"id": "a\nlidarpose: error: b \x1b[31m"}, far | {"id": "7" * 3000}])
@@ -323,7 +323,7 @@ def test_an_id_cannot_forge_a_line(crop, tmp_path, out, capsys):
     assert "\x1b" not in err and max(map(len, err.splitlines())) < 400
 
 
-def test_closed_outputs(crop, monkeypatch, capsys):
+def test_predict_with_closed_stderr_or_stdout(crop, monkeypatch, capsys):
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stderr", None)
         assert run("predict", crop, "--crop", "--out", "-") == 0
@@ -333,7 +333,7 @@ def test_closed_outputs(crop, monkeypatch, capsys):
     assert "standard output, which is closed" in capsys.readouterr().err
 
 
-def test_what_the_output_cannot_show_is_escaped(monkeypatch):
+def test_output_escapes_characters_missing_in_encoding(monkeypatch):
     written = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(written, encoding="cp932"))
     monkeypatch.setattr(contact_sheet, "draw_dataset", lambda *args, **more: Path(os.fsdecode(b"caf\xe9 \xc2\xb7.png")))
@@ -341,7 +341,7 @@ def test_what_the_output_cannot_show_is_escaped(monkeypatch):
     assert written.getvalue().split() == [rb"caf\udce9", rb"\xb7.png"]
 
 
-def test_a_full_memory_is_one_line(monkeypatch, capsys):
+def test_out_of_memory_is_one_line(monkeypatch, capsys):
     # more than any machine has
     monkeypatch.setattr(contact_sheet, "draw_dataset", lambda *args, **more: np.empty(2**60, np.uint8))
     assert run("view", "streetlife") == 2
@@ -349,7 +349,7 @@ def test_a_full_memory_is_one_line(monkeypatch, capsys):
 
 
 @pytest.mark.filterwarnings("error")
-def test_map_coordinates_in_32_bits_are_named(crop, points, tmp_path, out, capsys):
+def test_predict_warns_of_rounded_map_coordinates(crop, points, tmp_path, out, capsys):
     far = points + [500_000.0, 4_676_500.0, 0.0]
     for name, dtype, is_warned in (("narrow", np.float32, True), ("wide", np.float64, False)):
         np.save(tmp_path / f"{name}.npy", far.astype(dtype))
@@ -358,19 +358,19 @@ def test_map_coordinates_in_32_bits_are_named(crop, points, tmp_path, out, capsy
 
 
 @pytest.mark.parametrize("scale, words", [(1e30, ""), (1e30, "--crop"), (1.7e308, "--boxes"), (1.7e308, "")])
-def test_absurd_coordinates_are_one_line(crop, points, boxes, tmp_path, out, capsys, scale, words):
+def test_predict_rejects_or_drops_absurd_coordinates(crop, points, boxes, tmp_path, out, capsys, scale, words):
     flags = [words, boxes] if words == "--boxes" else words.split()
     np.save(tmp_path / "far.npy", np.resize([scale, -scale], (10, 3)))
     assert run("predict", tmp_path / "far.npy", *flags, "--out", out) == 2
     line = one_line(capsys)
     assert "expected points in meters, got none within 1e+09 m" in line and len(line) < 300
-    # among good ones they are dropped
+    # among valid points they are dropped
     np.save(tmp_path / "some.npy", np.concatenate([points, np.full((3, 3), scale)]))
     assert run("predict", tmp_path / "some.npy", *flags, "--out", out) == 0
     assert f"dropped 3 of {len(points) + 3} points" in capsys.readouterr().err
 
 
-def test_json_that_is_nothing_but_brackets_is_one_line(tmp_path, capsys):
+def test_deeply_nested_json_is_one_line(tmp_path, capsys):
     deep = "[" * 100_000
     folder = tmp_path / "run"
     folder.mkdir()
@@ -382,7 +382,7 @@ def test_json_that_is_nothing_but_brackets_is_one_line(tmp_path, capsys):
     assert "its header cannot be read" in one_line(capsys)
 
 
-# ---- what is wrong with a command or a file: (command, words of the error)
+# ---- invalid commands and files: (command, words of the error)
 
 BAD_FILES = {
     "a.pcap": b"abcd",
@@ -431,7 +431,7 @@ BAD_COMMANDS = {
     "export how": ("export --format tflite --out DIR/x", "known are onnx, torch"),
     "export nothing": ("export no/such.safetensors --out DIR/x.onnx", "does not exist"),
     "import nothing": ("import no/such.safetensors DIR/x.safetensors", "does not exist"),
-    "import a pickle": ("import weights.pth DIR/x.safetensors", "got a pickle"),
+    "import a missing pickle": ("import weights.pth DIR/x.safetensors", "does not exist"),
     "import as": ("import DAPT DIR/x.safetensors --config kitti", "waymo"),
     "import into another kind": ("import DAPT DIR/x.onnx", "give a name that ends in .safetensors"),
     "import without an out": ("import DAPT", "OUT"),
@@ -465,7 +465,7 @@ BAD_COMMANDS = {
 
 
 @pytest.mark.parametrize("case", BAD_COMMANDS)
-def test_a_bad_command_is_one_line(crop, boxes, tmp_path, capsys, monkeypatch, case):
+def test_invalid_commands_are_one_line(crop, boxes, tmp_path, capsys, monkeypatch, case):
     words, expected = BAD_COMMANDS[case]
     monkeypatch.chdir(tmp_path)
     files = [write(tmp_path / name, content) for name, content in BAD_FILES.items() if f"DIR/{name}" in words]
@@ -478,17 +478,17 @@ def test_a_bad_command_is_one_line(crop, boxes, tmp_path, capsys, monkeypatch, c
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_an_output_that_cannot_be_written_is_told_before_the_work(crop, out, monkeypatch, capsys):
+def test_predict_checks_output_before_predicting(crop, out, monkeypatch, capsys):
     monkeypatch.setattr(predictor.Predictor, "predict", lambda *_, **__: pytest.fail("predicted first"))
     (out / "crop.poses.png").mkdir(parents=True)
     for folder, words in ((crop / "deep", "cannot write"), (out, "crop.poses.png")):
         assert run("predict", crop, "--out", folder, "--picture") == 2
         assert words in one_line(capsys)
-    # no JSON without its picture
+    # no JSON is written without its picture
     assert [path.name for path in out.iterdir()] == ["crop.poses.png"]
 
 
-def test_a_demo_that_is_killed_leaves_nothing(out, monkeypatch, capsys):
+def test_failed_demo_leaves_no_files(out, monkeypatch, capsys):
     there = []
 
     def load(*_, **__):
@@ -506,8 +506,8 @@ def printing(crop):
     return f"import sys; from lidarpose.cli import main; sys.exit(main(['predict', {str(crop)!r}, '--out', '-']))"
 
 
-def test_a_reader_that_has_enough_is_no_error(crop):
-    # buffered, so that the pipe is found broken only at the last moment
+def test_closed_pipe_is_no_error(crop):
+    # buffered, so that the broken pipe is noticed only at exit
     settings = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "env": {**os.environ, "PYTHONUNBUFFERED": ""}}
     child = subprocess.Popen([sys.executable, "-c", printing(crop)], text=True, **settings)
     child.stdout.close()
@@ -517,26 +517,26 @@ def test_a_reader_that_has_enough_is_no_error(crop):
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no full device here")
-def test_a_full_output_is_one_line(crop):
+def test_full_output_device_is_one_line(crop):
     with open("/dev/full", "w") as full:
         done = subprocess.run([sys.executable, "-c", printing(crop)], stdout=full, stderr=subprocess.PIPE, text=True)
     assert done.returncode == 2 and "error: cannot write the output (No space left on device)" in done.stderr
     assert "Traceback" not in done.stderr
 
 
-def test_python_m_is_the_same_program():
+def test_python_m_lidarpose_runs_command_line():
     done = subprocess.run([sys.executable, "-m", "lidarpose", "predict", "no.pcd"], capture_output=True, text=True)
     assert done.returncode == 2 and done.stderr.count("\n") == 1
 
 
-def test_demo(out, capsys):
+def test_demo_writes_pictures_and_prints_table(out, capsys):
     assert run("demo", "--out", out) == 0
     assert sorted(path.name for path in out.iterdir()) == ["hdl-64e.png", "index.html", "os1-128.png", "vlp-32c.png"]
     lines = capsys.readouterr().out.splitlines()
     head = next(i for i, line in enumerate(lines) if line.startswith("LiDAR"))
-    for word in ("points", "distance", "MPJPE", "ms per person"):
+    for word in ("points", "distance", "MPJPE"):
         assert word in lines[head]
-    assert len(lines) == head + 1 + 12 + 1
+    assert len(lines) == head + 1 + 12 + 2 and lines[head + 13].endswith("ms per person")
 
 
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
@@ -547,7 +547,7 @@ def test_examples_run(example, tmp_path, monkeypatch, capsys):
     assert "wrote" in capsys.readouterr().out
 
 
-def test_the_notebook_runs_and_holds_no_output(tmp_path, monkeypatch, capsys):
+def test_notebook_runs_and_contains_no_output(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     notebook = json.loads((EXAMPLES[0].parent / "03_notebook.ipynb").read_text("utf-8"))
     cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
@@ -562,7 +562,7 @@ def test_the_notebook_runs_and_holds_no_output(tmp_path, monkeypatch, capsys):
 # ---- help and quiet
 
 
-def test_a_command_is_what_its_text_says():
+def test_add_command_parses_text_of_command():
     from lidarpose.cli.terminal import add_command, option_names
 
     text = """
@@ -611,7 +611,7 @@ def test_help_and_version(capsys):
         assert "()" not in text and " V\n" not in text and "--quiet" in text
 
 
-def test_without_a_terminal_lines_say_how_far_the_prediction_is(crop, tmp_path, monkeypatch, capsys):
+def test_predict_prints_progress_lines_without_terminal(crop, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(progress, "LINE_EVERY", 0.001)
     words = ("predict", crop, "--crop", "--out", tmp_path / "a.json")
     assert run(*words) == 0 and "of 1 clouds" in capsys.readouterr().err
@@ -625,9 +625,9 @@ def test_quiet_prints_errors_only(crop, tmp_path, capsys):
     assert captured.err == captured.out == "" and (tmp_path / "a.json").is_file()
     assert run("predict", "--quiet", tmp_path / "no.npy") == 2
     assert "no.npy" in capsys.readouterr().err
-    # and does not outlast its command
+    # the option affects only its own command
     assert run(*words) == 0
-    assert "1 of 1 people" in capsys.readouterr().err
+    assert "1 of 1 person" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -638,14 +638,27 @@ def test_quiet_prints_errors_only(crop, tmp_path, capsys):
         ("detect a.pcd --picture", "unrecognized arguments: --picture; see lidarpose detect --help"),
     ],
 )
-def test_a_wrong_word_names_the_help_that_says_more(words, problem, capsys):
+def test_usage_errors_refer_to_help(words, problem, capsys):
     with pytest.raises(SystemExit) as ended:
         main(words.split())
     assert ended.value.code == 2 and problem in capsys.readouterr().err
 
 
 @pytest.mark.filterwarnings("error")
-def test_a_stray_point_does_not_round_the_others(crop, points, tmp_path, out, capsys):
+def test_stray_point_causes_no_rounding_warning(crop, points, tmp_path, out, capsys):
     np.save(tmp_path / "stray.npy", np.concatenate([points, [[5e6, 0, 0]]]).astype(np.float32))
     assert run("predict", tmp_path / "stray.npy", "--crop", "--out", out) == 0
     assert "rounded" not in capsys.readouterr().err
+
+
+def test_import_rejects_pickle(tmp_path, capsys):
+    path = tmp_path / "weights.pth"
+    path.write_bytes(b"\x80\x04.")
+    assert main(["import", str(path), str(tmp_path / "x.safetensors")]) == 2
+    assert "got a pickle, which can run programs" in capsys.readouterr().err
+
+
+def test_advice_after_empty_detection_unless_explained():
+    assert "a lower --min-score finds more" in predicting._none_found(" -> x.json", ["dropped 3 points"])
+    explained = predicting._none_found(" -> x.json", ["no people found with up z, but 4 people with up y: try up y"])
+    assert explained == "no people found -> x.json"

@@ -1,4 +1,4 @@
-"""What networks of clips read: rotations, the clouds about a person, and windows of frames that follow each other."""
+"""Data of clip networks: rotations, clouds around a person, and windows of consecutive frames."""
 
 import dataset_files as files
 import numpy as np
@@ -26,20 +26,22 @@ def clip():
     return [person.sample for person in Generator(scene="wild", measure=False).clip(5, 2)]
 
 
-def test_rotations_of_half_a_turn_come_back():
+def test_rotation_vector_round_trip_near_half_turn():
     axis = np.random.default_rng(0).normal(size=(200, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     angle = np.concatenate([np.pi - np.geomspace(1e-9, 0.1, 199), [np.pi]])
     R = axis_angle_to_matrix(axis * angle[:, None])
     np.testing.assert_allclose(axis_angle_to_matrix(rotation_vector(R)), R, atol=2e-6)
+    # in single precision, too
+    np.testing.assert_allclose(axis_angle_to_matrix(rotation_vector(R.astype(np.float32))), R, atol=1e-3)
     assert np.abs(rotation_vector(np.eye(3))).max() == 0
 
 
 # ---- synthesized clips
 
 
-def test_synthesized_rotations_move_the_joints(clip):
-    """In its parent's frame a bone is the same in all frames, and SMPL's: left is +x, up is +y."""
+def test_synthesized_rotations_agree_with_joints(clip):
+    """A bone is constant in the frame of its parent, in SMPL's axes: +x is left, +y is up."""
     joints = np.stack([sample.pose.joints[:24] for sample in clip]).astype(float)
     rotations = axis_angle_to_matrix(np.stack([sample.rotations for sample in clip]))
     world, _ = forward_kinematics(SMPL24.parents, np.zeros((1, 24, 3)), rotations, joints[:, 0])
@@ -56,7 +58,7 @@ def _extent(points):
     return np.arctan2(points[:, 1], points[:, 0]), np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
 
 
-def test_synthesized_clouds_are_about_the_person_and_not_of_them(clip):
+def test_synthesized_clouds_are_around_person(clip):
     for sample in clip:
         assert len(sample.background) > 20
         for name in ("background", "neighbors"):
@@ -66,12 +68,12 @@ def test_synthesized_clouds_are_about_the_person_and_not_of_them(clip):
                 for own, other in zip(_extent(sample.points), _extent(cloud), strict=True):
                     assert other.min() > own.min() - 1.01 * MARGIN and other.max() < own.max() + 1.01 * MARGIN
         assert not sample.box.contains(sample.neighbors, -1e-3).any()
-    # the sensor stands still, so a map's points are where they were, but for the window
+    # the sensor does not move, so points of the map stay in place, except for the window
     distances = np.linalg.norm(clip[0].background[:, None] - clip[1].background, axis=-1).min(1)
     assert np.median(distances) < 0.1
 
 
-def test_a_person_alone_is_as_before_and_has_no_clip():
+def test_single_person_has_no_clip_data():
     sample = Generator(scene="wild", measure=False).person(5, 2).sample
     assert all(getattr(sample, name) is None for name in NAMES)
 
@@ -79,7 +81,7 @@ def test_a_person_alone_is_as_before_and_has_no_clip():
 # ---- columns
 
 
-def test_columns_come_back_and_older_shards_stay_readable(clip, tmp_path):
+def test_clip_columns_round_trip_and_are_optional(clip, tmp_path):
     path = tmp_path / "people-00000.parquet"
     write_shard(path, "people", [person_row(sample, index=0, frame=k) for k, sample in enumerate(clip)])
     for row, sample in zip(read_rows(path, "people"), clip, strict=True):
@@ -91,7 +93,7 @@ def test_columns_come_back_and_older_shards_stay_readable(clip, tmp_path):
     assert len(older) == len(clip) and older[0].rotations is older[0].neighbors is None
 
 
-def test_rows_with_damaged_columns_are_refused(clip):
+def test_sample_of_rejects_damaged_clip_columns(clip):
     flat = {
         name: np.ravel(value) if np.ndim(value) == 2 else value for name, value in person_row(clip[0], index=0).items()
     }
@@ -106,7 +108,7 @@ def test_rows_with_damaged_columns_are_refused(clip):
 
 
 @pytest.mark.parametrize("name", ["lidarhuman26m", "sloper4d"])
-def test_readers_give_rotations_in_the_sensor_s_frame(name, tmp_path, smpl):
+def test_readers_give_rotations_in_sensor_frame(name, tmp_path, smpl):
     mounted = {"R_sensor_level": axis_angle_to_matrix([0.0, 0.5, 0.0])} if name == "lidarhuman26m" else {}
     writer = getattr(files, f"write_{name}")
     writer(tmp_path, smpl, **({"frames": 120} | mounted if mounted else {}))
@@ -115,7 +117,7 @@ def test_readers_give_rotations_in_the_sensor_s_frame(name, tmp_path, smpl):
         items = [item for item in source.read(tmp_path, part) if isinstance(item, LabeledSample)]
         rotations = axis_angle_to_matrix(np.stack([item.rotations for item in items]))
         joints = np.stack([item.joints for item in items]).astype(float)
-        # bones as they are at rest; the shape is one person's
+        # bones are constant in the frames of their parents, because the shape is that of one person
         world, _ = forward_kinematics(SMPL24.parents, np.zeros((1, 24, 3)), rotations, joints[:, 0])
         parents = np.array(SMPL24.parents[1:])
         bones = np.einsum("fjba,fjb->fja", world[:, parents], joints[:, 1:] - joints[:, parents])
@@ -124,14 +126,14 @@ def test_readers_give_rotations_in_the_sensor_s_frame(name, tmp_path, smpl):
         assert items[0].background is None and items[0].neighbors is None
 
 
-def test_lidarhuman26m_s_scans_give_background_and_neighbors(tmp_path, smpl):
+def test_lidarhuman26m_scans_give_background_and_neighbors(tmp_path, smpl):
     files.write_lidarhuman26m(tmp_path, smpl, sequences=("7",), frames=6)
     rng = np.random.default_rng(0)
     source = reader("lidarhuman26m", smpl)
     people = [item.points for item in source.read(tmp_path, "7")]
     wall = np.stack([np.full(4000, 25.0), rng.uniform(0, 12, 4000), rng.uniform(-2, 4, 4000)], 1)
     for f, person in enumerate(people):
-        # somebody else walks before the wall
+        # another person walks in front of the wall
         passer = person[:50] * 0.8 + [0.0, 0.2 * f - 0.4, 0.0]
         files.write_pcd(tmp_path / f"pointclouds/7/{f + 1:06d}.pcd", np.concatenate([person, wall, passer]))
     (tmp_path / "pointclouds/7/000006.pcd").write_bytes(b"cut off")
@@ -143,7 +145,7 @@ def test_lidarhuman26m_s_scans_give_background_and_neighbors(tmp_path, smpl):
         assert np.linalg.norm(item.neighbors[:, None] - item.points, axis=-1).min() > 0
 
 
-def test_sloper4d_s_scans_are_found_by_their_time(tmp_path, smpl):
+def test_sloper4d_scans_are_found_by_time(tmp_path, smpl):
     content, _ = files.sloper4d_labels(smpl, "seq001", without=())
     folder = tmp_path / "seq001"
     folder.mkdir()
@@ -157,14 +159,14 @@ def test_sloper4d_s_scans_are_found_by_their_time(tmp_path, smpl):
     items = [item for item in reader("sloper4d", smpl).read(tmp_path, "seq001") if isinstance(item, LabeledSample)]
     assert [item.background is None for item in items] == [False] * 3 + [True]
     for item in items[:3]:
-        # the ground below the sensor, which stands 3.7 m up
+        # the ground at z = 1.95 m, the sensor at z = 3.7 m
         assert len(item.background) > 20 and np.abs(item.background[:, 2] + 1.75).max() < 0.06
 
 
-# ---- the clouds about a person
+# ---- clouds around a person
 
 
-def test_a_window_goes_round_the_back_and_takes_at_most_512():
+def test_window_points_wraps_around_back_and_limits_count():
     person = np.array([[-5.0, 0.3, 0.0], [-5.0, -0.3, 1.0]])
     inside, outside = [-9.0, 0.0, 0.5], [[9.0, 0.0, 0.5], [-9.0, 2.0, 0.5], [-9.0, 0.0, 3.0]]
     assert window_points(np.array([inside, *outside]), person).tolist() == [inside]
@@ -174,21 +176,21 @@ def test_a_window_goes_round_the_back_and_takes_at_most_512():
     assert len(window_points(many, np.zeros((0, 3)))) == len(window_points(np.zeros((0, 3)), person)) == 0
 
 
-def test_a_map_holds_what_three_scans_hold_without_the_person():
+def test_static_points_need_three_scans_and_exclude_person():
     rng = np.random.default_rng(1)
     still = rng.uniform(-20, 20, (500, 3))
     scans = [np.concatenate([still, rng.uniform(50, 60, (100, 3)) + 100 * k]) for k in range(3)]
     static = static_points(scans)
     assert len(static) > 450 and np.abs(static).max() < 21
     assert len(static_points(scans[:2])) == len(static_points([])) == 0
-    # written as float32
+    # coordinates may be rounded to float32
     assert len(without_person(np.concatenate([still, still[:7] + 30]), still.astype(np.float32).astype(float))) == 7
 
 
 # ---- windows
 
 
-def test_runs_end_at_gaps_and_belong_to_one_track():
+def test_consecutive_splits_at_gaps_and_tracks():
     tracks = ["a", "b"] * 6
     frames = [5, 7, 10, 8, 15, 9, 20, 10, 45, 11, 50, 30]
     runs = [run.tolist() for run in consecutive(tracks, frames)]
@@ -199,7 +201,7 @@ def test_runs_end_at_gaps_and_belong_to_one_track():
 
 
 @pytest.mark.parametrize("count", [16, 17, 31, 32, 1])
-def test_windows_do_not_overlap_and_the_last_frame_fills_the_last(count):
+def test_clip_windows_repeat_last_frame_at_end(count):
     rows = 100 + np.arange(count)
     clips = clip_windows(rows)
     assert clips.shape == (-(-count // CLIP_FRAMES), CLIP_FRAMES)

@@ -1,4 +1,4 @@
-"""LiDARCap and NE from clips to scores: what they read of a frame, windows, losses, runs, predictions."""
+"""LiDARCap and NE: inputs, clips, losses, training, predictions, evaluation."""
 
 import json
 from dataclasses import replace
@@ -45,7 +45,7 @@ from lidarpose.train.torch_dataset import InMemoryDataset
 from lidarpose.train.validation import draw_examples, update_batch_norms, validate
 
 CONFIGS = {"lidarcap": LidarcapConfig(width_divisor=4), "ne": NeConfig(width_divisor=4)}
-# points of a cloud, that tests take seconds
+# points per cloud, few to keep tests fast
 FEW = 24
 
 
@@ -62,7 +62,7 @@ def clips():
 
 
 def write_clips(folder, clips, gap=0):
-    """gap: frames that are missing after the 20th."""
+    """gap: number of frames missing after the 20th."""
     folder.mkdir()
     settings = {"what": "clips", "seed": 3, "scene": "paper"}
     write_card(folder, DatasetCard(settings=settings, count=len(clips), per_shard=10, tables=("people",)))
@@ -85,10 +85,10 @@ def predictor(request):
     return Predictor(ClipBackend(build(config), Header(config=config, card={})), name=request.param)
 
 
-# ---- what is read of a frame
+# ---- inputs of a frame
 
 
-def test_all_points_once_and_masked():
+def test_pad_frames_gives_points_once_and_mask():
     rng = np.random.default_rng(0)
     clouds = [rng.normal(0, 0.5, (n, 3)) for n in (5, 0, 700)]
     points, valid = pad_frames(clouds, LidarcapConfig(), [1, 2, 3])
@@ -104,12 +104,12 @@ def test_all_points_once_and_masked():
     assert pad_frames([far], LidarcapConfig(), [0], window=2.0)[1].sum() == 1
 
 
-def test_512_points_as_published():
+def test_pad_frames_with_replacement_resamples_as_published():
     rng = np.random.default_rng(0)
     cloud = rng.normal(size=(200, 3)).astype(np.float32)
     published = LidarcapConfig(resample_with_replacement=True)
     points, valid = pad_frames([cloud], published, [0])
-    # each twice, and the first 56 twice more
+    # each point twice, and the first 56 two more times
     expected = np.concatenate([np.repeat(cloud, 2, axis=0), np.repeat(cloud[:56], 2, axis=0)])
     assert valid.all() and (points[0] == expected).all()
     assert (pad_frames([cloud[:1]], published, [0])[0] == cloud[0]).all()
@@ -122,7 +122,7 @@ def test_512_points_as_published():
 # ---- clips of datasets
 
 
-def test_what_makes_no_clip_is_counted_by_its_reason(clips, tmp_path):
+def test_dataset_clips_counts_skipped_frames_by_reason(clips, tmp_path):
     without = [replace(sample, rotations=None) for sample in clips[1][:3]]
     longer = [*clips[0], *clips[1][:4]]
     dataset = InMemoryDataset.load([write_clips(tmp_path / "d", [longer, clips[1][:7], without])])
@@ -133,7 +133,7 @@ def test_what_makes_no_clip_is_counted_by_its_reason(clips, tmp_path):
     assert source.frames == CLIP_FRAMES and sum("left out" in warning for warning in source.warnings) == 2
 
 
-def test_an_example_is_about_each_frame_s_center(clips):
+def test_clip_example_is_centered_per_frame(clips):
     rng = np.random.default_rng(0)
     for trans_center, refined in ((False, 0.0), (False, 1.0), (True, 1.0)):
         example = clip_example(clips[0], rng, trans_center=trans_center, refined=refined)
@@ -152,15 +152,15 @@ def test_an_example_is_about_each_frame_s_center(clips):
 # ---- losses
 
 
-def test_the_skeleton_at_rest_is_the_package_s_mean_adult():
+def test_rest_offsets_are_those_of_mean_adult():
     rest = mean_adult_joints() @ UP_AXES["y"]
     offsets = rest - rest[[max(parent, 0) for parent in SMPL24.parents]]
     np.testing.assert_allclose(rest_offsets(), offsets, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", CONFIGS)
-def test_losses_vanish_at_the_truth(name, clips):
-    """The first stage is about the frame's center: where the pelvis is, is learned."""
+def test_clip_losses_vanish_at_true_rotations(name, clips):
+    """Joints of the first stage are relative to the frame's center, so they include the position of the pelvis."""
     objective = ClipObjective(config=CONFIGS[name])
     arrays = objective.collate([clip_example(clip, np.random.default_rng(1)) for clip in clips])
     assert {f"{cloud}_valid" for cloud in objective.config.clouds} <= arrays.keys()
@@ -177,7 +177,7 @@ def test_losses_vanish_at_the_truth(name, clips):
 
     terms = objective.terms(Perfect(), arrays)
     assert float(total(terms)) < 1e-10
-    # the mean adult is not this person, but has the same pose
+    # the joints are those of the mean adult in the pose of the person
     assert 0 < float(terms["mpjpe"]) < 0.12
     joints = objective.joints(Perfect(), arrays)
     assert joints.shape == (2 * CLIP_FRAMES, 26, 3) and np.isnan(joints[:, 24:]).all()
@@ -190,7 +190,7 @@ def test_losses_vanish_at_the_truth(name, clips):
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", CONFIGS)
-def test_a_run_on_clips_is_evaluated_and_predicts(name, folder, clips, tmp_path, monkeypatch):
+def test_clip_network_trains_evaluates_and_predicts(name, folder, clips, tmp_path, monkeypatch):
     monkeypatch.setattr(setup, "VALIDATION", CLIP_FRAMES)
     few = {"batch": 32, "workers": 0, "pictures": 1}
     wanted = recipe(Pretrain, name, size=f"{name}-tiny", shards=(str(folder),), scene="paper", people=40, **few)
@@ -198,7 +198,7 @@ def test_a_run_on_clips_is_evaluated_and_predicts(name, folder, clips, tmp_path,
     assert recipe(Pretrain, "ne").batch == 8 * CLIP_FRAMES
     path = loop.train(wanted, tmp_path / "run", device="cpu", draw=draw_examples)
     log = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
-    # a clip counts 16 people: two steps of two clips
+    # a clip counts as 16 people: two steps of two clips
     assert log[-1]["people"] == 64 and {"rotation", "joints", "first", "mpjpe"} <= log[-1].keys()
     assert log[-1]["validation_mm"] > 0 and list((tmp_path / "run/pictures").glob("*.png"))
     result = evaluation.evaluate(path, folder)
@@ -208,7 +208,7 @@ def test_a_run_on_clips_is_evaluated_and_predicts(name, folder, clips, tmp_path,
     assert make_setup(tuned).people == 2 * CLIP_FRAMES
     went_on, before = make_setup(tuned).network().state_dict(), load(path).backend.network.state_dict()
     assert all(torch.equal(value, before[key]) for key, value in went_on.items())
-    # and by command, from random weights
+    # by commands, from random weights
     monkeypatch.chdir(tmp_path)
     words = ["--model", name, "--size", f"{name}-tiny", "--split", "all", "--epochs", "1", "--batch", "32"]
     assert not main(["finetune", str(folder), *words, "--workers", "0", "--pictures", "0", "--out", "tuned"])
@@ -220,8 +220,8 @@ def test_a_run_on_clips_is_evaluated_and_predicts(name, folder, clips, tmp_path,
     assert np.isfinite(person["joints"]).all() and len(person["joints"]) == len(SMPL24)
 
 
-def test_a_clip_turns_as_one_and_its_rotations_with_it(clips):
-    """Points, joints, surroundings and the pelvis turn by one angle; forward kinematics gives the joints as turned."""
+def test_clip_example_turn_rotates_clip_as_a_whole(clips):
+    """Points, joints, surroundings and root rotations turn by one angle; other rotations stay the same."""
     clip = clips[0]
     plain = clip_example(clip, np.random.default_rng(4), refined=0.0)
     turned = clip_example(clip, np.random.default_rng(4), refined=0.0, turn=True)
@@ -243,8 +243,8 @@ def test_a_clip_turns_as_one_and_its_rotations_with_it(clips):
     assert np.abs(again.frames[0].joints - turned.frames[0].joints).max() > 0.01
 
 
-def test_all_windows_of_an_epoch_may_begin_later(monkeypatch):
-    """As NE's do, but none leaves its run."""
+def test_clip_source_shifts_windows_by_epoch(monkeypatch):
+    """As published for NE, but windows stay within their run of frames."""
     monkeypatch.setattr(data_loader, "clip_example", lambda samples, *_, **__: samples)
     settings = {"dataset": SimpleNamespace(sample=lambda row: row), "seed": 3, "trans_center": False}
     run = np.arange(40)
@@ -258,12 +258,12 @@ def test_all_windows_of_an_epoch_may_begin_later(monkeypatch):
     assert starts == set(range(16))
     still = ClipSource(clips=clip_windows(run), **settings)
     assert sorted(still.example(k) for k in range(3)) == sorted(still.example(k) for k in range(3, 6))
-    # those to validate on do not move
+    # validation windows are not shifted
     assert [clip[0] for clip in shifted.validation_clips(3)] == [0, 16, 32]
 
 
-def test_the_rate_goes_by_the_losses_of_whole_epochs(folder, tmp_path):
-    """Of a run that went on, too: they are those of its log."""
+def test_plateau_schedule_uses_losses_of_whole_epochs(folder, tmp_path):
+    """A resumed run takes the losses from its log."""
     wanted = recipe(Finetune, "lidarcap", data=(str(folder),), split="all", size="lidarcap-tiny", batch=32, workers=0)
     assert wanted.schedule == "reduce-on-plateau"
     people = loop.BATCHES * wanted.batch
@@ -272,7 +272,7 @@ def test_the_rate_goes_by_the_losses_of_whole_epochs(folder, tmp_path):
     losses = [3.0, 1.0, 2.0, 2.0, 2.0, 2.0, 2.0]
     for k, loss in enumerate(losses):
         run.chunk, run._losses = k + 1, [*run._losses, (people * (k + 1), loss)]
-    # epochs of two chunks, the last one half over: 2, 2, 2
+    # epochs of two chunks, the last one incomplete: losses 2, 2, 2
     assert run.seen == 7 * people and run._plateau_factor() == pytest.approx(0.9)
     entries = [{"people": seen, "seconds": 1.0, "rotation": loss / 2, "first": loss / 2} for seen, loss in run._losses]
     (tmp_path / "log.jsonl").write_text("".join(json.dumps(entry | {"mpjpe": 9.0}) + "\n" for entry in entries))
@@ -282,7 +282,7 @@ def test_the_rate_goes_by_the_losses_of_whole_epochs(folder, tmp_path):
     assert again._losses == run._losses and again._plateau_factor() == run._plateau_factor()
 
 
-def test_settings_that_clips_cannot_have_are_refused(folder, tmp_path):
+def test_setup_rejects_settings_that_clip_networks_lack(folder, tmp_path):
     with refused("lidarcap learns from clips: .* by --shards"):
         make_setup(recipe(Pretrain, "lidarcap"))
     with refused("batch counts frames, and a clip has 16: give a multiple, got 24"):
@@ -301,15 +301,15 @@ def test_settings_that_clips_cannot_have_are_refused(folder, tmp_path):
         make_setup(recipe(Pretrain, "lidarcap", shards=(str(folder),), options=("grid=32",)))
 
 
-def test_people_alone_make_no_clips(tmp_path):
+def test_setup_rejects_shards_without_clips(tmp_path):
     people = [[Generator(scene="paper", measure=False).person(0, k).sample] for k in range(3)]
     with refused("needs 16 consecutive frames of a person with rotations, got none: 3 frames without rotations"):
         make_setup(recipe(Pretrain, "lidarcap", shards=(str(write_clips(tmp_path / "p", people)),)))
 
 
 @pytest.mark.long
-def test_raw_files_of_lidarhuman26m_become_a_score(tmp_path):
-    """By the published protocol: centered on trans, as the network was trained."""
+def test_lidarhuman26m_from_raw_files_to_scores(tmp_path):
+    """With the published protocol: centered on trans, as in training."""
     smpl = files.write_smpl(tmp_path / "SMPL_NEUTRAL.npz")
     files.write_lidarhuman26m(tmp_path / "raw", smpl, sequences=("5", "7"), frames=18)
     prepare("lidarhuman26m", tmp_path / "raw", tmp_path / "set", smpl=smpl)
@@ -317,7 +317,7 @@ def test_raw_files_of_lidarhuman26m_become_a_score(tmp_path):
         Finetune, "lidarcap", data=(str(tmp_path / "set"),), size="lidarcap", options=("trans_center",), batch=16
     )
     made = make_setup(wanted)
-    # sequence 5: two windows, the last filled
+    # sequence 5: two windows, the last one padded
     assert made.people == 200 * 2 * CLIP_FRAMES and made.objective.config.trans_center
     example = made.source.example(0)
     assert np.ptp([frame.joints[0] for frame in example.frames], axis=0).max() < 1e-4
@@ -332,10 +332,9 @@ def test_raw_files_of_lidarhuman26m_become_a_score(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("size", ["lidarcap-small", "ne-small"])
-def test_two_clips_are_learned_by_heart(size, monkeypatch):
-    """At the width for CPUs, by the rates of the paper's tables, without dropping anything, which is for other data.
-    Both people are nearly the mean adult, whose bones the networks answer with: 20.6 mm are left at the true
-    rotations."""
+def test_clip_networks_overfit_two_clips(size, monkeypatch):
+    """Narrow networks for CPUs, with the rates of the paper's tables and without dropout. The error at the true
+    rotations is 20.6 mm, because the networks use the bones of the mean adult."""
     monkeypatch.setattr(torch.nn.functional, "dropout", lambda x, *_: x)
     monkeypatch.setattr(ne, "drop_path", lambda branch, *_: branch)
     generator = Generator(scene="paper", measure=False)
@@ -362,8 +361,8 @@ def test_two_clips_are_learned_by_heart(size, monkeypatch):
 
 
 @pytest.mark.parametrize("stock", [False, True])
-def test_ne_begins_with_frames_told_apart(stock, clips):
-    """As published it has lost most of that before the first step, and loses the rest within a hundred."""
+def test_ne_initialization_keeps_frames_distinct(stock, clips):
+    """With the published initialization, frames are nearly equal before the first step."""
     config = replace(PRETRAINED["ne-small"][0], stock_initialization=stock)
     torch.manual_seed(0)
     network = build(config)
@@ -377,7 +376,7 @@ def test_ne_begins_with_frames_told_apart(stock, clips):
             )
         )
     arrays = objective.collate([clip_example(clip, np.random.default_rng(1)) for clip in clips])
-    # frames without neighbors, which are all zero to the encoder
+    # frames without neighbors, for which the encoder gets zeros
     arrays["neighbors"] = np.zeros_like(arrays["neighbors"])
     total(objective.terms(network.train(), arrays)).backward()
     gradient = torch.nn.utils.get_total_norm([value.grad for value in network.parameters() if value.grad is not None])
@@ -393,7 +392,7 @@ def _joints(poses):
     return np.stack([person.joints for person in poses])
 
 
-def test_a_person_alone_is_a_clip_of_equal_frames(predictor, clips):
+def test_predict_single_cloud_equals_clip_of_equal_frames(predictor, clips):
     clouds = [sample.points for sample in clips[0][:3]]
     alone = predictor.predict(clouds)
     equal = predictor.predict([clouds[1]] * CLIP_FRAMES, clips=Clips.of_run(CLIP_FRAMES))
@@ -401,7 +400,7 @@ def test_a_person_alone_is_a_clip_of_equal_frames(predictor, clips):
     assert alone[1].skeleton == SMPL24
 
 
-def test_frames_of_a_clip_know_of_each_other_and_of_their_order(predictor, clips):
+def test_predict_clip_depends_on_other_frames_and_their_order(predictor, clips):
     clouds = [sample.points for sample in clips[0]]
     around = {name: [getattr(sample, name) for sample in clips[0]] for name in CLOUDS[1:]}
     joints = _joints(predictor.predict(clouds, clips=Clips.of_run(CLIP_FRAMES, **around)))
@@ -410,12 +409,12 @@ def test_frames_of_a_clip_know_of_each_other_and_of_their_order(predictor, clips
     alone = _joints(predictor.predict(clouds))
     assert np.abs(joints - alone).max() > 1e-3
     assert np.abs(joints - turned[::-1]).max() > 1e-3
-    # only NE reads what stands about the person
+    # only NE uses background and neighbors
     bare = _joints(predictor.predict(clouds, clips=Clips.of_run(CLIP_FRAMES)))
     assert (np.abs(bare - joints).max() > 1e-5) == (predictor.model["name"] == "ne")
 
 
-def test_frames_that_show_nothing_have_no_pose_and_harm_no_other(predictor, clips):
+def test_predict_clip_gives_no_pose_for_empty_frames(predictor, clips):
     clouds = [sample.points for sample in clips[0]]
     clouds[4], clouds[15] = clouds[4][:2], clouds[15][:0]
     poses = predictor.predict(clouds, clips=Clips.of_run(CLIP_FRAMES))
@@ -437,23 +436,23 @@ def test_frames_that_show_nothing_have_no_pose_and_harm_no_other(predictor, clip
         (Clips.of_run(4, neighbors=[np.zeros((5, 2))] * 4), r"neighbors\[0\] must be \(n, 3\)"),
     ],
 )
-def test_clips_that_do_not_fit_the_clouds_are_refused(predictor, clips, told):
+def test_predict_rejects_clips_that_do_not_match_clouds(predictor, clips, told):
     with refused(told):
         predictor.predict([np.random.default_rng(k).normal(0, 0.3, (20, 3)) for k in range(4)], clips=clips)
 
 
 @pytest.mark.parametrize("given", [{"boxes": []}, {"find": True}])
-def test_clips_are_of_clouds_without_boxes(predictor, given):
+def test_predict_rejects_clips_with_boxes_or_find(predictor, given):
     with refused("omit clips with boxes or find"):
         predictor.predict(np.zeros((20, 3)), clips=Clips.of_run(1), **given)
 
 
-def test_networks_of_single_frames_take_no_clips():
+def test_single_frame_network_rejects_clips():
     with refused("reads single frames"):
         load("tiny").predict([np.zeros((10, 3))] * CLIP_FRAMES, clips=Clips.of_run(CLIP_FRAMES))
 
 
-def test_evaluation_shows_true_windows(predictor, folder, clips):
+def test_evaluation_predicts_true_windows(predictor, folder, clips):
     result = evaluation.run(predictor, [folder]).evaluations[0]
     by_clip = []
     for clip in clips:
@@ -467,8 +466,8 @@ def test_evaluation_shows_true_windows(predictor, folder, clips):
 
 
 @pytest.mark.long
-def test_people_who_are_drawn_from_clips_stand_alone(predictor, folder, clips, monkeypatch):
-    """Frames that lie apart are no window, however evenly they are spread; a study of stability draws, too."""
+def test_evaluation_with_limit_predicts_frames_alone(predictor, folder, clips, monkeypatch):
+    """Frames that are not consecutive form no window, even if evenly spaced. The same holds for the stability study."""
     result = evaluation.run(predictor, [folder], limit=8).evaluations[0].predictions
     samples = [sample for clip in clips for sample in clip]
     assert len(result.row) == 8
@@ -490,8 +489,8 @@ def test_people_who_are_drawn_from_clips_stand_alone(predictor, folder, clips, m
 
 
 @pytest.mark.parametrize("gap", [0, 5])
-def test_evaluation_in_parts_shows_the_same_windows(gap, clips, tmp_path, monkeypatch):
-    """A run of 40 frames, or one of 20 and one of 20 after a gap, then another person, in parts of at least 10."""
+def test_evaluation_in_chunks_predicts_same_windows(gap, clips, tmp_path, monkeypatch):
+    """One run of 40 frames, or two of 20 with a gap, then another person, in chunks of at least 10 frames."""
     samples = [*clips[0], *clips[1], *clips[0][:8]]
     folder = write_clips(tmp_path / "long", [samples, clips[1]], gap=gap)
     torch.manual_seed(0)

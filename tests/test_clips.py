@@ -18,7 +18,7 @@ from lidarpose.skeleton import SMPL24
 
 
 def a_motion(lengths=(8, 1, 13), fps=20.0, seed=0):
-    """Clips in which every bone turns evenly about an axis of its own and the pelvis goes straight."""
+    """Clips in which each bone rotates at a constant rate about its own axis and the pelvis moves straight."""
     rng = np.random.default_rng(seed)
     rotations, translation = [np.zeros((0, 24, 3, 3))], [np.zeros((0, 3))]
     for n in lengths:
@@ -33,7 +33,7 @@ def a_motion(lengths=(8, 1, 13), fps=20.0, seed=0):
 
 
 def still(n=1, **turns):
-    """The rest pose n times, with named joints turned."""
+    """The rest pose n times, with named joints rotated."""
     rotations = np.broadcast_to(np.eye(3), (n, 24, 3, 3)).copy()
     for joint, turn in turns.items():
         rotations[:, J[joint]] = turn
@@ -53,12 +53,12 @@ def stored(tmp_path, **changes):
 # clips files
 
 
-def test_clips_are_read(tmp_path):
+def test_load_clips_reads_clips(tmp_path):
     path, joints = stored(tmp_path)
     read_joints, names, length, fps = motion.load_clips(path)
     np.testing.assert_array_equal(read_joints, joints)
     assert names == ("002_01", "005_01", "002_02") and tuple(length) == (4, 2, 4) and fps == 10
-    # clips may lie apart and share frames
+    # clips may be in any order and share frames
     apart = motion.load_clips(stored(tmp_path, clip_start=np.array([5, 1, 5]))[0])[0]
     np.testing.assert_array_equal(apart, joints[[5, 6, 7, 8, 1, 2, 5, 6, 7, 8]])
 
@@ -80,7 +80,7 @@ def test_clips_are_read(tmp_path):
         ({"clip": np.array(["a", None, {}], dtype=object)}, "plain arrays"),
     ],
 )
-def test_a_wrong_clips_file_is_named(tmp_path, changes, message):
+def test_load_clips_rejects_invalid_files(tmp_path, changes, message):
     path, _ = stored(tmp_path, **changes)
     with pytest.raises(InputError, match=f"clips.npz: .*{message}"):
         motion.load_clips(path)
@@ -88,7 +88,7 @@ def test_a_wrong_clips_file_is_named(tmp_path, changes, message):
 
 @settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(at=st.integers(0, 2**20), bit=st.integers(0, 7), keep=st.integers(0, 2**20))
-def test_a_damaged_clips_file_is_read_or_refused(tmp_path, at, bit, keep):
+def test_load_clips_of_damaged_files_raises_only_input_error(tmp_path, at, bit, keep):
     path, _ = stored(tmp_path)
     data = bytearray(path.read_bytes())
     data[at % len(data)] ^= 1 << bit
@@ -100,8 +100,8 @@ def test_a_damaged_clips_file_is_read_or_refused(tmp_path, at, bit, keep):
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.int8, np.uint64, np.int32])
-def test_cuts_of_any_whole_numbers(tmp_path, kind):
-    """120 + 120 is -16 in a byte with a sign."""
+def test_load_clips_accepts_any_integer_dtype(tmp_path, kind):
+    """In int8, 120 + 120 overflows to -16."""
     clips = dict(clip=np.array(["a", "b"]), clip_start=np.array([0, 120], kind), clip_length=np.array([120] * 2, kind))
     joints = np.random.default_rng(0).normal(size=(240, 24, 3)).astype(np.float32)
     read_joints, _, length, _ = motion.load_clips(stored(tmp_path, joints=joints, **clips)[0])
@@ -114,8 +114,8 @@ def test_cuts_of_any_whole_numbers(tmp_path, kind):
 # motion
 
 
-def test_even_turns_stay_even_at_another_rate():
-    """The clips of `a_motion` at 20, 50 and 10 frames a second are the same curves."""
+def test_resampled_keeps_constant_rotation_rates():
+    """The clips of `a_motion` are the same curves at 20, 50 and 10 frames per second."""
     even = a_motion((9, 21))
     for hz, lengths in ((50.0, (21, 51)), (10.0, (5, 11)), (20.0, (9, 21))):
         other = even.resampled(hz)
@@ -138,7 +138,7 @@ def test_even_turns_stay_even_at_another_rate():
     frames=st.integers(1, 6),
     dt=st.integers(0, 50).map(lambda n: n / 100),
 )
-def test_cuts_stay_inside_their_clips(lengths, fps, hz, frames, dt):
+def test_resampled_windows_and_pairs_stay_inside_clips(lengths, fps, hz, frames, dt):
     drawn = a_motion(lengths, fps)
     lengths, other = drawn.length, drawn.resampled(hz)
     assert len(other.rotations) == other.length.sum() and (other.length >= (lengths > 0)).all()
@@ -153,8 +153,8 @@ def test_cuts_stay_inside_their_clips(lengths, fps, hz, frames, dt):
     np.testing.assert_allclose(heading(poses), 0, atol=1e-5)
 
 
-def test_pairs_are_what_happens_next():
-    """A person who turns and walks ahead: seen from the first pose, the second is turned and in front."""
+def test_pairs_give_pose_and_step_after_interval():
+    """A person turns and walks forward: relative to the first pose, the second is rotated and in front."""
     angle = np.linspace(0.5, 2.0, 31)
     way = np.cumsum(np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1) * 0.05, 0).astype(np.float32)
     rotations = still(31, pelvis=rotation_about("z", angle)).astype(np.float32)
@@ -174,8 +174,8 @@ def test_pairs_are_what_happens_next():
     assert (moved[:, -1, 0] > 0.5).all()
 
 
-def test_a_subject_whose_number_goes_on_is_another_one():
-    """CMU's subjects go from 01 to 144: who trains on 10 must not meet 102, who is kept for evaluation."""
+def test_motion_of_matches_whole_subject_names():
+    """CMU has subjects 01 to 144: training on 10 must not include 102, which is kept for evaluation."""
     names = ("1_01", "10_01", "102_03", "walk01", "02/02_01")
     clips = replace(a_motion([1] * 5), names=names)
     assert clips.of("10").names == ("10_01",) and clips.of("1").names == ("1_01",)
@@ -184,7 +184,7 @@ def test_a_subject_whose_number_goes_on_is_another_one():
         clips.of("0")
 
 
-def test_clips_are_chosen_and_joined():
+def test_motion_of_selects_clips_and_join_concatenates():
     a, b = a_motion((4, 2, 6), 20.0), a_motion((7,), 10.0, seed=1)
     chosen = a.of(("002", "000"))
     assert len(chosen) == 2 and chosen.names == ("000_01", "002_01") and tuple(chosen.start) == (0, 4)
@@ -206,7 +206,7 @@ def test_clips_are_chosen_and_joined():
         (lambda m: motion.Motion(**{**vars(m), "rotations": m.rotations * np.nan}), "finite"),
     ],
 )
-def test_what_is_wrong_with_a_motion_is_said(call, message):
+def test_motion_rejects_invalid_values(call, message):
     with pytest.raises(InputError, match=message):
         call(a_motion())
 
@@ -215,7 +215,7 @@ def test_what_is_wrong_with_a_motion_is_said(call, message):
 
 
 @pytest.mark.parametrize("yaw", [0.0, 2.5])
-def test_retargeting_own_poses_gives_them_back(yaw):
+def test_retarget_positions_recovers_own_poses(yaw):
     rotations = sampling.sample_rotations(np.random.default_rng(11), 1500).rotations
     rotations[:, 0] = rotation_about("z", yaw) @ rotations[:, 0]
     joints = joints_of(rotations)
@@ -227,7 +227,7 @@ def test_retargeting_own_poses_gives_them_back(yaw):
     np.testing.assert_allclose(heading(without_yaw(back)), 0, atol=1e-5)
 
 
-def test_retargeting_another_body_keeps_the_directions_of_its_limbs():
+def test_retarget_positions_keeps_limb_directions_of_other_body():
     rotations = sampling.sample_rotations(np.random.default_rng(12), 300).rotations
     rest = mean_adult_joints() * [1.0, 1.2, 0.8] * 0.9
     p = forward_kinematics(SMPL24.parents, rest[None], rotations, np.zeros((300, 3)))[1]
@@ -239,7 +239,7 @@ def test_retargeting_another_body_keeps_the_directions_of_its_limbs():
             np.testing.assert_allclose(cosine, 1, atol=1e-4)
 
 
-def test_straight_limbs_and_the_rest_pose():
+def test_retarget_positions_of_rest_pose_and_straight_limbs():
     straight = mean_adult_joints().copy()
     np.testing.assert_allclose(retarget.retarget_positions(straight[None]), still(), atol=0.04)
     for side, sign in (("left", 1), ("right", -1)):  # every limb exactly straight, feet along the shanks
@@ -253,8 +253,8 @@ def test_straight_limbs_and_the_rest_pose():
         assert np.trace(rotations[0, J[name]]) > 2.8, name
 
 
-def test_an_overstretched_knee_is_not_a_thigh_turned_over():
-    """A knee that is 15 degrees past straight bends by -15 degrees; the thigh keeps its direction."""
+def test_retarget_positions_of_overextended_knee():
+    """A knee that is 15 degrees past straight bends by -15 degrees, and the thigh is not rotated by half a turn."""
     over = rotation_about("y", np.radians(-15))
     joints = joints_of(still(left_knee=over, right_knee=over))
     back = retarget.retarget_positions(joints)
@@ -263,34 +263,34 @@ def test_an_overstretched_knee_is_not_a_thigh_turned_over():
 
 
 def arm(bend, twist):
-    """The rest pose with the left upper arm turned about itself by `twist` and the elbow bent by `bend` (n,)."""
+    """Joints of the rest pose, the left upper arm rotated about its axis by `twist`, the elbow bent by `bend` (n,)."""
     turns = dict(left_shoulder=rotation_about("y", twist), left_elbow=rotation_about("z", -bend))
     return joints_of(still(len(bend), **turns))
 
 
 def steps_of(rotations):
-    """Degrees between one frame's rotation and the next one's."""
+    """Degrees between the rotations of consecutive frames."""
     rotations = rotations.astype(float)
     turn = rotation_vector(np.swapaxes(rotations[:-1], -1, -2) @ rotations[1:])
     return np.degrees(np.linalg.norm(turn, axis=-1))
 
 
 @pytest.mark.parametrize("twist", [0.0, 1.5, 2.6, 2.9])
-def test_an_elbow_that_bends_more_and_more_does_not_flip(twist):
-    """The upper arm turns over while the bend grows, in steps, however far it was turned."""
+def test_retarget_positions_is_smooth_while_elbow_bends(twist):
+    """The upper arm rotates in small steps while the bend grows, for any initial twist."""
     upper = retarget.retarget_positions(arm(np.linspace(0.0, 2.9, 300), twist))[:, J["left_shoulder"]]
     assert steps_of(upper).max() < 20
-    # and once the bend is plain, the twist is the arm's
+    # with a clear bend, the twist is that of the arm
     plain = rotation_vector(upper[120:])
     np.testing.assert_allclose(plain, np.broadcast_to([0, twist, 0], plain.shape), atol=0.05)
 
 
-def test_a_folded_joint_keeps_its_axis_and_a_hand_across_it_does_not_flip():
+def test_retarget_positions_of_folded_elbow_and_sideways_wrist():
     # the sine of a bend near 180 degrees is small, but the joint is not straight
     back = retarget.retarget_positions(arm(np.radians([60.0, 172.0]), 1.2))[:, J["left_shoulder"]]
     np.testing.assert_allclose(back[0], back[1], atol=0.02)
-    # a wrist bent sideways points along the axis of the elbow, where that axis says nothing about the hand; a hair
-    # off, so that the hand passes beside the axis and not through it
+    # a wrist bent sideways points along the axis of the elbow, which then does not determine the hand; slightly off,
+    # so that the hand passes beside the axis and not through it
     across = rotation_about("z", 0.02) @ rotation_about("x", np.linspace(1.2, 1.9, 60))
     joints = joints_of(still(60, left_elbow=rotation_about("z", -1.0), left_wrist=across))
     assert steps_of(retarget.retarget_positions(joints)[:, J["left_wrist"]]).max() < 5
@@ -298,6 +298,6 @@ def test_a_folded_joint_keeps_its_axis_and_a_hand_across_it_does_not_flip():
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_retargeting_anything_gives_rotations(seed):
+def test_retarget_positions_of_random_joints_gives_rotations(seed):
     rng = np.random.default_rng(seed)
     check_rotations(retarget.retarget_positions(rng.normal(0, 10 ** rng.uniform(-2, 2), (4, 24, 3))), atol=1e-4)

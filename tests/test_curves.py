@@ -1,4 +1,4 @@
-"""Space-filling curves: every cell once, parents and children, neighbors in code and in space."""
+"""Space-filling curves: one code per cell, codes of parents and children, neighbors in code and in space."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from lidarpose.models.dapt.dapt_config import CURVES
 from lidarpose.models.dapt.voxel_tables import curve, dilated, hilbert, z_order
 
-# bits an axis: of a cell, and one more for a step across the edge
+# bits per axis: those of a cell, and one more for a step across the edge
 BITS = 17
 
 
@@ -25,25 +25,25 @@ def z_order_reference(cell):
 
 
 @pytest.mark.parametrize("bits", [1, 2, 3, 4])
-def test_codes_number_the_cells_of_a_cube_and_hilbert_steps_to_a_neighbor(bits):
+def test_curves_number_all_cells_and_hilbert_visits_neighbors(bits):
     cells = cube(bits)
     assert sorted(z_order(cells)) == sorted(hilbert(cells, bits)) == list(range(8**bits))
     path = cells[np.argsort(hilbert(cells, bits))]
     assert (np.abs(np.diff(path, axis=0)).sum(1) == 1).all() and (path[0] == 0).all()
-    # a parent has its children's code without three bits
+    # the code of a parent is that of its children without three bits
     assert (z_order(cells) >> 3 == z_order(cells >> 1)).all()
     assert bits == 1 or (hilbert(cells, bits) >> 3 == hilbert(cells >> 1, bits - 1)).all()
 
 
 @given(st.lists(st.tuples(*[st.integers(0, (1 << BITS) - 1)] * 3), min_size=1, max_size=20))
-def test_z_order_is_bits_taken_in_turn(cells):
+def test_z_order_interleaves_bits(cells):
     assert z_order(np.array(cells)).tolist() == [z_order_reference(cell) for cell in cells]
 
 
 @settings(max_examples=30)
 @given(st.integers(2, BITS), st.integers(0, 2**31))
-def test_hilbert_of_large_cubes(bits, seed):
-    # where the cube is too large to go through: distinct codes in range, and neighbors in code are neighbors in space
+def test_hilbert_visits_neighbors_in_large_cubes(bits, seed):
+    # the cube is too large to enumerate: codes are distinct and in range, and neighbors in code are neighbors in space
     cells = np.random.default_rng(seed).integers(0, 1 << bits, (200, 3))
     codes = hilbert(cells, bits)
     assert len(np.unique(codes)) == len(np.unique(cells, axis=0)) and codes.min() >= 0 and codes.max() < 8**bits
@@ -60,7 +60,7 @@ def test_dilated_puts_two_zeros_before_each_bit():
     assert dilated(np.array([0b0, 0b1, 0b101, 0b111])).tolist() == [0, 1, 0b1000001, 0b1001001]
 
 
-def test_curves_by_name():
+def test_curve_selects_curve_by_name():
     cells = np.random.default_rng(0).integers(0, 99, (50, 3))
     for name, code in (("z", z_order), ("hilbert", hilbert)):
         assert (curve(name, cells) == code(cells)).all()

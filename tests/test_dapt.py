@@ -1,4 +1,4 @@
-"""The paper's network against the outputs of the authors' code, and its own promises."""
+"""The DAPT network: parity with the authors' code, invariances, tables, attention, configurations, import."""
 
 import itertools
 import json
@@ -61,7 +61,7 @@ def released():
 def network(config=TINY, seed=0):
     torch.manual_seed(seed)
     net = DaptNet(config).eval()
-    # norms and anchors as training would leave them: all different
+    # distinct values in norms and anchors, as after training
     for name, value in net.state_dict().items():
         if value.is_floating_point() and ("running" in name or "keypoint_embedding" in name):
             value.copy_(torch.rand_like(value) + 0.5)
@@ -98,26 +98,26 @@ def assert_parity(out, people):
         dark = decode.dark(logits, low=config.low[k], step=config.step[k])
         np.testing.assert_allclose(dark, ORACLE["dark"][people, :, k], rtol=0, atol=1e-4)
     want = np.concatenate([POINT_FEATURES[k] for k in people])
-    # half a unit in the last place of the float16 that they were stored in
+    # they were stored as float16: half a unit in the last place
     assert (np.abs(out["point_feat_last"] - want) <= np.maximum(np.abs(want) * 2**-11, 2**-24) + 2e-6).all()
 
 
-def test_people_together_and_alone_equal_the_authors_code(released):
+def test_dapt_equals_authors_code_in_batches_and_alone(released):
     assert_parity(released.outputs(CLOUDS), np.arange(5))
     for k, cloud in enumerate(CLOUDS):
         assert_parity(released.outputs([cloud]), np.array([k]))
 
 
-def test_the_accelerators_layout_equals_the_authors_code(released):
+def test_dapt_padded_layout_equals_authors_code(released):
     out = run(released, CLOUDS, "padded")
     for name in ("anchors", "logits_x", "logits_y", "logits_z", "inter"):
         np.testing.assert_allclose(getattr(out, name), ORACLE[name], rtol=0, atol=1e-5, err_msg=name)
 
 
-def test_the_released_flow_is_needed_for_released_weights(released):
+def test_released_weights_need_stale_convolution(released):
     corrected = DaptNet(replace(released.config, stale_convolution=False)).eval()
     corrected.load_state_dict(released.state_dict())
-    # the same voxels for both, so that nothing but the flow differs
+    # the same voxels for both, so that only the flow differs
     batch = released.batch(CLOUDS)
     with torch.inference_mode():
         old, new = released(batch), corrected(batch)
@@ -125,7 +125,7 @@ def test_the_released_flow_is_needed_for_released_weights(released):
         assert (getattr(old, name) - getattr(new, name)).abs().max() > 1e-2, name
 
 
-def test_the_corrected_flow_is_blocks_one_after_the_other():
+def test_stage_without_stale_convolution_chains_blocks():
     net = network()
     batch = net.batch([person(300), person(50, 1)])
     stage, level = net.backbone.enc.enc2, batch.levels[2]
@@ -140,7 +140,7 @@ def test_the_corrected_flow_is_blocks_one_after_the_other():
     assert (corrected - stale).abs().max() > 1e-2
 
 
-# ---- what may not matter
+# ---- invariances
 
 
 NECKS = {
@@ -154,7 +154,7 @@ NECKS = {
 @pytest.mark.long
 @pytest.mark.parametrize("config", NECKS.values(), ids=NECKS)
 @pytest.mark.parametrize("n", [1, 2, 40, 700])
-def test_batch_mates_do_not_matter(config, n):
+def test_outputs_are_independent_of_batch(config, n):
     net, one = network(config), person(n)
     alone = net.outputs([one])
     among = net.outputs([person(900, 1), person(0), one, person(3, 2)])
@@ -166,7 +166,7 @@ def test_batch_mates_do_not_matter(config, n):
 
 
 @pytest.mark.parametrize("n", [60, 900])
-def test_the_order_of_points_does_not_matter(n):
+def test_outputs_are_independent_of_point_order(n):
     # some voxels have several points
     net, cloud = network(), person(n, size=0.05 if n < 100 else 0.2)
     order = np.random.default_rng(0).permutation(n)
@@ -176,7 +176,7 @@ def test_the_order_of_points_does_not_matter(n):
     assert build_tables([cloud], net.config).features.shape[0] < n
 
 
-def test_the_form_of_the_input_does_not_matter(released):
+def test_outputs_accept_any_dtype_and_memory_layout(released):
     want = released.outputs(CLOUDS[:2])
     assert_outputs(want, released.outputs([cloud.astype(np.float64) for cloud in CLOUDS[:2]]))
     wide = [np.concatenate([cloud, cloud], 1)[:, 3:] for cloud in CLOUDS[:2]]
@@ -187,7 +187,7 @@ def test_the_form_of_the_input_does_not_matter(released):
     assert released.outputs([np.zeros((2, 3), int)])["inter"].shape == (1, 14, 3)
 
 
-def test_outputs_leave_the_network_as_it_was():
+def test_outputs_keep_network_state_and_mode():
     net = network().train()
     before = {name: value.clone() for name, value in net.state_dict().items()}
     first = net.outputs([person(100)])
@@ -196,10 +196,10 @@ def test_outputs_leave_the_network_as_it_was():
     assert not net.training
 
 
-# ---- what matters
+# ---- sensitivity, few points, half precision
 
 
-def test_the_points_matter():
+def test_outputs_depend_on_points():
     net, cloud = network(), person(300)
     base, moved = net.outputs([cloud]), cloud + 0.2 * (np.arange(300) < 30)[:, None]
     assert np.abs(net.outputs([moved])["anchors"] - base["anchors"]).max() > 1e-3
@@ -207,7 +207,7 @@ def test_the_points_matter():
 
 
 @pytest.mark.parametrize("sizes", [[0], [0, 0], [0, 40, 0], [1], []])
-def test_people_of_few_points(sizes):
+def test_outputs_are_finite_for_few_points(sizes):
     for name, config in NECKS.items():
         net = network(config)
         out = net.outputs([person(n, k) for k, n in enumerate(sizes)])
@@ -221,7 +221,7 @@ def test_people_of_few_points(sizes):
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_half_types(dtype, layout):
+def test_outputs_in_half_precision_are_close(dtype, layout):
     net = network()
     clouds = [person(200), person(0), person(700, 1)]
     want = run(net, clouds, layout)
@@ -234,7 +234,7 @@ def test_half_types(dtype, layout):
 # ---- training
 
 
-def test_both_layouts_have_the_same_gradients():
+def test_layouts_give_equal_gradients_with_small_patches():
     grads = []
     for layout in LAYOUTS:
         net = network(replace(TINY, patch=128))
@@ -246,11 +246,11 @@ def test_both_layouts_have_the_same_gradients():
         torch.testing.assert_close(grad, grads[1][name], rtol=1e-3, atol=1e-4, msg=name)
 
 
-def test_joints_are_the_windowed_mean():
+def test_outputs_joints_equal_window_decoder():
     net = network()
     out = run(net, [person(100), person(30, 1)])
     for k, name in enumerate(("logits_x", "logits_y", "logits_z")):
-        # sharpened, and with broad peaks at the edges too
+        # sharpened, and with broad peaks at the edges
         logits = getattr(out, name).numpy() * 30
         index = np.arange(logits.shape[-1])
         for joint, at in enumerate((0, 1, len(index) - 2)):
@@ -277,9 +277,9 @@ def test_drop_path_keeps_the_mean_and_drops_whole_rows():
     np.testing.assert_allclose(sum(rates, []), [0.15, 0, 0.3])
 
 
-def test_norms_are_the_authors_and_one_row_alone_is_normed_by_what_was_learnt():
+def test_norms_match_authors_and_single_row_uses_running_mean():
     norms = [m for m in DaptNet(TINY).modules() if isinstance(m, torch.nn.BatchNorm1d)]
-    # the stem, a pooling each, two an unpooling; the part head has torch's defaults
+    # the stem, one per pooling, two per unpooling; the part head has torch's defaults
     assert [(m.eps, m.momentum) for m in norms] == [(1e-3, 0.01)] * 7 + [(1e-5, 0.1)]
     norm = RowNorm(4).train()
     norm.running_mean.fill_(2)
@@ -298,7 +298,7 @@ def cells_of(cloud, config):
 
 
 @pytest.mark.parametrize("from_minimum", [False, True])
-def test_tables_against_dictionaries(from_minimum):
+def test_build_tables_equals_dictionaries(from_minimum):
     config = replace(TINY, grid_from_minimum=from_minimum)
     clouds = [person(150, size=0.1), person(1, 1), person(80, 2, 0.04)]
     tables = build_tables(clouds, config)
@@ -306,7 +306,7 @@ def test_tables_against_dictionaries(from_minimum):
     assert (tables.features == points[tables.kept]).all()
     cells = [cells_of(cloud, config) for cloud in clouds]
     people = [list(dict.fromkeys(map(tuple, c))) for c in cells]
-    # level 0: one row a cell, every point in its own
+    # level 0: one row per cell, each point in the row of its cell
     found = [(b, *cell) for b, c in enumerate(cells) for cell in c.tolist()]
     row_of = {}
     for point, row in enumerate(tables.point_voxel):
@@ -351,19 +351,19 @@ def assert_neighbors(near, row_of, reach):
     assert len(near.source) == len(want)
 
 
-def test_of_several_points_the_nearest_to_the_middle_is_kept():
+def test_build_tables_keeps_point_nearest_to_cell_center():
     cloud = np.float32([[0.001, 0.001, 0.001], [0.011, 0.009, 0.01], [0.019, 0.019, 0.019]])
     assert build_tables([cloud], TINY).kept.tolist() == [1]
 
 
-def test_in_training_curves_are_shuffled():
+def test_build_tables_shuffles_curves_in_training():
     rng, straight = np.random.default_rng(0), build_tables([person(900)], TINY).levels[0].sequence
     shuffled = {build_tables([person(900)], TINY, rng=rng).levels[0].sequence[0].tobytes() for _ in range(20)}
     assert shuffled == {sequence.tobytes() for sequence in straight}
 
 
-def test_cells_at_the_edge_of_what_can_be_counted_meet_nobody():
-    # the first and last cell of each axis: a step beyond wraps to no other cell
+def test_build_tables_neighbors_do_not_wrap_at_range_limits():
+    # the first and last cell of each axis: a step beyond must not wrap to another cell
     reach = TINY.grid * (1 << 15)
     corners = np.array(list(itertools.product((-reach, reach - TINY.grid / 2), repeat=3)))
     tables = build_tables([corners, corners], TINY)
@@ -371,17 +371,17 @@ def test_cells_at_the_edge_of_what_can_be_counted_meet_nobody():
     assert len(tables.stem.source) == 0 and all(len(level.near.source) == 0 for level in tables.levels)
 
 
-def test_a_stray_point_moves_no_voxel_but_in_the_released_code():
+def test_stray_point_moves_voxels_only_with_grid_from_minimum():
     near, stray = np.float32([[0.001, 0, 0], [0.021, 0, 0]]), np.float32([[-0.339, 0, 0]])
     for from_minimum, shared in ((False, True), (True, False)):
         tables = build_tables([np.concatenate([near, stray])], replace(TINY, grid_from_minimum=from_minimum))
-        # the released grid begins at the stray point: what shared a parent without it may no longer
+        # the released grid begins at the stray point, so voxels with a common parent may get different ones
         parent = tables.levels[0].parent[tables.point_voxel]
         assert (parent[0] == parent[1]) == shared and tables.levels[0].lengths.tolist() == [3]
         assert build_tables([near], replace(TINY, grid_from_minimum=from_minimum)).levels[1].lengths.tolist() == [1]
 
 
-def test_bad_clouds():
+def test_dapt_rejects_bad_clouds_and_layouts():
     net = network()
     for cloud, message in (
         (np.zeros((4, 4)), r"cloud 1: expected numbers of shape \(n, 3\), x y z in meters, got float64 of \(4, 4\)"),
@@ -403,7 +403,7 @@ def test_bad_clouds():
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("kernel", [3, 5])
-def test_convolution_equals_a_dense_one(kernel, layout):
+def test_submanifold_convolution_equals_dense_convolution(kernel, layout):
     rng = np.random.default_rng(0)
     side = 7
     occupied = np.argwhere(rng.random((side, side, side)) < 0.4)
@@ -433,7 +433,7 @@ def test_convolution_equals_a_dense_one(kernel, layout):
 
 
 @pytest.mark.parametrize("from_minimum", [False, True])
-def test_a_large_cloud_is_cut_into_patches(from_minimum):
+def test_large_cloud_is_split_into_patches(from_minimum):
     config, cloud = replace(TINY, grid_from_minimum=from_minimum), person(3400, size=0.3)
     tables = build_tables([cloud, person(40, 1)], config)
     level = tables.levels[0]
@@ -443,7 +443,7 @@ def test_a_large_cloud_is_cut_into_patches(from_minimum):
     for sequence in level.sequence:
         assert sorted(sequence) == list(range(len(sequence)))
         patches = np.split(sequence, np.cumsum(level.patch_lengths)[:-1])
-        # patches are compact, and nobody's points are lent to somebody else
+        # patches are compact and contain points of one person only
         assert all(len(set(rows < level.lengths[0])) == 1 for rows in patches)
         spread = np.mean([tables.features[rows].std(0).mean() for rows in patches[:-1]])
         assert spread < 0.8 * tables.features[: level.lengths[0]].std(0).mean()
@@ -458,7 +458,7 @@ def test_a_large_cloud_is_cut_into_patches(from_minimum):
 
 
 @pytest.mark.parametrize("patch, lengths", [(64, [64, 64]), (128, [128]), (100, [100, 28]), (127, [127, 1])])
-def test_the_last_patch_is_what_is_left(patch, lengths):
+def test_last_patch_contains_remainder(patch, lengths):
     # 128 cells in a row
     row = np.zeros((128, 3))
     row[:, 0] = (np.arange(128) + 0.5) * TINY.grid
@@ -467,18 +467,18 @@ def test_the_last_patch_is_what_is_left(patch, lengths):
     torch.testing.assert_close(run(net, [row]).anchors, run(net, [row], "padded").anchors, rtol=1e-4, atol=1e-5)
 
 
-def test_patches_agree_in_both_layouts_and_spare_the_small():
+def test_layouts_agree_with_patches_and_small_people_are_exact():
     net = network(replace(TINY, patch=100))
     clouds = [person(700), person(30, 1), person(100, 2), person(0)]
     ragged, padded = run(net, clouds), run(net, clouds, "padded")
     for name in ("anchors", "points", "inter", "logits_x", "parts"):
         torch.testing.assert_close(getattr(ragged, name), getattr(padded, name), rtol=1e-4, atol=1e-5, msg=name)
-    # somebody of no more than a patch has exact full attention, whoever else is there
+    # a person of at most one patch has exact full attention in any batch
     small = network(replace(TINY, patch=4096)).outputs(clouds[1:2])
     np.testing.assert_allclose(padded.anchors[1].numpy(), small["anchors"][0], rtol=1e-4, atol=1e-5)
 
 
-def test_gradients_agree_in_both_layouts():
+def test_layouts_give_equal_gradients_of_points_and_anchors():
     net = network(TINY)
     gradients = {}
     for layout in ("ragged", "padded"):
@@ -492,7 +492,7 @@ def test_gradients_agree_in_both_layouts():
         torch.testing.assert_close(gradients["padded"][name] / scale, value / scale, rtol=0, atol=1e-3, msg=name)
 
 
-def test_attention_equals_its_formula():
+def test_patch_attention_equals_formula():
     torch.manual_seed(0)
     attention = PatchAttention(32, 2).eval()
     tables = build_tables([person(70), person(9, 1)], replace(TINY, patch=32))
@@ -508,7 +508,7 @@ def test_attention_equals_its_formula():
         torch.testing.assert_close(attention(rows, level, order), attention.proj(want), rtol=1e-4, atol=1e-5)
 
 
-def test_tables_and_decoders_need_no_torch():
+def test_tables_and_decoders_do_not_import_torch():
     code = "import sys, lidarpose.models.decode, lidarpose.models.dapt.voxel_tables; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], timeout=60).returncode == 0
 
@@ -521,11 +521,11 @@ def parameters(config):
         return sum(p.numel() for p in DaptNet(config).parameters())
 
 
-def test_sizes_and_bins():
+def test_named_configs_have_published_sizes_and_bins():
     counts = {name: parameters(config) for name, config in CONFIGS.items()}
     assert counts == {
         "paper": 50_513_310,
-        # the authors' own count is 50.40 M
+        # the authors state 50.40 M
         "waymo": 50_403_794,
         "humanm3": 50_436_033,
         "lidarhuman26m": 50_472_828,
@@ -541,8 +541,8 @@ def test_sizes_and_bins():
 
 
 @pytest.mark.parametrize("width, finest, prn", [(64, 267_136, 228_870), (128, 1_058_560, 899_910)])
-def test_necks_have_as_many_parameters_as_published(width, finest, prn):
-    """More than plain Point Transformer V3: its decoder of `width` channels, 15 joints."""
+def test_necks_have_published_parameter_counts(width, finest, prn):
+    """In addition to the plain Point Transformer V3 with a decoder of `width` channels, for 15 joints."""
     widths = {"decoder_channels": (width, 128, 128, 256), "anchor_channels": (width, 128, 128, 256, 256)}
     plain = replace(named_config("pretrain"), parts=0, **widths)
     whole = parameters(replace(plain, neck="prn"))
@@ -553,13 +553,13 @@ def test_necks_have_as_many_parameters_as_published(width, finest, prn):
     assert whole - prn == sum(p.numel() for p in backbone.parameters())
 
 
-def test_a_header_without_a_neck_means_mde():
+def test_dapt_config_without_neck_means_mde():
     entries = TINY.to_dict()
     assert entries.pop("neck") == "mde" and DaptConfig.from_dict(entries) == TINY
     assert DaptConfig.from_dict(json.loads(json.dumps(NECKS["finest"].to_dict()))) == NECKS["finest"]
 
 
-def test_joints_of_the_released_networks_by_name():
+def test_named_configs_have_joints_of_released_networks():
     # the authors' order: rows 1 to 13 and 15 of Waymo's table of keypoints
     limbs = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
     both = [f"{side}_{limb}" for side in ("left", "right") for limb in limbs]
@@ -575,7 +575,7 @@ def test_joints_of_the_released_networks_by_name():
     ):
         config = named_config(name)
         assert [config.joints[k] for k in config.order_in(skeleton)] == list(skeleton.joints)
-    # the subset that the authors took of SMPL's joints
+    # the authors' subset of SMPL's joints
     subset = [0, 1, 2, 4, 5, 7, 8, 12, 15, 16, 17, 18, 19, 20, 21]
     assert named_config("pretrain").joints == tuple(SMPL24.joints[k] for k in subset)
 
@@ -608,17 +608,17 @@ def test_joints_of_the_released_networks_by_name():
         ({"neck": "prn"}, "the neck prn has joints and parts of its own: leave bins, ranges and parts empty"),
     ],
 )
-def test_bad_configurations(change, message):
+def test_dapt_config_rejects_invalid_values(change, message):
     with pytest.raises(InputError, match=message):
         replace(TINY, **change)
 
 
-def test_wider_strides():
+def test_wider_strides_give_coarser_levels():
     net, cloud = network(replace(TINY, strides=(4, 8))), person(500)
     lengths = [level.lengths[0] for level in build_tables([cloud], net.config).levels]
     assert lengths == [len(np.unique(cells_of(cloud, net.config) >> shift, axis=0)) for shift in (0, 2, 5)]
     assert np.isfinite(net.outputs([cloud])["inter"]).all()
-    # no voxels wider than cells are counted
+    # the range of cell numbers limits the product of strides
     levels = {name: (1,) * (7 if name in ("decoder_depths", "decoder_heads") else 8) for name in SIZES}
     levels |= {"encoder_channels": (8,) * 8, "decoder_channels": (8,) * 7, "anchor_channels": (8,) * 8}
     config = replace(TINY, **levels | {"anchor_heads": 1, "strides": (4, 4, 4, 4, 4, 8, 8)})
@@ -639,7 +639,7 @@ def faults_of(net):
     return [getattr(net.config, name) for name in FAULTS]
 
 
-def test_import_by_header_by_dict_and_by_configuration(released, tmp_path):
+def test_import_dapt_by_header_dict_and_config(released, tmp_path):
     want = released.outputs(CLOUDS[1:2])
     assert (
         not released.training and faults_of(released) == [True, True, False] and released.config.joints == WAYMO_JOINTS
@@ -654,8 +654,8 @@ def test_import_by_header_by_dict_and_by_configuration(released, tmp_path):
     assert faults_of(import_dapt(WEIGHTS, own | {"stale_convolution": False})) == [False, True, False]
 
 
-def test_import_by_name(tmp_path, monkeypatch):
-    # as the released one, of fewer channels: 200 MB less to write
+def test_import_dapt_by_name_of_config(tmp_path, monkeypatch):
+    # with fewer channels than the released one, to write 200 MB less
     narrow = {name: getattr(TINY, name) for name in SIZES}
     monkeypatch.setitem(CONFIGS, "pretrain", replace(named_config("pretrain"), **narrow))
     tensors = {name: value.contiguous() for name, value in DaptNet(CONFIGS["pretrain"]).state_dict().items()}
@@ -686,7 +686,7 @@ FIRST_BIAS = "heads.query.fcs.0.fc1.bias"
         (lambda t: t.clear(), "has 0 tensors, too few for the .* layers of the configuration released"),
     ],
 )
-def test_import_of_tensors_that_do_not_fit(tmp_path, change, message):
+def test_import_dapt_rejects_mismatched_tensors(tmp_path, change, message):
     tensors = load_file(WEIGHTS)
     change(tensors)
     save_file(tensors, tmp_path / "bad.safetensors", {"config": json.dumps(header())})
@@ -707,7 +707,7 @@ THEIRS = header()
         ({"widths": 3}, "unknown setting of the network 'widths'"),
         ({"name": "x"}, "needs the entry 'joints'"),
         ([1], "should be a dict, a name or a DaptConfig, got list"),
-        # another network of theirs
+        # other networks of the authors
         (THEIRS | {"in_channels": 6}, "in_channels must be 3"),
         (THEIRS | {"dec_kp_mixer": "linear"}, "dec_kp_mixer must be 'attn'"),
         (THEIRS | {"num_keypoints": 17}, "num_keypoints must be 14, 15 or 24"),
@@ -716,17 +716,17 @@ THEIRS = header()
         (THEIRS | {"grid": 7}, "grid must be .*of the heatmaps, got 7"),
     ],
 )
-def test_import_with_a_wrong_configuration(config, message):
+def test_import_dapt_rejects_wrong_configurations(config, message):
     with pytest.raises(InputError, match=message):
         import_dapt(WEIGHTS, config)
 
 
-def test_import_of_files_that_are_none(tmp_path):
+def test_import_dapt_rejects_pickles_and_damaged_files(tmp_path):
     pickle, cut = tmp_path / "dapt.pth", tmp_path / "cut.safetensors"
     pickle.write_bytes(b"\x80\x04.")
     with pytest.raises(InputError, match=r"dapt.pth: .* pickle.*weights_only=True.*safetensors"):
         import_dapt(pickle)
-    # what else may be wrong with a file is said as for any checkpoint
+    # other faults of a file give the errors of any checkpoint
     cut.write_bytes(WEIGHTS.read_bytes()[:100])
     with pytest.raises(InputError, match="cut.safetensors: .*ends at byte"):
         import_dapt(cut)

@@ -1,4 +1,4 @@
-"""Training of the paper's network: its equations, its batches, and what goes on from one stage to the next."""
+"""Training of the DAPT network: losses, batches, gradients, transfer between stages, batch norm statistics."""
 
 import math
 import pickle
@@ -59,7 +59,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def person(n, seed=0, labelled=None, size=(0.2, 0.3, 0.6)):
-    """n points; labelled: how many of the joints have a label, None for all."""
+    """n points; labelled: number of joints with a label, None for all."""
     rng = np.random.default_rng([seed, n])
     joints = rng.normal(0, size, (26, 3)).astype(np.float32)
     joints[rng.permutation(26)[26 if labelled is None else labelled :]] = np.nan
@@ -88,7 +88,7 @@ def gradients(net, terms):
 
 
 def made(seed=0, people=3, voxels=7):
-    """Outputs of nobody's network, with every head, and targets of which some are not known."""
+    """Random outputs of all heads, and targets with some unknown labels."""
     torch.manual_seed(seed)
     bins = (11, 13, 17)
     outputs = DaptOutputs(
@@ -103,7 +103,7 @@ def made(seed=0, people=3, voxels=7):
         low=(-1.0, -0.5, -2.0),
         step=(0.2, 0.1, 0.25),
     )
-    # some beyond the heatmaps' range
+    # some are outside the range of the heatmaps
     joints = torch.randn(people, 4, 3)
     weight = torch.tensor([[1.0, 0, 1, 1], [0, 0, 0, 0], [0, 1, 0, 0]])
     return outputs, DaptTargets(joints=joints, weight=weight, part=torch.tensor([0, 24, -1, 3, 3, -1, 0]))
@@ -148,7 +148,7 @@ def slow_heatmap(outputs, targets):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_losses_are_equations_9_and_10(seed):
+def test_losses_equal_equations_9_and_10(seed):
     outputs, targets = made(seed)
     terms = pretraining(outputs, targets)
     regression = slow_regression(numbers(outputs.coordinates), targets)
@@ -158,7 +158,7 @@ def test_losses_are_equations_9_and_10(seed):
     assert finetuning(outputs, targets).keys() == {"heatmap", "mpjpe"}
     terms = finetuning(outputs, targets)
     assert terms["heatmap"].item() == pytest.approx(slow_heatmap(outputs, targets), rel=1e-5)
-    # without heatmaps Eq. 7, in fine-tuning too
+    # without heatmaps, fine-tuning uses Eq. 7, too
     bare = replace(outputs, logits_x=None, voted=outputs.coordinates * 2)
     assert finetuning(bare, targets)["regression"].item() == pytest.approx(regression, rel=1e-5)
     terms = prn(bare, targets)
@@ -172,14 +172,14 @@ def test_losses_are_equations_9_and_10(seed):
 
 @settings(max_examples=60, deadline=None)
 @given(st.floats(-1e4, 1e4), st.integers(1, 300))
-def test_targets_are_distributions(place, bins):
+def test_log_gaussian_targets_are_distributions(place, bins):
     target = log_gaussian(torch.tensor([place]), bins).exp()
     assert abs(target.sum().item() - 1) < 1e-5
-    # a joint beyond the range is told to be at its end
+    # the target of a joint outside the range is at its end
     assert abs(target.argmax().item() - min(max(place, 0), bins - 1)) <= 0.5 + 1e-3
 
 
-def test_background_is_supervised_and_joints_without_a_label_teach_nothing():
+def test_losses_use_background_and_ignore_unlabeled_joints():
     outputs, targets = made()
     parts, logits = (value.clone().requires_grad_() for value in (outputs.parts, outputs.logits_x))
     outputs = replace(outputs, parts=parts, logits_x=logits)
@@ -195,7 +195,7 @@ def test_background_is_supervised_and_joints_without_a_label_teach_nothing():
 @pytest.mark.long
 @BOTH
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_nobody_depends_on_batch_mates_or_on_the_order_of_points(task, layout):
+def test_collate_is_independent_of_batch_and_point_order(task, layout):
     task = replace(task, layout=layout)
     one, mates = person(300), [person(150, 1), person(0, 2), person(700, 3)]
     alone_, among = task.collate([one]), task.collate([*mates, one])
@@ -214,7 +214,7 @@ def test_nobody_depends_on_batch_mates_or_on_the_order_of_points(task, layout):
 
 @pytest.mark.long
 @BOTH
-def test_the_order_of_people_does_not_matter(task):
+def test_terms_are_independent_of_order_of_people(task):
     people = [person(n, n) for n in (40, 0, 300, 9)]
     net = network(task).eval()
     forth, back = (task.collate(order) for order in (people, people[::-1]))
@@ -223,7 +223,7 @@ def test_the_order_of_people_does_not_matter(task):
     torch.testing.assert_close(terms, reversed_terms, rtol=1e-5, atol=1e-6)
 
 
-def test_people_larger_than_a_patch_only_shuffle_their_curves():
+def test_people_larger_than_patch_do_not_affect_others():
     task = replace(PRETRAIN, config=replace(PRETRAIN.config, patch=64))
     large, little = person(400, 1), person(30)
     alone_, among = task.collate([little]), task.collate([large, little])
@@ -233,7 +233,7 @@ def test_people_larger_than_a_patch_only_shuffle_their_curves():
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**31 - 1), st.integers(0, 200), st.floats(0.02, 0.5))
-def test_parts_against_counting(seed, n, size):
+def test_collate_takes_most_frequent_part_of_voxel(seed, n, size):
     one = replace(person(n, 3, size=size), seed=seed)
     arrays = PRETRAIN.collate([one])
     cells = {}
@@ -248,12 +248,12 @@ def test_parts_against_counting(seed, n, size):
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 60), st.sampled_from([0.3, 5.0, 2000.0]))
-def test_size_counts_occupied_cells(seed, n, reach):
+def test_example_size_counts_occupied_cells(seed, n, reach):
     example = replace(person(5), points=np.random.default_rng(seed).uniform(-reach, reach, (n, 3)).astype(np.float32))
     assert example.size == len({tuple(cell) for cell in np.floor(example.points * 10).tolist()})
 
 
-def test_voxels_of_the_neck_prn_are_their_nearest_joint_s():
+def test_prn_collate_labels_voxels_by_nearest_joint():
     people = [person(60, 1, labelled=5, size=0.1), person(0, 2), person(40, 3, labelled=0)]
     arrays = PRN.collate(people)
     rows = np.repeat(np.arange(3), arrays.tables.levels[0].lengths)
@@ -262,12 +262,12 @@ def test_voxels_of_the_neck_prn_are_their_nearest_joint_s():
         distances = [math.dist(at, joint) if np.isfinite(joint).all() else math.inf for joint in arrays.joints[b]]
         nearest = min(distances)
         want.append(1 + distances.index(nearest) if nearest < 0.1 else 0)
-    # those without points or labels teach nothing
+    # people without points or labels are not supervised
     want = np.where(rows == 0, want, -1)
     assert arrays.part.tolist() == want.tolist() and {0, -1} < set(arrays.part.tolist())
 
 
-def test_any_point_of_a_voxel_may_be_kept():
+def test_collate_keeps_random_point_of_voxel():
     cloud = np.float32([[0.001, 0.001, 0.001], [0.02, 0.02, 0.02], [0.039, 0.039, 0.039], [-0.01, 0, 0]])
     cell = replace(person(4), points=cloud, part=np.array([7, 3, 3, -1]))
     batches = [PRETRAIN.collate([person(0), replace(cell, seed=seed)]) for seed in range(40)]
@@ -276,7 +276,7 @@ def test_any_point_of_a_voxel_may_be_kept():
 
 
 @BOTH
-def test_task_and_arrays_survive_the_way_from_a_worker(task):
+def test_objective_and_batches_survive_pickling(task):
     arrays = task.collate([person(60), person(0, 1, labelled=3)])
     assert pickle.loads(pickle.dumps(task)) == task
     net = network(task).eval()
@@ -284,7 +284,7 @@ def test_task_and_arrays_survive_the_way_from_a_worker(task):
     torch.testing.assert_close(terms, again, rtol=0, atol=0)
 
 
-def test_joints_are_body26s_and_those_that_the_stage_teaches():
+def test_objective_joints_are_those_of_head_and_stage():
     out = FINETUNE.joints(network(FINETUNE).eval(), FINETUNE.collate([person(50), person(5, 1)]))
     has = np.isin(BODY26.joints, WAYMO14.joints)
     assert out.shape == (2, 26, 3) and np.isfinite(out[:, has]).all() and np.isnan(out[:, ~has]).all()
@@ -305,11 +305,11 @@ def test_joints_are_body26s_and_those_that_the_stage_teaches():
 @pytest.mark.long
 @BOTH
 @pytest.mark.parametrize("rare", [False, True])
-def test_gradients_of_two_halves_average_to_those_of_the_whole(task, rare):
-    # people, labels and voxels are shared out unevenly; a batch norm in training would see its own half alone
+def test_gradients_of_two_shares_average_to_whole_batch(task, rare):
+    # people, labels and voxels are split unevenly; in training mode, a batch norm would see only its own half
     people = [person(40), person(200, 1, labelled=2), person(3, 2, labelled=0), person(0, 3), person(90, 4)]
     if rare:
-        # one joint and one point are all that is known, so that a share of the counts is less than one
+        # only one joint and one point have labels, so that a share of the counts is less than one
         nothing = np.full((26, 3), np.nan, np.float32)
         hip = np.where(np.arange(26)[:, None] == BODY26.index("left_hip"), np.float32(0.2), nothing)
         people = [replace(one, joints=nothing, part=np.full(len(one.points), -1)) for one in people]
@@ -331,7 +331,7 @@ def test_gradients_of_two_halves_average_to_those_of_the_whole(task, rare):
     for name, value in whole.items():
         torch.testing.assert_close((terms[0][name] + terms[1][name]) / 2, value, rtol=1e-4, atol=1e-6, msg=name)
     largest = max(value.abs().max() for value in want.values())
-    # without the share they would not
+    # without sharing of counts, they differ
     naive = [gradients(net, task.terms(net, half, share=one_process)) for half in halves]
     off = 0.0
     for name, value in want.items():
@@ -345,19 +345,19 @@ def test_gradients_of_two_halves_average_to_those_of_the_whole(task, rare):
 @BOTH
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("n", [1, 2, 1500])
-def test_gradients_are_finite(task, layout, n):
+def test_gradients_are_finite_for_all_parameters(task, layout, n):
     if task is PRN and n == 1:
         pytest.skip("its norms are torch's own, which need two rows")
     task = replace(task, layout=layout)
     net = network(task).train()
     terms = task.terms(net, task.collate([person(n)]))
     assert all(torch.isfinite(value) for value in terms.values())
-    # every parameter has one
+    # each parameter has a gradient
     assert all(torch.isfinite(value).all() for value in gradients(net, terms).values())
 
 
 @BOTH
-def test_people_without_labels_or_points(task):
+def test_losses_of_people_without_labels_or_points(task):
     net = network(task).train()
     nothing = [replace(person(n, n, labelled=0), part=np.full(n, -1)) for n in (30, 0, 1)]
     terms = task.terms(net, task.collate(nothing))
@@ -369,7 +369,7 @@ def test_people_without_labels_or_points(task):
 
 
 @pytest.mark.parametrize("stage", ["pretrain", "finetune"])
-def test_all_learns_but_heads_that_a_stage_does_not_ask_whose_gradient_is_zero(stage):
+def test_only_unused_heads_of_stage_have_zero_gradients(stage):
     task = DaptObjective(config=replace(named_config("paper"), **TINY), stage=stage)
     net = network(task)
     of = gradients(net, task.terms(net, task.collate([person(60), person(9, 1)])))
@@ -380,7 +380,7 @@ def test_all_learns_but_heads_that_a_stage_does_not_ask_whose_gradient_is_zero(s
 @pytest.mark.long
 @BOTH
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_half_precision(task, layout):
+def test_terms_under_bfloat16_autocast_are_close(task, layout):
     task = replace(task, layout=layout)
     net = network(task).train()
     people = [person(n, n) for n in (200, 0, 1, 600)]
@@ -400,10 +400,10 @@ def test_half_precision(task, layout):
 
 @pytest.mark.long
 @BOTH
-def test_it_learns_four_people_by_heart(task):
+def test_dapt_overfits_four_people(task):
     people = [person(30, k, size=0.25) for k in range(4)]
     if task is PRN:
-        # it votes from what is near
+        # its votes come from points near the joints
         near = [each.joints[np.arange(30) % 26] + np.float32(0.02) for each in people]
         people = [replace(each, points=points) for each, points in zip(people, near, strict=True)]
     arrays = task.collate(people)
@@ -423,7 +423,7 @@ def test_it_learns_four_people_by_heart(task):
         assert value < losses[0][name] / 2, name
 
 
-# --- from stage to stage
+# --- transfer between stages
 
 
 def trained(config, seed=3):
@@ -435,7 +435,7 @@ def trained(config, seed=3):
     return net
 
 
-def test_the_papers_transfer_keeps_the_backbone_alone():
+def test_transferred_copies_only_backbone():
     source = trained(PRETRAIN.config)
     before = {name: value.clone() for name, value in source.state_dict().items()}
     config = replace(FINETUNE.config, joints=HUMAN15.joints)
@@ -453,20 +453,20 @@ def test_the_papers_transfer_keeps_the_backbone_alone():
     assert all(torch.equal(before[name], value) for name, value in source.state_dict().items())
 
 
-def test_anchors_go_on_by_name():
+def test_transferred_copies_anchors_by_joint_name():
     source = trained(replace(PRETRAIN.config, joints=BODY26.joints[:25]))
     torch.manual_seed(8)
     net = transferred(source, FINETUNE.config, keep_anchors=True)
     torch.manual_seed(8)
     fresh = DaptNet(FINETUNE.config).backbone.keypoint_embedding
     for j, name in enumerate(FINETUNE.config.joints):
-        # the middle of the head is new
+        # head_center is new
         want = fresh[j] if name == "head_center" else source.backbone.keypoint_embedding[BODY26.index(name)]
         assert torch.equal(net.backbone.keypoint_embedding[j], want), name
     assert BODY26.joints[25] == "head_center" and "head_center" in FINETUNE.config.joints
 
 
-def test_heads_go_on_where_they_say_the_same():
+def test_transferred_copies_matching_heads():
     whole = replace(named_config("paper"), **TINY)
     source = trained(whole)
     # another range of z, fewer joints in another order
@@ -489,13 +489,13 @@ def test_heads_go_on_where_they_say_the_same():
     again = transferred(source, whole, keep_anchors=True).state_dict()
     buffers = ("heads.query.coord_range", "heads.query.joint_wise_weight")
     assert all(torch.equal(value, again[name]) for name, value in old.items() if name not in buffers)
-    # the coordinate head bears another name where there is no other head of anchors
+    # the coordinate head has another name if it is the only head of anchors
     bare = transferred(source, replace(PRETRAIN.config, joints=SMPL24.joints), keep_anchors=True).state_dict()
     assert torch.equal(bare["heads.query.fc.fc2.weight"], old["heads.coordinate.fc.fc2.weight"])
     assert torch.equal(bare["heads.feat.fc.3.weight"], old["heads.feat.fc.3.weight"])
 
 
-def test_the_neck_goes_on_too():
+def test_transferred_copies_neck():
     for neck in ("finest", "prn"):
         source = trained(replace(PRN.config, neck=neck))
         config = replace(source.config, name="waymo", joints=WAYMO14.joints)
@@ -534,7 +534,7 @@ def test_the_neck_goes_on_too():
     ],
 )
 @pytest.mark.parametrize("keep", [False, True])
-def test_a_backbone_that_does_not_fit(change, message, keep):
+def test_transferred_rejects_mismatched_backbone(change, message, keep):
     with refused(message):
         transferred(trained(PRETRAIN.config), replace(FINETUNE.config, **change), keep_anchors=keep)
 
@@ -542,7 +542,7 @@ def test_a_backbone_that_does_not_fit(change, message, keep):
 # --- settings
 
 
-def test_configurations():
+def test_dapt_training_configs_are_consistent():
     assert pretraining_config().joints == HUMAN15.joints
     assert not any(getattr(pretraining_config(), fault) for fault in FAULTS)
     for dataset in ("waymo", "humanm3", "lidarhuman26m", "sloper4d"):
@@ -555,7 +555,7 @@ def test_configurations():
     assert 50e6 / 45 < weights[0] < 50e6 / 35 and weights[1] < weights[0]
 
 
-def test_the_released_faults_are_options():
+def test_released_faults_are_options_of_training():
     options = tuple(f"{fault}=true" for fault in FAULTS)
     for head in ("coordinates", "heatmaps"):
         config, _ = pretraining_network(Pretrain(size="paper-tiny", head=head, options=options))
@@ -582,12 +582,12 @@ def test_the_released_faults_are_options():
         ({"stage": "pretrain"}, "pre-training needs coordinates and 25 parts, waymo has coordinates=False and parts=0"),
     ],
 )
-def test_bad_settings(change, message):
+def test_dapt_objective_rejects_invalid_settings(change, message):
     with pytest.raises(InputError, match=message):
         replace(FINETUNE, **change)
 
 
-def test_bad_people():
+def test_collate_rejects_invalid_people():
     for part in (np.array([0, 25, 3]), np.array([1, 2])):
         with pytest.raises(InputError, match="each of 3 points needs a part below 25"):
             PRETRAIN.collate([replace(person(3), part=part)])
@@ -602,7 +602,7 @@ def test_bad_people():
 
 @dataclass(frozen=True)
 class Fixed:
-    """The same few people, again and again."""
+    """A source that repeats the same few people."""
 
     people: int
 
@@ -630,7 +630,7 @@ def setup_of(task):
     )
 
 
-def test_statistics_are_torch_s_own_and_nothing_else_moves():
+def test_update_batch_norms_equals_torch_update_bn():
     batches = [PRETRAIN.collate([person(n, n) for n in sizes]) for sizes in ((50, 9), (300, 40), (80, 5, 7))]
     net, twin = network(PRETRAIN), network(PRETRAIN)
     before = {name: value.clone() for name, value in net.state_dict().items()}
@@ -643,8 +643,8 @@ def test_statistics_are_torch_s_own_and_nothing_else_moves():
 
 
 @pytest.mark.long
-def test_statistics_that_run_along_are_stale_and_are_estimated_anew_before_every_judgement():
-    """A few steps at a high rate: momentum 0.01 remembers the weights of the beginning."""
+def test_update_batch_norms_improves_on_running_statistics():
+    """After a few steps at a high rate, running statistics with momentum 0.01 are those of early weights."""
     source = Fixed(8)
     examples = [source.example(k) for k in range(8)]
     arrays = FINETUNE.collate(examples)
@@ -662,8 +662,8 @@ def test_statistics_that_run_along_are_stale_and_are_estimated_anew_before_every
 
 @pytest.mark.long
 @pytest.mark.parametrize(("task", "times"), [(PRETRAIN, 1.0), (FINETUNE, 10.0)], ids=("pretrain", "finetune"))
-def test_a_killed_run_of_the_papers_network_ends_with_the_same_statistics(tmp_path, monkeypatch, task, times):
-    """Three chunks, the last one of four steps: statistics are of the last whole one."""
+def test_resumed_dapt_run_ends_with_equal_weights_and_statistics(tmp_path, monkeypatch, task, times):
+    """Three chunks, the last one of four steps. Statistics are those of the last whole chunk."""
     monkeypatch.setattr(loop, "SAVE_EVERY", -1.0)
     setup, recipe = (
         setup_of(replace(task, config=replace(task.config, drop_path=0.1))),
@@ -688,7 +688,7 @@ def test_a_killed_run_of_the_papers_network_ends_with_the_same_statistics(tmp_pa
         one, other = (load_file(folder / name) for folder in (tmp_path / "whole", halted))
         assert one.keys() == other.keys()
         assert all(torch.equal(one[key], other[key]) for key in one), name
-    # what is used has its own statistics, what is resumed from those of training
+    # the model has statistics of its own, the state for resuming has those of training
     model, state = load_file(halted / run_dir.MODEL), load_file(halted / run_dir.STATE)
     net = setup.objective.network()
     net.load_state_dict(model)
@@ -700,7 +700,7 @@ def test_a_killed_run_of_the_papers_network_ends_with_the_same_statistics(tmp_pa
 
 
 @pytest.mark.parametrize("task", [FINETUNE, FINEST], ids=["heatmaps", "coordinates"])
-def test_the_last_layers_of_heatmaps_learn_at_a_rate_of_their_own(task):
+def test_heatmap_rate_applies_to_last_heatmap_layers(task):
     net = network(task)
     recipe = replace(SHORT, heatmap_rate=10.0)
     (alike,), (made,) = optimizers(net, SHORT), optimizers(net, recipe)
@@ -717,7 +717,7 @@ def test_the_last_layers_of_heatmaps_learn_at_a_rate_of_their_own(task):
 
 
 @pytest.mark.long
-def test_statistics_are_of_all_processes_people(tmp_path):
+def test_batch_norm_statistics_use_people_of_all_processes(tmp_path):
     setup = setup_of(PRETRAIN)
     loop.train(SHORT, tmp_path / "run", setup=setup)
     runs = []

@@ -1,4 +1,4 @@
-"""People found in whole scans, mostly by a detector without weights: boxes, frames, odd input, the command line."""
+"""Detection of people in whole scans, mostly with a detector without weights: boxes, frames, odd input, commands."""
 
 import json
 from dataclasses import replace
@@ -16,6 +16,7 @@ from lidarpose.errors import InputError
 from lidarpose.eval.detector.labeled_scans import heldout_scans
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
 from lidarpose.inference import detection, verification
+from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.lidar.raycast import scan
 from lidarpose.models.detector.candidates import SceneIndex
 from lidarpose.models.detector.detector import Detector, rows_that_matter
@@ -25,7 +26,7 @@ from lidarpose.synth.bodies import draw_bodies
 from lidarpose.synth.detection_scene import detection_scene
 from lidarpose.synth.environment.mesh import Mesh, box, quad, union
 
-# feet of people who stand alone, and of two beside each other, m
+# feet of three single people and of two close to each other, m
 PLACES = np.array([[6.0, 1.0], [-4.0, 5.0], [2.0, -8.0], [5.0, -4.0], [5.0, -3.4]])
 
 
@@ -43,7 +44,7 @@ def fake(monkeypatch):
 
 @pytest.fixture(scope="module")
 def scene():
-    """Points (n, 3) m and joints (5, 26, 3) m of people on flat ground with a wall, about an OS1-64."""
+    """Points (n, 3) m and joints (5, 26, 3) m of people on flat ground with a wall, seen by an OS1-64."""
     sensor = lidarpose.sensor("os1-64")
     bodies = draw_bodies(None, captured=0.0, count=40, seed=1, block=0, moving=False)
     standing = [i for i, kind in enumerate(bodies.kinds) if kind in ("stand", "idle", "walk")][: len(PLACES)]
@@ -64,17 +65,17 @@ def file(scene, tmp_path, monkeypatch):
 
 
 def alone(points):
-    """Which of points (n, 3) m are of nobody."""
+    """Which of the points (n, 3) m are not on people."""
     return np.min(np.linalg.norm(points[:, None, :2] - PLACES, axis=2), axis=1) > 1
 
 
 def found_at(centers, joints):
-    """Which of the people (P, 26, 3) have a center (D, 3) within 0.3 m, seen from above."""
+    """For which of the people (P, 26, 3) one of the centers (D, 3) is within 0.3 m, seen from above."""
     middles = joints[:, :, :2].mean(1)
     return [bool((np.linalg.norm(np.reshape(centers, (-1, 3))[:, :2] - at, axis=1) < 0.3).any()) for at in middles]
 
 
-def test_everybody_is_found(scene):
+def test_detect_finds_all_people(scene):
     points, joints = scene
     boxes = lidarpose.detect(points)
     assert found_at([found.center for found in boxes], joints) == [True] * len(PLACES)
@@ -82,17 +83,17 @@ def test_everybody_is_found(scene):
     scores = [found.score for found in boxes]
     assert scores == sorted(scores, reverse=True) and all(0.5 <= score <= 1 for score in scores)
     assert [found.id for found in boxes] == list(range(len(boxes)))
-    # upright and about as large as they are
+    # upright and of plausible size
     for found in boxes:
         assert 1.4 < found.size[2] < 2.4 and (found.size[:2] < 1.6).all()
 
 
-def test_a_file_alone_is_searched_and_boxes_do_the_same(model, scene, file):
+def test_predict_of_file_equals_predict_with_detected_boxes(model, scene, file):
     poses = lidarpose.predict(file, model=model)
     assert len(poses) == len(PLACES) and found_at(poses.to_numpy()[:, 0], scene[1]) == [True] * len(PLACES)
     assert all(person.score == person.box.score for person in poses)
     assert {"read", "find", "load", "crop", "predict", "per_person"} == set(poses.timing_ms)
-    # files of boxes keep what was found, to the last bit of the joints
+    # saved boxes are exact: joints are bitwise equal
     lidarpose.detect(file).save("people.json")
     poses.save("poses.json")
     for boxes in ("people.json", "poses.json", lidarpose.detect(file)):
@@ -103,7 +104,7 @@ def test_a_file_alone_is_searched_and_boxes_do_the_same(model, scene, file):
     np.testing.assert_array_equal(in_memory.to_numpy(), poses.to_numpy())
 
 
-def test_second_returns_that_are_the_first_again_change_nothing(scene):
+def test_detect_ignores_duplicated_points(scene):
     points, _ = scene
     rng = np.random.default_rng(0)
     copies = np.concatenate([points, points[rng.permutation(len(points))[: len(points) // 2]]])
@@ -111,12 +112,12 @@ def test_second_returns_that_are_the_first_again_change_nothing(scene):
     for one, other in zip(boxes, again, strict=True):
         np.testing.assert_array_equal(one.center, other.center)
         assert one.score == other.score
-    # few copies are left alone, and none are no points
+    # few copies are kept, and an empty scan stays empty
     few = np.concatenate([points, points[:5]])
     assert detection._distinct(few) is few and len(detection._distinct(np.zeros((0, 3)))) == 0
 
 
-def test_fewer_are_found_where_fewer_are_asked_for(scene):
+def test_detect_options_limit_people(scene):
     points, _ = scene
     boxes = lidarpose.detect(points)
     best = lidarpose.detect(points, max_people=2)
@@ -129,8 +130,8 @@ def test_fewer_are_found_where_fewer_are_asked_for(scene):
     assert everybody[: len(boxes)] == [found.score for found in boxes]
 
 
-def test_one_person_is_found_once(scene, fake, monkeypatch):
-    """However many detections there are of them; two who stand 0.6 m apart are two."""
+def test_detect_merges_duplicate_detections(scene, fake, monkeypatch):
+    """Two people 0.6 m apart remain two."""
     boxes = lidarpose.detect(scene[0])
     detect = FakeDetector.detect
 
@@ -148,7 +149,7 @@ def test_one_person_is_found_once(scene, fake, monkeypatch):
 
 @pytest.mark.long
 @pytest.mark.parametrize("up", ["-y", "x", "0.26,0,0.97"])
-def test_other_frames_show_the_same_people(model, scene, up, tmp_path):
+def test_detect_with_up_gives_same_people(model, scene, up, tmp_path):
     points, joints = scene
     R_level_input = rotation_from_up(up)
     np.save(tmp_path / "a.npy", points @ R_level_input)
@@ -156,14 +157,14 @@ def test_other_frames_show_the_same_people(model, scene, up, tmp_path):
     assert found_at([R_level_input @ found.center for found in boxes], joints) == [True] * len(PLACES)
     poses = lidarpose.predict(tmp_path / "a.npy", up=up, model=model)
     level = lidarpose.detect(points)
-    # rounding may move a point to another cell of the search
+    # rounding may move a point to another voxel
     off = np.abs(poses.to_numpy() @ R_level_input.T - model.predict(points, boxes=level).to_numpy())
     assert off.mean() < 0.01 and off.max() < 0.15
     again = lidarpose.predict(tmp_path / "a.npy", up=up, boxes=boxes, model=model)
     if up in UP_AXES:
         np.testing.assert_array_equal(again.to_numpy(), poses.to_numpy())
     for found, person in zip(boxes, poses, strict=True):
-        # in a frame that leans a box grows, and still holds the person
+        # in a tilted frame a box is larger, and still contains the person
         own = points if up not in UP_AXES else (points @ R_level_input) @ UP_AXES[up].T
         inside = replace(found, center=UP_AXES[up] @ found.center) if up in UP_AXES else found
         held = inside.contains(own if up in UP_AXES else points @ R_level_input).sum()
@@ -171,13 +172,13 @@ def test_other_frames_show_the_same_people(model, scene, up, tmp_path):
     assert poses.picture()
 
 
-def test_a_tilted_sensor_is_told(model, scene):
+def test_predict_warns_of_tilted_sensor(model, scene):
     points, joints = scene
     tilt = rotation_about("y", np.radians(20.0))
     poses = model.predict(points @ tilt.T, find=True)
     (warning,) = (warning for warning in poses.warnings if "leans by" in warning)
     assert "leans by 20 degrees" in warning or "leans by 19" in warning
-    # what it says to give is what was found
+    # the suggested up axis is the tilted one
     suggested = np.array([float(value) for value in warning.rpartition("up=")[2].split(",")])
     assert np.linalg.norm(suggested) == pytest.approx(1, abs=2e-3) and suggested @ tilt[:, 2] > np.cos(np.radians(2))
     assert sum(found_at(poses.to_numpy()[:, 0] @ tilt, joints)) >= 4
@@ -185,7 +186,7 @@ def test_a_tilted_sensor_is_told(model, scene):
 
 @pytest.mark.long
 @pytest.mark.parametrize("axis", ["z", "-y"])
-def test_boxes_of_a_tilted_scan_say_what_is_up(model, scene, tmp_path, axis):
+def test_boxes_of_tilted_scan_store_up_axis(model, scene, tmp_path, axis):
     tilt = rotation_about("y", np.radians(20.0))
     path = tmp_path / "sweep.npy"
     points = scene[0] @ tilt.T @ UP_AXES[axis]
@@ -195,20 +196,20 @@ def test_boxes_of_a_tilted_scan_say_what_is_up(model, scene, tmp_path, axis):
     assert searched.up == boxes.up and len(boxes.up.split(",")) == 3 and boxes[:2].up == boxes.up
     boxes.save(tmp_path / "sweep.boxes.json")
     searched.save(tmp_path / "sweep.poses.json")
-    # without a word about the axis
+    # the up axis is taken from the boxes
     for given in (boxes, tmp_path / "sweep.boxes.json", tmp_path / "sweep.poses.json"):
         again = lidarpose.predict(path, boxes=given, model=model)
         assert again.up == searched.up
         errors = np.linalg.norm(again.to_numpy() - searched.to_numpy(), axis=-1).mean(1)
         assert len(again) == len(searched) and np.median(errors) < 0.03
     np.testing.assert_array_equal(model.predict(points, boxes=boxes).to_numpy(), again.to_numpy())
-    # but what is said counts, unless it is another axis
+    # a given up axis is used, unless it contradicts that of the boxes
     assert lidarpose.predict(path, boxes=boxes, up=axis, model=model).up == axis
     with pytest.raises(InputError, match="the up axis of the boxes is"):
         lidarpose.predict(path, boxes=boxes, up="x", model=model)
 
 
-def test_arrows_of_a_tilted_scan_show_where_people_face(model, scene):
+def test_picture_of_tilted_scan_shows_facing(model, scene):
     tilt = rotation_about("y", np.radians(20.0)) @ rotation_about("z", 2.5)
     poses = model.predict(scene[0] @ tilt.T, find=True)
     _, above = poses._panels()
@@ -222,7 +223,7 @@ def test_arrows_of_a_tilted_scan_show_where_people_face(model, scene):
 
 
 @pytest.mark.parametrize("up", ["y", "-y", "x"])
-def test_boxes_of_a_tilted_sensor_face_as_people_do_whatever_axis_is_up(scene, up):
+def test_boxes_of_tilted_scan_have_correct_yaw(scene, up):
     level = lidarpose.detect(scene[0])
     tilt = rotation_about("y", np.radians(20.0))
     boxes = lidarpose.detect(scene[0] @ tilt.T @ UP_AXES[up], up=up)
@@ -236,13 +237,13 @@ def test_boxes_of_a_tilted_sensor_face_as_people_do_whatever_axis_is_up(scene, u
 
 @pytest.mark.long
 @pytest.mark.parametrize(("factor", "word"), [(1000, "millimeters"), (100, "centimeters"), (0.001, "kilometers")])
-def test_units_are_told_before_anyone_is_found(scene, factor, word):
+def test_detect_warns_of_wrong_units(scene, factor, word):
     (warning,) = lidarpose.detect(scene[0] * factor).warnings
     assert word in warning
 
 
-def test_a_tilted_scan_is_not_in_other_units(scene):
-    """However tall it is in the frame of its sensor."""
+def test_detect_does_not_take_tilted_scan_for_wrong_units(scene):
+    """Although the scan is tall in the frame of its sensor."""
     x, y = np.meshgrid(np.arange(-45.0, 45, 0.5), np.arange(-15.0, 15, 0.5))
     road = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -1.5)])
     street = np.concatenate([scene[0], *[road] * 3]) @ rotation_about("y", np.radians(30.0)).T
@@ -250,13 +251,13 @@ def test_a_tilted_scan_is_not_in_other_units(scene):
     assert "leans by" in warning
 
 
-def test_one_person_is_no_scan_in_kilometers():
+def test_detect_does_not_take_single_person_for_kilometers():
     standing = np.random.default_rng(0).normal([8, 0, 0], [0.08, 0.12, 0.4], (500, 3))
     assert not any("kilometers" in warning for warning in lidarpose.detect(standing).warnings)
 
 
-def test_axes_are_told(scene):
-    # nobody is in them with any axis up
+def test_detect_warns_of_wrong_up_axis(scene):
+    # no person is detected with any up axis
     empty = scene[0][alone(scene[0])]
     (warning,) = lidarpose.detect(empty @ UP_AXES["y"]).warnings
     assert "probably not the input's up axis: try up y" in warning
@@ -266,7 +267,7 @@ def test_axes_are_told(scene):
 
 @pytest.mark.long
 @pytest.mark.parametrize("up", ["y", "-y", "x", "-x"])
-def test_a_warning_names_the_axis_with_which_people_are_detected(scene, file, up):
+def test_detect_suggests_up_axis_that_finds_people(scene, file, up):
     near = scene[0][np.abs(scene[0][:, :2]).max(1) < 6]
     for points in (scene[0], near):
         boxes = lidarpose.detect(points @ UP_AXES[up])
@@ -278,15 +279,15 @@ def test_a_warning_names_the_axis_with_which_people_are_detected(scene, file, up
     assert lidarpose.predict(file).warnings == (warning,)
 
 
-def test_no_other_axis_is_offered_where_nobody_is(scene, fake):
+def test_detect_suggests_no_up_axis_without_people(scene, fake):
     empty = scene[0][alone(scene[0])]
     assert lidarpose.detect(empty).warnings == () and len(fake.calls) == 1
-    # in a room nothing tells what is up
+    # in a room the up axis is ambiguous, so all are tried
     near = empty[np.abs(empty[:, :2]).max(1) < 6]
     assert lidarpose.detect(near).warnings == () and len(fake.calls) >= 6
 
 
-def test_the_sensor_stands_at_zero_unless_it_cannot(scene, fake):
+def test_detect_replaces_implausible_sensor_origin_by_unknown(scene, fake):
     points, joints = scene
     height = np.array([0, 0, 1.8])
     for moved, problem in ((np.array([5e5, 5e6, 0]), "nearest point"), (height, "no ground below it")):
@@ -298,13 +299,13 @@ def test_the_sensor_stands_at_zero_unless_it_cannot(scene, fake):
         np.testing.assert_allclose(fake.calls[-1]["origin"], moved)
     assert lidarpose.detect(points, sensor_origin="unknown").warnings == ()
     assert fake.calls[-1]["origin"] is None
-    # a drone, and what is no sensor's height
+    # a drone at 40 m, and an implausible height
     assert lidarpose.detect(points, sensor_origin=(0, 0, 40)).warnings == ()
     (warning,) = lidarpose.detect(points, sensor_origin=(0, 0, 100)).warnings
     assert "m from the nearest point" in warning and fake.calls[-1]["origin"] is None
 
 
-def test_nothing_to_find_is_no_error(model):
+def test_detect_of_scans_without_people_is_empty(model):
     rng = np.random.default_rng(0)
     floor = np.column_stack([rng.uniform(-20, 20, (20_000, 2)), rng.normal(-1.7, 0.01, 20_000)])
     line = np.column_stack([np.linspace(-30, 30, 500), np.zeros((500, 2))])
@@ -321,38 +322,38 @@ def test_nothing_to_find_is_no_error(model):
         assert len(model.predict(points, find=True)) == 0
 
 
-def test_a_map_is_thinned(scene, monkeypatch):
+def test_find_people_thins_large_maps(scene, monkeypatch):
     points, _ = scene
     far = np.random.default_rng(0).uniform((100, 100, -2), (900, 900, 2), (20_000, 3))
     wide = np.concatenate([far, points])
     monkeypatch.setattr(detection, "_CHUNK", 777)
     monkeypatch.setattr(detection, "_MOST_POINTS", len(wide) // 2)
-    # of an unknown sensor evenly
+    # evenly, if the sensor is unknown
     unknown = detection.find_people(detection.Scan(points=wide), detection.Search())
     assert abs(len(unknown.points) - len(wide) / 2) < 500 and any("thinned" in line for line in unknown.warnings)
-    # around a known one what is out of reach goes first, without a word
+    # around a known sensor, points out of range are dropped first, without a warning
     known = detection.Scan(points=wide, origin=np.zeros(3))
     monkeypatch.setattr(detection, "_MOST_AROUND", len(points))
     searched = detection.find_people(known, detection.Search())
     np.testing.assert_array_equal(searched.points, points[np.linalg.norm(points, axis=1) < 55])
-    # then what is dense: who is far keeps all points
+    # then dense regions are thinned, and far people keep all points
     monkeypatch.setattr(detection, "_MOST_AROUND", len(points) // 2)
     searched = detection.find_people(known, detection.Search())
     assert abs(len(searched.points) - len(points) / 2) < 500 and searched.warnings == () and len(searched.boxes) >= 4
     distance, kept = np.linalg.norm(points, axis=1), np.linalg.norm(searched.points, axis=1)
     assert (kept > 15).sum() == ((distance > 15) & (distance < 55)).sum() > 1000
     assert 0 < (kept < 6).sum() < 0.4 * (distance < 6).sum()
-    # a sensor that is nowhere near is no middle
+    # a sensor far away from all points is not used as the center
     monkeypatch.setattr(detection, "_MOST_POINTS", len(wide))
     away = detection._thinned(detection.Scan(points=points, origin=np.full(3, 1e5)), detection.Search())
     assert len(away[0].points) == len(points) and away[1] == []
-    # and with a note what people have few points of
+    # with a warning if people keep few points
     monkeypatch.setattr(detection, "_MOST_AROUND", 200)
     assert any("thinned" in line for line in detection.find_people(known, detection.Search()).warnings)
 
 
-def test_around_a_sensor_that_cannot_stand_at_zero_all_of_a_map_is_searched(scene, fake, monkeypatch):
-    """Whether it is thinned or not, and what is up is told as of an unknown sensor."""
+def test_detect_searches_whole_map_around_implausible_origin(scene, fake, monkeypatch):
+    """With and without thinning; the up axis is checked as for an unknown sensor."""
     points, _ = scene
     moved, bare = np.array([70.0, 0, 1.5]), np.array([-70.0, 0, 1.5])
     empty = points[points[:, 2] < -1.45]
@@ -361,7 +362,7 @@ def test_around_a_sensor_that_cannot_stand_at_zero_all_of_a_map_is_searched(scen
     boxes = lidarpose.detect(wide)
     assert any("no ground below it" in warning for warning in boxes.warnings)
     assert any("thinned" in warning for warning in boxes.warnings) and len(boxes) >= 4
-    # a single point at zero is no surroundings
+    # a single point at the origin does not make it plausible
     lidarpose.detect(np.concatenate([wide + [5e5, 5e6, 0], np.zeros((1, 3))]))
     assert fake.calls[-1]["origin"] is None and len(fake.calls[-1]["points"]) > 1000
     tilted = points @ rotation_about("y", np.radians(20.0)).T + [5e5, 5e6, 0]
@@ -371,18 +372,18 @@ def test_around_a_sensor_that_cannot_stand_at_zero_all_of_a_map_is_searched(scen
 # ---- the final score
 
 
-def test_the_final_score_is_what_the_header_says():
+def test_final_score_uses_weights_of_header():
     features = np.array([[2.0, 1.5, 5.0], [np.nan, 0.5, 4.0], [1.0, np.nan, 4.0]])
     header = {"verification": {"bias": 0.5, "logit": 1.5, "verifier": 2.0, "log_points": 0.1}}
     header["verification"]["calibration"] = [[0.0, 10.0], [0.0, 1.0]]
     np.testing.assert_allclose(verification.final_score(features, header), [(0.5 + 3 + 3 + 0.5) / 10, 0, 0])
-    # weights of before there was a verifier are of other features
+    # older weights, for other features than those of a verifier, are ignored
     header = {"calibration": [[-10.0, 10.0], [0.0, 1.0]], "verification": {"bias": 9.0, "logit": 1.0, "person": 1.0}}
     np.testing.assert_allclose(verification.final_score(features[:1], header), 0.5 + 1.75 / 20)
 
 
-def test_a_detector_that_is_not_calibrated_scores_as_its_network_does(scene, fake, monkeypatch):
-    """As `lidarpose evaluate detector --detector` meets it after an export."""
+def test_final_score_without_calibration_is_network_score(scene, fake, monkeypatch):
+    """This is the case in `lidarpose evaluate detector --detector` after an export."""
     features = np.array([[-2.0, -2, 4], [0, 0, 4], [3, 3, 4], [np.nan, 1, 4]])
     scores = verification.final_score(features, {})
     np.testing.assert_allclose(scores, [*(1 / (1 + np.exp(-features[:3, 0]))), 0], atol=1e-4)
@@ -395,8 +396,8 @@ def test_a_detector_that_is_not_calibrated_scores_as_its_network_does(scene, fak
 
 
 @pytest.mark.long
-def test_a_background_is_not_searched(scene, tmp_path, fake):
-    """People keep their points where they touch it, and a person in it is none."""
+def test_detect_excludes_background(scene, tmp_path, fake):
+    """People keep their points close to the background, and a person in the background is not detected."""
     points, joints = scene
     decoy = points[np.linalg.norm(points[:, :2] - PLACES[0], axis=1) < 0.8]
     rest = points[np.linalg.norm(points[:, :2] - PLACES[0], axis=1) >= 0.8]
@@ -421,51 +422,53 @@ def test_a_background_is_not_searched(scene, tmp_path, fake):
     assert len(itself) == 0 and "learned from this scan alone?" in itself.warnings[0]
 
 
-# ---- mistakes, and the command line
+# ---- errors and commands
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"min_score": 2}, "min score: expected a probability"),
-        ({"min_score": "high"}, "min score"),
+        ({"min_score": 2}, "min_score: expected a probability"),
+        ({"min_score": "high"}, "min_score"),
         ({"max_range": 0}, "range: expected meters"),
         ({"max_range": np.nan}, "range: expected meters"),
-        ({"max_people": 0}, "max people must be a whole number"),
+        ({"max_people": 0}, "max_people must be a whole number"),
         ({"sensor_origin": "here"}, "sensor origin"),
         ({"up": "w"}, "up: expected"),
         ({"background": []}, "background: expected"),
         ({"background": "nowhere.pcd"}, "nowhere.pcd: no such file"),
     ],
 )
-def test_wrong_options_are_told(scene, options, words):
+def test_detect_rejects_invalid_options(scene, options, words):
     with pytest.raises(InputError, match=words):
         lidarpose.detect(scene[0], **options)
-    # of one person, too, who is not searched for
+    # also for a file of one person, in which no detection takes place
     if options.keys() & {"min_score", "max_range", "max_people", "background"}:
         with pytest.raises(InputError, match=words):
             lidarpose.predict(np.random.default_rng(0).uniform(0, 1, (50, 3)), **options, model="tiny")
 
 
-def test_boxes_and_crops_are_not_searched(model, file, fake, scene):
+def test_predict_rejects_detection_options_with_boxes_or_crop(model, file, fake, scene):
     for given in ({"boxes": []}, {"crop": True}):
         for option in ({"find": True}, {"min_score": 0.5}, {"max_people": 1}, {"background": file}, {"max_range": 9.0}):
             with pytest.raises(InputError, match="options of the detection: omit them with boxes or a crop"):
                 lidarpose.predict(file, **given, **option, model=model)
     with pytest.raises(InputError, match="find is an option of the detection: omit it with boxes"):
         model.predict(scene[0], boxes=[], find=True)
-    # a small file is one person unless it is to be searched
+    # a small file is one person unless find is given
     near = scene[0][np.linalg.norm(scene[0][:, :2] - PLACES[0], axis=1) < 1.5]
     np.save("small.npy", near)
     assert lidarpose.predict("small.npy", model=model)[0].box is None and not fake.calls
-    # and options of a search that is not made are told
+    # detection options without a detection give a warning
     for option in ({"min_score": 0.5}, {"background": file}):
         (person,) = lidarpose.predict("small.npy", **option, model=model)
-        assert person.box is None and any("use find to detect people" in warning for warning in person.warnings)
+        assert person.box is None and any(
+            "set find (--find) to detect people" in warning for warning in person.warnings
+        )
     assert lidarpose.predict("small.npy", find=True, sensor_origin="unknown", model=model)[0].box is not None
 
 
-def test_the_commands(file, capsys, fake, tmp_path):
+def test_detect_and_predict_commands(file, capsys, fake, tmp_path):
     assert main(["detect", file]) == 0
     assert capsys.readouterr().err.strip() == "5 people found -> sweep.boxes.json"
     document = json.loads((tmp_path / "sweep.boxes.json").read_text())
@@ -486,16 +489,15 @@ def test_the_commands(file, capsys, fake, tmp_path):
     assert main(["predict", file, *fast, "--background", "static.npy", "--picture", "--sensor-origin", "0,0,0.1"]) == 0
     warning, line = capsys.readouterr().err.strip().splitlines()
     assert "learned from this scan alone?" in warning
-    assert line.startswith(
-        "no people found -> sweep.poses.json and sweep.poses.png; if there should be: points need meters"
-    )
+    # the warning states the cause, so there is no further advice
+    assert line == "no people found -> sweep.poses.json and sweep.poses.png"
     assert json.loads((tmp_path / "sweep.poses.json").read_text())["people"] == []
     for wrong, words in (
         (["detect", file, "--out", "boxes.csv"], "a folder or a file .json, got .csv"),
         (["detect", file, "--out", file], "got .npy"),
         (["detect", "none.pcd"], "no such file"),
         (["detect", file, "--min-score", "7"], "probability"),
-        (["predict", file, "--boxes", "sweep.boxes.json", "--find"], "find, min score, range"),
+        (["predict", file, "--boxes", "sweep.boxes.json", "--find"], "find, min_score, max_range"),
     ):
         assert main(wrong) == 2
         error = capsys.readouterr().err
@@ -512,18 +514,18 @@ def bundled(monkeypatch):
     monkeypatch.setattr(detection, "_detector", cache(Detector))
 
 
-def test_the_bundled_detector_finds_people_and_poses_them(bundled, scene, file, model):
+def test_bundled_detector_finds_and_poses_people(bundled, scene, file, model):
     points, joints = scene
     poses = lidarpose.predict(file, model=model)
     assert sum(found_at(poses.to_numpy()[:, 0], joints)) >= 4 and len(poses) <= 6
     assert 0 < detection._detector().header["default_score"] < 1
-    # the wall and the ground alone
+    # only the wall and the ground
     assert len(lidarpose.detect(points[alone(points)])) <= 1
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="needs real sweeps")
 @pytest.mark.parametrize("sweep", ["sweep_0.pcd", "sweep_1.bin", "sweep_2.ply"])
-def test_people_in_real_sweeps_are_found(bundled, sweep):
+def test_bundled_detector_finds_people_in_real_sweeps(bundled, sweep):
     path = REAL / sweep
     points = lidarpose.read_points(path).points
     labels = [box for box in lidarpose.read_boxes(path.with_suffix(".json")) if np.hypot(*box.center[:2]) < 40]
@@ -531,11 +533,11 @@ def test_people_in_real_sweeps_are_found(bundled, sweep):
     boxes = lidarpose.detect(path)
     centers = np.array([box.center[:2] for box in boxes]).reshape(-1, 2)
     found = sum(bool((np.linalg.norm(centers - box.center[:2], axis=1) < 0.5).any()) for box in labels)
-    # all but one, and few who have no label
+    # at most one person is missed, and few detections have no label
     assert found >= len(labels) - 1 and len(boxes) - found <= 5 and boxes.warnings == ()
 
 
-def test_who_cannot_reach_the_least_score_is_neither_verified_nor_posed(monkeypatch):
+def test_verified_skips_candidates_below_min_score(monkeypatch):
     scene = detection_scene(5, 5)
     points, origin = scene.points, scene.origin
     detections = Detector(threads=1).detect(points, origin, limit=60)
@@ -551,37 +553,55 @@ def test_who_cannot_reach_the_least_score_is_neither_verified_nor_posed(monkeypa
     people = verification.verified(detections, points, origin, header, 0.6)
     (_, verifier), (posed, poser), *again = verified
     assert verifier is not poser and set(posed) == set(np.flatnonzero(scores >= 0.6))
-    # of those who are left whoever is near to a surer one
+    # a second pass poses only people close to one with a higher score
     assert all(backend is poser and 0 < len(rows) < len(posed) for rows, backend in again) and len(again) <= 1
-    # several have a score of 1
+    # by logits, because several scores are 1
     own = [np.nanargmin(np.abs(logits - logit)) for logit in people.logits]
     np.testing.assert_allclose(people.logits, logits[own])
     np.testing.assert_allclose([box.score for box in people.boxes], scores[own])
     assert len(people.boxes) >= 2 and (np.diff([box.score for box in people.boxes]) <= 0).all()
-    # who is less sure and shown too narrows nobody's box
+    # additional people with lower scores do not change the boxes of others
     more = verification.verified(detections, points, origin, header | {"default_score": 0.6}, 0.05).boxes
     assert len(more) > len(people.boxes)
     for own, same in zip(people.boxes, more, strict=False):
         assert (own.score, *own.center, *own.size) == (same.score, *same.center, *same.size)
-    # nobody is most of somebody surer
+    # verified detections below a third of the score threshold are rejected
+    nobody = detections.centers[(highest >= 0.6) & (scores < 0.2)]
+    np.testing.assert_array_equal(people.rejected, nobody)
+    # known people are not verified again and their positions are not rejected
+    own = [people.pelvises[:1], people.boxes[0].center[None], np.array([0.5])]
+    known = KnownPlaces(
+        boxes=people.boxes[:1],
+        **dict(zip(("pelvises", "tracks", "reach"), own, strict=True)),
+        rejected=np.zeros((0, 3)),
+    )
+    again = verification.verified(detections, points, origin, header, 0.6, known=known)
+    assert sorted(again.verified) == [False] + [True] * (len(people.boxes) - 1) and len(nobody)
+    assert {tuple(place) for place in again.rejected} <= {tuple(place) for place in nobody}
+    # for max_people=1, the two highest-scoring detections are posed
+    verified.clear()
+    (alone,) = verification.verified(detections, points, origin, header, 0.6, 1).boxes
+    assert sorted(verified[1][0]) == sorted(np.lexsort((-logits, -np.nan_to_num(scores)))[:2])
+    np.testing.assert_array_equal(alone.center, people.boxes[0].center)
+    # people share few points with those of higher scores
     owned = set()
     for rows in people.rows:
         assert len(owned & set(rows.tolist())) <= verification._SHARED * len(rows)
         owned |= set(rows.tolist())
 
 
-def test_candidates_are_spread_over_threads():
+def test_detector_results_are_independent_of_threads():
     scene = detection_scene(5, 5)
     alone, spread = (Detector(threads=n).detect(scene.points, scene.origin, limit=40) for n in (1, 3))
     for name in ("centers", "sizes", "logit", "score", "mounted"):
         np.testing.assert_allclose(getattr(spread, name), getattr(alone, name), atol=1e-4)
-    # nobody to look at
+    # no candidates
     assert len(Detector(threads=3).detect(np.zeros((0, 3)), scene.origin)) == 0
 
 
 @pytest.fixture(scope="module")
 def hidden():
-    """A scene whose person 6, 0.8 m from another, has no detection, as if taken for one with the other."""
+    """A scene in which person 6, 0.8 m from another, has no detection, as if the two were merged."""
     scene = heldout_scans().loaders[170]()
     detector = Detector(threads=1)
     detections = detector.detect(scene.points, scene.origin, limit=60)
@@ -591,7 +611,7 @@ def hidden():
     return scene, detector, replace(detections, **arrays)
 
 
-def test_who_is_beside_somebody_is_found_without_their_points(hidden):
+def test_verified_detects_person_beside_another(hidden):
     scene, detector, detections = hidden
     rows_asked = []
 
@@ -608,18 +628,18 @@ def test_who_is_beside_somebody_is_found_without_their_points(hidden):
     people = verification.verified(*given, detect_beside=detect_beside)
     ((rows, places),) = rows_asked
     assert is_detected(people) and not is_detected(alone)
-    # nobody else is lost, and the points on those who were detected were not looked at again
+    # no other person is lost, and points on detected people are not searched again
     assert {tuple(box.center) for box in alone.boxes} <= {tuple(box.center) for box in people.boxes}
     assert scene.num_points[6] > 100 and len(places) >= len(alone.boxes)
     left = np.isin(np.arange(len(scene.points)), rows)
     assert left[scene.person == 6].mean() > 0.7 and left[scene.person < 0].mean() > 0.99
     assert [box.id for box in people.boxes] == list(range(len(people.boxes)))
-    # scores are not those of who asks: a lower bound only adds people
+    # scores do not depend on min_score: a lower one only adds people
     more = verification.verified(*given[:-1], 0.3, detect_beside=detect_beside)
     assert {tuple(box.center) for box in people.boxes} <= {tuple(box.center) for box in more.boxes}
 
 
-def test_people_beside_others_are_looked_for_near_them_alone(hidden):
+def test_detect_beside_searches_only_near_given_people(hidden):
     scene, detector, detections = hidden
     people = scene.joints[:3, 0, :2].astype(float)
     rows = np.arange(len(scene.points))
@@ -627,16 +647,16 @@ def test_people_beside_others_are_looked_for_near_them_alone(hidden):
     beside = detector.detect_beside(*given, people)
     distance = np.linalg.norm(beside.centers[:, None, :2] - people, axis=-1).min(1)
     assert 0 < len(beside) < len(detections) and distance.max() < 0.85 + 0.6
-    # of nobody, and where nothing moves
+    # without people, and without moving points
     assert not len(detector.detect_beside(*given, people[:0]))
     assert not len(detector.detect_beside(*given, people, moving=np.zeros(len(rows), bool)))
 
 
 @pytest.mark.parametrize("is_known", [True, False])
-def test_a_few_places_look_the_same_without_the_points_that_do_not_matter(hidden, is_known):
+def test_rows_that_matter_give_same_candidates_as_all_points(hidden, is_known):
     scene, _, detections = hidden
     origin = scene.origin if is_known else None
-    # one nearer to the sensor than a view is wide
+    # the last place is closer to the sensor than the width of a view
     places = np.concatenate([scene.joints[:4, 0].astype(float), scene.origin[None] + [0.9, 0.4, -1.0]])
     places[:, 2] = detections.ground.at(places[:, :2])
     for part in (places, places[:1], places[:0]):
@@ -650,20 +670,20 @@ def test_a_few_places_look_the_same_without_the_points_that_do_not_matter(hidden
         assert len(rows) < len(scene.points) or len(part) > 1
 
 
-def test_of_two_whose_pelvises_meet_the_surer_one_stays():
+def test_surest_rows_keeps_higher_score_of_close_pelvises():
     pelvises = np.array([[0.0, 0, 0], [0.25, 0, 0], [0.5, 0, 0], [np.nan, 0, 0], [5, 0, 0]])
     none = np.zeros(5)
     assert verification.surest_rows(np.array([0.5, 0.9, 0.4, 1.0, 0.1]), pelvises, none) == [1, 4]
-    # who is near somebody that has gone stays
+    # a person close only to a removed one stays
     assert verification.surest_rows(np.array([0.9, 0.8, 0.7, 1.0, 0.1]), pelvises, none) == [0, 2, 4]
-    # of equal scores by what they rise with
+    # equal scores are ordered by their logits
     ties = np.array([1.0, 2.0, np.nan, 0.0, 0.0])
     assert verification.surest_rows(np.array([0.9, 0.9, 0.9, 0.9, 0.1]), pelvises, ties) == [1, 4]
     assert verification.surest_rows(np.zeros(0), np.zeros((0, 3)), np.zeros(0)) == []
 
 
-def test_what_is_left_of_somebody_s_points_is_nobody_beside_them(monkeypatch):
-    """By the pelvis that the points in each one's own box show, of those who are close to a surer one."""
+def test_without_repeats_removes_second_box_of_one_person(monkeypatch):
+    """Boxes close to one with a higher score are posed again with their own points; their pelvis then decides."""
     pelvises = np.array([[0.0, 0, 0], [0.5, 0, 0], [1.0, 0, 0], [5, 0, 0]])
     own = {0: [9.0, 9, 9], 1: [0.2, 0, 0], 2: [0.45, 0, 0], 3: [9.0, 9, 9]}
     asked = []
@@ -678,13 +698,13 @@ def test_what_is_left_of_somebody_s_points_is_nobody_beside_them(monkeypatch):
     people = [(k, Box(center=pelvises[k], size=np.ones(3)), np.array([k])) for k in range(4)]
     places = SimpleNamespace(pelvises=pelvises)
     kept = verification._without_repeats(people, places, points, None)
-    # the third is shown where the second was, who is none
+    # the third is posed at the place of the second, which was removed
     assert [row for row, _, _ in kept] == [0, 2, 3] and asked == [[0.5, 1.0]]
     assert verification._without_repeats(people[3:], places, points, None) == people[3:] and len(asked) == 1
     assert verification._without_repeats([], places, points, None) == []
 
 
-def test_options_of_a_search_are_numbers_of_any_kind(model, scene, fake):
+def test_detect_accepts_numpy_numbers_as_options(model, scene, fake):
     expected = lidarpose.detect(scene[0], max_range=20.0)
     for options in ({"max_range": np.array(20.0)}, {"max_range": np.float32(20), "up": None}):
         assert [box.score for box in lidarpose.detect(scene[0], **options)] == [box.score for box in expected]

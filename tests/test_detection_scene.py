@@ -1,4 +1,4 @@
-"""Scenes to find people in: whose points are whose, what each family may hold, and that nothing else draws along."""
+"""Scenes for training of the detector: owners of points, content of each family, determinism."""
 
 import json
 from collections import Counter
@@ -30,7 +30,7 @@ def heldout() -> list[DetectionScene]:
     return [detection_scene(5, index, family="heldout") for index in range(30)]
 
 
-def test_a_scene_is_a_function_of_seed_index_and_family(train):
+def test_detection_scene_is_determined_by_seed_index_and_family(train):
     again, others = detection_scene(5, 3), [detection_scene(6, 3), detection_scene(5, 3, family="bench")]
     for name in ("points", "origin", "person", "thing", "joints", "mounted", "up"):
         np.testing.assert_array_equal(getattr(again, name), getattr(train[3], name))
@@ -39,7 +39,7 @@ def test_a_scene_is_a_function_of_seed_index_and_family(train):
         assert other.points.shape != again.points.shape or (other.points != again.points).any()
 
 
-def test_points_of_people_lie_in_their_boxes_and_boxes_on_the_ground(train, heldout):
+def test_detection_scene_boxes_contain_points_of_people(train, heldout):
     strays = people = 0
     for scene in [*train, *heldout]:
         count = len(scene.boxes)
@@ -54,26 +54,26 @@ def test_points_of_people_lie_in_their_boxes_and_boxes_on_the_ground(train, held
         for number, box in enumerate(scene.boxes):
             own = scene.points[scene.person == number]
             people += 1
-            # clothes, skirts, hats and range noise beyond the tight box
+            # clothes, hats and range noise exceed the tight box
             assert box.contains(own, 0.3).all()
             assert box.contains(scene.joints[number], 0.02).all()
             assert 0.3 < box.size[2] < 2.6 and box.id == number
         centers = np.array([box.center for box in scene.boxes]).reshape(-1, 3)
         gaps = np.linalg.norm(centers[:, None] - centers, axis=-1) + 9 * np.eye(count)
-        # half of a wide stride nearer than where they stand
+        # closer than people are placed, by half of a wide stride
         strays += int((gaps < 0.2).sum())
-    # some walk towards each other
+    # few people walk into each other
     assert people > 300 and strays < 0.01 * people
 
 
-def test_training_never_draws_what_is_left_out(train, heldout):
+def test_training_scenes_exclude_left_out_kinds(train, heldout):
     for scene in train:
         assert scene.kind not in LEFT_OUT and not LEFT_OUT_THINGS & set(scene.negatives)
     assert set(LEFT_OUT) & {scene.kind for scene in heldout}
     assert set().union(*(scene.negatives for scene in heldout)) >= LEFT_OUT_THINGS
 
 
-def test_all_kinds_places_and_sensors_occur(train, heldout):
+def test_scenes_contain_all_kinds_places_and_sensors(train, heldout):
     present = Counter(name for scene in train for name in scene.negatives)
     assert set(present) | LEFT_OUT_THINGS == set(KINDS)
     assert {scene.kind for scene in train} == set(
@@ -81,7 +81,7 @@ def test_all_kinds_places_and_sensors_occur(train, heldout):
     )
     assert len({scene.sensor for scene in train}) >= 9
     seen = [np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes)) for scene in train]
-    # most scenes show people, and riders are among them
+    # people are visible in most scenes, and some are riders
     assert np.mean([(counts >= 20).any() for counts in seen]) > 0.6
     assert sum(int(scene.mounted.sum()) for scene in train) > 20
     tilt = np.degrees([np.arccos(min(scene.up[2], 1.0)) for scene in train])
@@ -90,7 +90,7 @@ def test_all_kinds_places_and_sensors_occur(train, heldout):
     assert min(scene.height for scene in train) < 0.6 and max(scene.height for scene in train) > 3
 
 
-def test_a_third_of_the_people_in_training_do_not_stand(train, heldout):
+def test_third_of_people_in_training_do_not_stand(train, heldout):
     low, of_heldout = (
         np.mean([kind in ("sit", "crouch", "kneel", "bend") for scene in scenes for kind in scene.activities])
         for scenes in (train, heldout)
@@ -98,30 +98,30 @@ def test_a_third_of_the_people_in_training_do_not_stand(train, heldout):
     assert 0.26 < low < 0.4 and of_heldout < low - 0.05
 
 
-def test_beams_pass_the_windows_of_some_cars_and_end_inside():
+def test_with_windows_lets_beams_into_some_cars():
     beam = Sensor(name="beam", elevations=np.zeros(1), azimuth_step=np.pi / 90, range_max=20.0)
     depths = []
     for number in range(30):
         car, angle = shape("car", 4.4, 1.8, 1.5), 0.3 * number
         mesh = with_windows(car.moved((20.0, -30.0, 2.0), angle), np.random.default_rng(number))
         mesh = mesh.moved((-20.0, 30.0, -2.0)).moved((0.0, 0.0, 0.0), -angle)
-        # all that is added is inside
+        # added surfaces are inside the car
         np.testing.assert_allclose(
             [mesh.vertices.min(0), mesh.vertices.max(0)], [car.vertices.min(0), car.vertices.max(0)], atol=1e-4
         )
         # from the side, at the height of the windows
         points = scan(mesh.moved((0.0, 6.0, -1.2)).vertices, mesh.faces, beam).points
         depths += (points[:, 1] - 5.1).tolist()
-    # at glass, and on seats, heads or the far window
+    # some beams hit glass, others seats, heads or the far window
     assert sum(depth < 0.35 for depth in depths) > 100 and sum(depth > 0.4 for depth in depths) > 20
 
 
-def test_what_is_no_car_has_no_windows():
+def test_with_windows_keeps_other_vehicles():
     van = shape("van", 5.0, 2.0, 2.0)
     assert with_windows(van, np.random.default_rng(0)) is van
 
 
-def test_people_stand_on_the_road_up_to_its_kerb():
+def test_site_level_follows_road_and_curb():
     road = Sensor(name="beam", elevations=np.zeros(1), azimuth_step=np.pi / 2, range_max=20.0)
     mount = Mount(height=2.0, R_sensor_level=np.eye(3), turn=0.0, view=(0.0, np.pi))
     kerbs = []
@@ -132,7 +132,7 @@ def test_people_stand_on_the_road_up_to_its_kerb():
         for offset in (-0.3, 0.3, -1.9, 1.9):
             for side in (-1, 1):
                 place = np.array([0.0, side * (layout.road + offset) - y])
-                # nearest in y of the ground's rows of vertices that lie on the same side of the kerb
+                # the ground's row of vertices that is nearest in y on the same side of the curb
                 is_same_side = (np.abs(ground[:, 1] + y) > layout.road + 0.01) == (offset > 0)
                 rows = ground[is_same_side]
                 expected = rows[np.argmin(np.abs(rows[:, 1] - place[1])), 2]
@@ -142,13 +142,13 @@ def test_people_stand_on_the_road_up_to_its_kerb():
 
 
 @pytest.mark.parametrize("wrong", [{"seed": -1}, {"index": 1.5}, {"family": "test"}])
-def test_wrong_arguments_say_what_is_expected(wrong):
+def test_detection_scene_rejects_invalid_arguments(wrong):
     with pytest.raises(InputError):
         detection_scene(**({"seed": 1, "index": 0} | wrong))
 
 
 @pytest.mark.parametrize("row", [0, 77, 202])
-def test_the_frozen_scenes_for_judging_are_made_again(row):
+def test_frozen_heldout_scenes_are_reproduced(row):
     frozen = json.loads(resources.files("lidarpose.eval").joinpath("assets/detector-heldout-1.json").read_text())
     assert frozen["indices"] == list(range(240)) and set(frozen["left_out"]) == LEFT_OUT_THINGS | set(LEFT_OUT)
     scene = detection_scene(frozen["seed"], frozen["indices"][row], family=frozen["family"])

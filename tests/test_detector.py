@@ -1,4 +1,4 @@
-"""The detector's runtime: from a scan to people, with a scorer that reads what the network would."""
+"""The detector's runtime, from a scan to people, with a scorer in place of the network."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ ORIGIN = np.zeros(3)
 
 
 def upright(arrays):
-    """A stand-in for the network: how many slices hold points within 0.4 m of the middle, but for the ground's."""
+    """A scorer in place of the network: number of slices above the ground with points within 0.4 m of the axis."""
     middle = arrays["fine"][:, 6:24, 8:16, 8:16]
     i, j = np.indices((8, 8)) - 3.5
     mass = middle.sum(1)
@@ -32,7 +32,7 @@ def points():
     return np.concatenate([plane(), column(5, 0), column(5, 0.5, seed=3), column(-8, 3, seed=4), column(30, 8, seed=5)])
 
 
-def test_people_are_found_once_each_where_they_stand(points):
+def test_detector_finds_each_person_once(points):
     detections = Detector(upright).detect(points, ORIGIN, max_range=25)
     sure = detections.logit > 0
     assert sure.sum() == 3 and detections.has_ground
@@ -45,8 +45,8 @@ def test_people_are_found_once_each_where_they_stand(points):
     assert len(Detector(upright).detect(points, ORIGIN, limit=2)) == 2
 
 
-def test_two_who_touch_are_two_and_nobody_is_two(points):
-    """Candidates 0.4 m apart stay, those that are moved to the same place do not."""
+def test_detector_separates_close_people_without_duplicates(points):
+    """Candidates 0.4 m apart are kept, those refined to the same place are merged."""
     pair = np.concatenate([plane(), column(6, 0), column(6, 0.4, seed=3)])
 
     def still(arrays):
@@ -61,7 +61,7 @@ def test_two_who_touch_are_two_and_nobody_is_two(points):
             assert (gaps[~np.eye(len(gaps), dtype=bool)] >= SAME).all()
 
 
-def test_a_scan_that_is_turned_or_unlocated_holds_the_same_people(points):
+def test_detector_supports_rotated_scan_and_unknown_origin(points):
     turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     sure = [
         detections.centers[detections.logit > 0]
@@ -76,8 +76,8 @@ def test_a_scan_that_is_turned_or_unlocated_holds_the_same_people(points):
         assert all(nearest(other, *center[:2]) < 0.15 for center in sure[0])
 
 
-def test_a_stray_point_far_away_changes_nothing(points):
-    """Where the sensor is unknown; what is around it is looked at in cells that grow with the extent."""
+def test_detector_ignores_far_stray_point(points):
+    """The sensor is unknown, and the cells of the context grow with the extent of the scan."""
     shown = []
 
     def remembering(arrays):
@@ -91,7 +91,7 @@ def test_a_stray_point_far_away_changes_nothing(points):
     np.testing.assert_array_equal(shown[0], shown[2])
 
 
-def test_moving_points_alone_are_searched_and_the_others_still_seen(points):
+def test_detector_searches_only_moving_points(points):
     is_moving = np.hypot(points[:, 0] - 5, points[:, 1]) < 0.3
     detections = Detector(upright).detect(points, ORIGIN, moving=is_moving)
     assert nearest(detections.centers, 5, 0) < 0.3
@@ -101,25 +101,25 @@ def test_moving_points_alone_are_searched_and_the_others_still_seen(points):
 
 
 @pytest.mark.parametrize("cloud", [np.zeros((0, 3)), np.full((3, 3), 2.0), plane()], ids=["none", "few", "bare"])
-def test_scans_without_anybody_are_legal(cloud):
+def test_detector_accepts_scans_without_people(cloud):
     detections = Detector(upright).detect(cloud, ORIGIN)
     assert len(detections) == 0 and detections.centers.shape == (0, 3)
     assert detections.has_ground == (len(cloud) > 3)
 
 
-def test_without_ground_the_search_goes_on():
+def test_detector_works_without_ground():
     detections = Detector(upright).detect(column(4, 1), ORIGIN)
     assert not detections.has_ground
     assert nearest(detections.centers, 4, 1) < 0.3
 
 
-def test_scores_follow_the_calibration_of_the_file(points):
+def test_detector_probability_uses_calibration_of_header(points):
     detector = Detector(upright)
     detector.header["calibration"] = [[-2.0, 0.0, 4.0], [0.0, 0.1, 0.9]]
     assert detector.probability(np.array([-5, -1, 2, 9])).tolist() == pytest.approx([0, 0.05, 0.5, 0.9])
 
 
-def test_candidates_are_scored_in_pieces_of_bounded_size():
+def test_detector_scores_candidates_in_limited_batches():
     points = street(3, 2, sensor="hdl-64e").frames[0].points
     sizes = []
 

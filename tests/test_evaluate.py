@@ -1,4 +1,4 @@
-"""Evaluation: what each protocol shows the network, what counts, and that poses.parquet holds every figure."""
+"""Evaluation: inputs of each protocol, scores, damaged data, and files."""
 
 import itertools
 import json
@@ -39,7 +39,7 @@ from lidarpose.synth.shard_job import SynthesisJob, write_dataset
 
 
 class Fake:
-    """A model of known answers, which remembers what it was shown. answer(cloud) -> (J, 3) m or None."""
+    """A model with given answers that records its inputs. answer(cloud) -> (J, 3) m or None."""
 
     def __init__(self, answer, skeleton=BODY26, card=None):
         self.answer, self.skeleton = answer, skeleton
@@ -68,12 +68,12 @@ class Fake:
 
 
 def standing(cloud):
-    """A pose that depends on the points alone."""
+    """A pose that depends only on the points."""
     return center_of(cloud) + np.random.default_rng(0).normal(0, 0.3, (26, 3))
 
 
 def shifted_truth(people, shift=(0.0, 0.0, 0.0)):
-    """A model that finds a cloud's owner by its middle and answers with the true joints of human15, moved."""
+    """A model that identifies people by the median of their points and returns the true joints of human15, shifted."""
     middles = np.stack([np.median(person.points, axis=0) for person in people])
     pick = [HUMAN15.index(name) if name in HUMAN15.joints else 0 for name in BODY26.joints]
 
@@ -85,7 +85,7 @@ def shifted_truth(people, shift=(0.0, 0.0, 0.0)):
 
 
 class Own:
-    """A user's model: what it must have, and nothing else."""
+    """A user's model with only the required attributes."""
 
     skeleton = "smpl24"
 
@@ -119,10 +119,10 @@ def evaluated(sets, name, model=None, *, split=None, limit=None, **options):
     return evaluate_dataset(eval_setup(model or Fake(standing), dataset, **options))
 
 
-# ---- what the network is shown
+# ---- inputs of the network
 
 
-def test_clean_shows_what_lies_in_a_displaced_box(sets):
+def test_clean_protocol_crops_by_jittered_box(sets):
     model = Fake(standing)
     setting = evaluated(sets, "humanm3", model, seed=3).result.setting
     people = list(open_eval_dataset(sets / "humanm3"))
@@ -130,7 +130,7 @@ def test_clean_shows_what_lies_in_a_displaced_box(sets):
     for cloud, person in zip(model.clouds, people, strict=True):
         box = jittered(person.sample.box, np.random.default_rng([3, person.shard, person.row]))
         np.testing.assert_array_equal(cloud, person.points[box.contains(person.points)])
-    # some points are lost, some come in, and nobody's position is known
+    # some points are lost, some are added, and the sensor's position is unknown
     undisplaced = [person.sample.box.contains(person.points).sum() for person in people]
     assert [len(cloud) for cloud in model.clouds] != undisplaced
     assert model.origins == [None] * 16 and setting.sensor == "unknown" and "detector" in setting.crop
@@ -144,8 +144,8 @@ class Asked(Fake):
 
 
 @pytest.mark.parametrize("name", ["humanm3", "waymo"])
-def test_clean_tells_the_center_of_the_displaced_box_alone(sets, name):
-    """By which a network chooses between two people: that of the labeled box would tell where the true joints are."""
+def test_clean_protocol_gives_center_of_jittered_box(sets, name):
+    """Networks choose between two people by it; the center of the labeled box would reveal the true joints."""
     model = Asked(standing)
     evaluated(sets, name, model, seed=3)
     people = [person for person in open_eval_dataset(sets / name) if person.sample.box is not None]
@@ -155,7 +155,7 @@ def test_clean_tells_the_center_of_the_displaced_box_alone(sets, name):
         np.testing.assert_array_equal(center, box.center)
 
 
-def test_people_without_a_box_take_nobody_s_box_away(sets):
+def test_clean_protocol_mixes_people_with_and_without_box(sets):
     setup = eval_setup(Asked(standing), open_eval_dataset(sets / "humanm3"), protocol="clean")
     people = [setup.crop_sample(person)[0] for person in open_eval_dataset(sets / "humanm3")]
     boxless = [replace(person, crop_box=None) if k % 2 else person for k, person in enumerate(people)]
@@ -164,7 +164,7 @@ def test_people_without_a_box_take_nobody_s_box_away(sets):
     np.testing.assert_array_equal(poses, setup.predict(people).pred)
 
 
-def test_clean_uses_no_label_of_who_was_segmented(sets):
+def test_clean_protocol_uses_no_label_of_segmented_people(sets):
     model = Fake(standing)
     setting = evaluated(sets, "lidarhuman26m", model).result.setting
     people = list(open_eval_dataset(sets / "lidarhuman26m"))
@@ -176,7 +176,7 @@ def test_clean_uses_no_label_of_who_was_segmented(sets):
     assert model.origins[len(people) :] == [None] * len(people)
 
 
-def test_a_person_s_box_does_not_depend_on_the_others(sets):
+def test_jittered_box_is_independent_of_other_people(sets):
     everybody, some, other = Fake(standing), Fake(standing), Fake(standing)
     evaluated(sets, "humanm3", everybody, split="all")
     evaluated(sets, "humanm3", some, split="all", limit=5)
@@ -186,19 +186,19 @@ def test_a_person_s_box_does_not_depend_on_the_others(sets):
     assert any(len(a) != len(b) for a, b in zip(other.clouds, everybody.clouds, strict=True))
 
 
-def test_a_detector_s_errors_are_as_documented():
+def test_jittered_errors_match_documentation():
     box = Box(center=[1, 2, 3], size=[0.6, 0.8, 1.8], yaw=0.3)
     boxes = [jittered(box, np.random.default_rng(k)) for k in range(4000)]
     center = np.stack([own.center for own in boxes]) - box.center
     size = np.log(np.stack([own.size for own in boxes]) / box.size)
     yaw = np.array([own.yaw for own in boxes]) - box.yaw
-    # a normal cut at twice its deviation has .96 of it
+    # a normal distribution clipped at two standard deviations has 0.96 of the deviation
     for values, sigma in ((center[:, :2], 0.1), (center[:, 2], 0.05), (size, 0.05), (yaw, 0.1)):
         assert np.abs(values).max() <= 2 * sigma + 1e-12 and abs(values.mean()) < 0.1 * sigma
         assert values.std() == pytest.approx(0.96 * sigma, rel=0.06)
 
 
-def test_dapt_crops_and_centers_as_released(sets):
+def test_dapt_protocol_crops_and_centers_as_released(sets):
     shown, results = {}, {}
     for name in ("humanm3", "waymo", "leaking"):
         model = Fake(standing)
@@ -209,7 +209,7 @@ def test_dapt_crops_and_centers_as_released(sets):
         inside = (np.abs(person.points - (low + high) / 2) <= 1.25 * (high - low) / 2).all(1)
         np.testing.assert_allclose(cloud, person.points[inside])
         np.testing.assert_allclose(center, (low + high) / 2, atol=1e-6)
-    # its mean leaves the pelvis out
+    # the mean excludes the pelvis
     setting = results["humanm3"].setting
     assert setting.joints == HUMAN15.joints[1:] and "pelvis" in setting.not_judged
 
@@ -228,7 +228,7 @@ def test_dapt_crops_and_centers_as_released(sets):
     assert all(row.split == "test" and row.protocol == "dapt" and "SMPL" in row.centring for row in rows)
 
 
-def test_a_frame_that_was_leveled_is_noted_where_it_is_compared_with_the_released_code(sets):
+def test_dapt_protocol_notes_leveled_frames(sets):
     for name, protocol, noted in (("lidarhuman26m", "dapt", 1), ("lidarhuman26m", "clean", 0), ("askew", "dapt", 0)):
         notes = evaluated(sets, name, protocol=protocol).result.notes
         assert sum("prepare with --no-level" in note for note in notes) == noted, (name, protocol)
@@ -252,7 +252,7 @@ def test_a_frame_that_was_leveled_is_noted_where_it_is_compared_with_the_release
         ("a", {}, "is not a dataset"),
     ],
 )
-def test_what_does_not_fit_is_an_error_before_anybody_is_predicted(sets, name, options, words):
+def test_run_rejects_invalid_options_before_predicting(sets, name, options, words):
     model = Fake(standing)
     with pytest.raises(InputError, match=words) as raised:
         evaluation.run(model, [sets / "lidarhuman26m", sets / name], **options)
@@ -272,12 +272,12 @@ def test_what_does_not_fit_is_an_error_before_anybody_is_predicted(sets, name, o
         ("tiny", None, {}, "expected a dataset to evaluate on"),
     ],
 )
-def test_synthetic_sets_have_neither_splits_nor_oracles_and_arguments_are_checked(model, dataset, options, words):
+def test_evaluate_rejects_invalid_arguments(model, dataset, options, words):
     with pytest.raises(InputError, match=words):
         evaluation.evaluate(model, dataset, **options)
 
 
-def test_a_model_of_one_s_own_needs_joints_and_answers_alone(sets):
+def test_evaluate_accepts_minimal_user_model(sets):
     def answers(clouds):
         poses = [Pose(joints=np.repeat(np.median(cloud, 0)[None], 24, 0), skeleton=SMPL24) for cloud in clouds]
         return [SimpleNamespace(pose=pose) for pose in poses]
@@ -288,7 +288,7 @@ def test_a_model_of_one_s_own_needs_joints_and_answers_alone(sets):
         evaluation.evaluate(Own(answers), sets / "humanm3", protocol="dapt")
 
 
-def test_splits_that_are_scored_by_default(sets, tmp_path):
+def test_open_eval_dataset_default_splits(sets, tmp_path):
     assert [open_eval_dataset(sets / name).split for name in ("waymo", "humanm3")] == ["val", "test"]
     everybody = open_eval_dataset(sets / "humanm3", split="all")
     assert everybody.split == "all" and everybody.count == 24
@@ -300,7 +300,7 @@ def test_splits_that_are_scored_by_default(sets, tmp_path):
 
 
 @given(total=st.integers(1, 400), limit=st.none() | st.integers(1, 500))
-def test_a_limit_takes_one_of_each_equal_share(total, limit):
+def test_evenly_drawn_takes_one_row_of_each_share(total, limit):
     rows = evenly_drawn(total, limit)
     assert len(rows) == min(total, limit or total)
     edges = np.arange(len(rows) + 1) * total // len(rows)
@@ -308,16 +308,16 @@ def test_a_limit_takes_one_of_each_equal_share(total, limit):
     np.testing.assert_array_equal(rows, evenly_drawn(total, limit))
 
 
-def test_a_limit_is_not_in_step_with_the_sensors_of_the_bench():
+def test_bench_limit_mixes_sensors():
     people = list(open_eval_dataset("bench", limit=40))
     of_sensor = Counter(person.info.sensor for person in people)
     assert len(of_sensor) == 8 and max(of_sensor.values()) <= 10
 
 
-# ---- what counts
+# ---- scores
 
 
-def test_the_truth_has_no_error_and_a_step_its_length(sets):
+def test_scores_of_true_and_shifted_joints(sets):
     people = list(open_eval_dataset(sets / "humanm3"))
     for shift, error in (((0, 0, 0), 0), ((0.06, 0, 0.08), 100)):
         result = evaluated(sets, "humanm3", shifted_truth(people, shift)).result
@@ -325,7 +325,7 @@ def test_the_truth_has_no_error_and_a_step_its_length(sets):
         assert values["mpjpe", "all"] == pytest.approx(error, abs=1e-2) == values["mpjpe", "wrists"]
         assert values["pa_mpjpe", "all"] == pytest.approx(0, abs=1e-2) and values["pck3", "all"] == 100
         assert result.line("turned_round", "points", "100 and more").value == 0
-        # who moves with the truth has its acceleration
+        # a constant shift does not change the acceleration
         assert result.line("acceleration", "all", "frames in a row").value == pytest.approx(0, abs=1e-2)
         assert result.line("mpjpe").people == 16 and result.counts["people"] == 16
     # poses of the protocol dapt are in the dataset's frame
@@ -333,7 +333,7 @@ def test_the_truth_has_no_error_and_a_step_its_length(sets):
     assert result.line("mpjpe").value == pytest.approx(100, abs=1e-2)
 
 
-def test_hidden_labels_count_and_missing_ones_do_not(sets):
+def test_scores_use_hidden_labels_and_skip_missing_ones(sets):
     scored = evaluated(sets, "waymo")
     people = [person.sample for person in open_eval_dataset(sets / "waymo")]
     labels, size = np.stack([own.joint_labels for own in people]), np.stack([own.box.size for own in people])
@@ -350,7 +350,7 @@ def test_hidden_labels_count_and_missing_ones_do_not(sets):
     assert line("pem").value == pytest.approx(wanted.pem)
 
 
-def test_people_without_a_pose_are_counted_and_in_pem_alone(sets):
+def test_people_without_pose_count_only_in_pem(sets):
     turns = itertools.cycle([True, False])
     some = evaluated(sets, "waymo", Fake(lambda cloud: standing(cloud) if next(turns) else None)).result
     words = "without a pose, and in no metric except PEM"
@@ -370,8 +370,8 @@ def test_people_without_a_pose_are_counted_and_in_pem_alone(sets):
     "trained, words",
     [("train", "validated on this split"), ("val", "trained on split val"), ("all", "trained on split all")],
 )
-def test_a_network_that_was_trained_on_the_people_is_noted(sets, trained, words):
-    """Waymo's people are of the split val."""
+def test_notes_report_training_on_evaluated_people(sets, trained, words):
+    """The people of the Waymo set are in the split val."""
 
     def noted(card, words):
         return sum(words in note for note in evaluated(sets, "waymo", Fake(standing, card=card)).result.notes)
@@ -379,12 +379,12 @@ def test_a_network_that_was_trained_on_the_people_is_noted(sets, trained, words)
     card = {"data": ["waymo"], "recipe": {"split": trained}, "validation_mm": 60.0}
     other = {"data": ["another"], "recipe": {"split": trained}}
     assert noted(card, words) == 1 and noted(other, words) == 0
-    # an earlier run's people count as well; pre-training on shards takes everybody
+    # people of an earlier run count as well; pre-training on shards uses all splits
     assert noted(other | {"init_card": card}, words) == 1
     assert noted({"recipe": {"shards": ["waymo"], "seed": 0, "scene": "wild"}}, "trained on split all") == 1
 
 
-def test_joints_that_both_have_are_scored_and_named(sets):
+def test_scored_joints_are_common_to_network_and_dataset(sets):
     result = evaluated(sets, "humanm3", Fake(lambda cloud: standing(cloud)[:14], WAYMO14)).result
     both = tuple(name for name in HUMAN15.joints if name in WAYMO14.joints)
     assert result.setting.joints == both and len(both) == 12
@@ -393,12 +393,12 @@ def test_joints_that_both_have_are_scored_and_named(sets):
     with pytest.raises(InputError, match="none in common"):
         nose = Skeleton(name="nose", joints=("nose",), parents=(-1,))
         evaluated(sets, "humanm3", Fake(lambda cloud: standing(cloud)[:1], nose))
-    # asked for fewer: those alone
+    # a given skeleton restricts the joints
     setting = evaluated(sets, "lidarhuman26m", skeleton="human15").result.setting
     assert set(setting.joints) == set(HUMAN15.joints)
 
 
-def test_few_sequences_have_no_interval_and_are_drawn_whole(sets, monkeypatch):
+def test_interval_needs_several_sequences_and_draws_them_whole(sets, monkeypatch):
     for name, words in (("lidarhuman26m", "only one sequence"), ("humanm3", "only 2 sequences")):
         result = evaluated(sets, name).result
         assert result.line("mpjpe").low is None and any(note.startswith(words) for note in result.notes)
@@ -406,29 +406,29 @@ def test_few_sequences_have_no_interval_and_are_drawn_whole(sets, monkeypatch):
     scored = evaluated(sets, "humanm3")
     row, table = scored.result.line("mpjpe"), scored.predictions.errors()
     means = [np.nanmean(table[scored.predictions.sequence == name]) for name in ("test/b", "test/c")]
-    # of two sequences the extreme draws are one of them twice
+    # with two sequences, the extreme draws are one of them twice
     assert (row.low, row.high) == pytest.approx((min(means), max(means)))
 
 
-def test_triples_follow_each_other_evenly(sets):
+def test_triples_are_consecutive_and_evenly_spaced(sets):
     base = evaluated(sets, "lidarhuman26m").predictions
 
     def triples_of(frames, **more):
-        """Of one person's frames, every 0.1 s."""
+        """Triples of one person's frames, 0.1 s apart."""
         frames = np.array(frames)
         predictions = replace(base.select(np.zeros(len(frames), int)), frame=frames, time=frames * 0.1)
         return frames[triples(replace(predictions, **more))].tolist()
 
-    # every second frame is not the sequence's own step
+    # the step of the sequence is one frame, not two
     assert sorted(triples_of([3, 1, 2, 5, 6, 7, 9, 11, 13])) == [[1, 2, 3], [5, 6, 7]]
     assert not triples_of([1, 2]) and not triples_of([1, 2, 3], time=np.full(3, np.nan))
-    # another track's frames nearby take nothing away
+    # frames of another track do not remove triples
     assert len(triples_of([0, 2, 4, 6, 8, 9, 10], track=np.array(["a"] * 5 + ["b"] * 2))) == 3
 
 
-def test_facing_is_flipped_over_a_right_angle(sets):
+def test_facing_flipped_beyond_right_angle(sets):
     base = evaluated(sets, "lidarhuman26m").predictions
-    # an upright body, so that a rotation about z is one of its facing
+    # an upright body, so that a rotation about z changes its facing
     true = np.zeros_like(base.true)
     for joint, y in (("hip", 0.1), ("shoulder", 0.2)):
         true[:, SMPL24.index(f"left_{joint}"), 1], true[:, SMPL24.index(f"right_{joint}"), 1] = y, -y
@@ -438,13 +438,13 @@ def test_facing_is_flipped_over_a_right_angle(sets):
     assert np.isnan(facing_flipped(replace(base, pred=np.full_like(true, np.nan)))).all()
 
 
-def test_the_worst_are_the_worst(sets):
+def test_worst_people_are_sorted_by_error(sets):
     scored = evaluated(sets, "humanm3", split="all")
     error = scored.predictions.errors().mean(1)
     assert len(error) == 24 and [k for _, k in scored.worst] == np.argsort(-error, kind="stable").tolist()
 
 
-# ---- damage
+# ---- damaged data
 
 
 @pytest.fixture
@@ -452,7 +452,7 @@ def copy(sets, tmp_path):
     return shutil.copytree(sets / "humanm3", tmp_path / "humanm3")
 
 
-def test_a_damaged_shard_is_skipped_counted_and_named(copy):
+def test_damaged_shard_is_skipped_and_reported(copy):
     shards = [shard_path(copy, "labelled", k) for k in range(open_dataset(copy).card.count)]
     split = [next(iter(read_rows(path, "labelled")))["split"] for path in shards]
     first, second = (path for path, name in zip(shards, split, strict=True) if name == "test")
@@ -470,10 +470,10 @@ def test_a_damaged_shard_is_skipped_counted_and_named(copy):
         open_eval_dataset(copy)
 
 
-def test_a_shard_that_breaks_half_way_is_left_out_whole(copy):
+def test_partly_damaged_shard_is_skipped_as_a_whole(copy):
     path = shard_path(copy, "labelled", 1)
     data = bytearray(path.read_bytes())
-    # within the points: the split column can still be read
+    # damage within the points, so that the split column can still be read
     at = len(data) // 3
     data[at : at + 64] = bytes(64)
     path.write_bytes(bytes(data))
@@ -481,11 +481,11 @@ def test_a_shard_that_breaks_half_way_is_left_out_whole(copy):
     result = evaluate_dataset(setup).result
     assert result.counts["people"] == 16 and result.skipped["people of damaged shards"]["count"] == 8
     assert path.name in result.skipped["damaged shards"]["first"]
-    # a second reading counts no more
+    # a second evaluation does not count them again
     assert evaluate_dataset(setup).result == result
 
 
-def test_who_the_released_code_leaves_out_is_counted(sets, tmp_path):
+def test_dapt_protocol_counts_people_that_released_code_skips(sets, tmp_path):
     path = shard_path(shutil.copytree(sets / "leaking", tmp_path / "leaking"), "labelled", 0)
     rows = list(read_rows(path, "labelled"))
     tests = [k for k, row in enumerate(rows) if row["split"] == "test"]
@@ -496,12 +496,12 @@ def test_who_the_released_code_leaves_out_is_counted(sets, tmp_path):
     assert after.counts["people"] == before.counts["people"] - 2
     assert after.skipped["people of under 10 points, as the released code skips them"]["count"] == 1
     assert after.skipped["people without the center 'trans'"]["count"] == 1
-    # nor are they perturbed
+    # these people are not perturbed either
     setup = eval_setup(Fake(standing), open_eval_dataset(tmp_path / "leaking"), protocol="dapt")
     assert len(robustness.people_to_perturb(setup)) == after.counts["people"]
 
 
-def test_dapt_predicts_each_person_once(sets):
+def test_dapt_protocol_rejects_test_time_augmentation(sets):
     model = Fake(standing)
     model.model["tta"] = 4
     assert evaluated(sets, "humanm3", model)
@@ -514,26 +514,26 @@ def test_dapt_predicts_each_person_once(sets):
 
 @pytest.fixture(scope="module")
 def written(sets, tmp_path_factory):
-    """What the bundled weights make of a real and of the synthetic set."""
+    """An evaluation of bundled weights on prepared sets and the bench, and its files."""
     run = evaluation.run("tiny", [sets / "waymo", sets / "humanm3", "bench"], limit=16, legacy=True, command="as typed")
     folder = tmp_path_factory.mktemp("out") / "new"
     return run, folder, evaluation.write(run, folder)
 
 
-def test_what_cannot_be_written_or_perturbed_is_an_error_before_anybody_is_predicted(tmp_path, monkeypatch, capsys):
+def test_evaluate_command_fails_before_predicting(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(run_module, "evaluate_dataset", None)
     (tmp_path / "file").write_text("")
     for out, words in (("file", "is a file; give a new or empty"), ("file/deep", "file")):
         assert main(["evaluate", "tiny", "bench", "--limit", "2", "--out", str(tmp_path / out)]) == 2
         assert words in capsys.readouterr().err
-    # of a single person of the bench nobody is clean
+    # the stability study needs clean people, and the single person is not
     assert main(["evaluate", "tiny", "bench", "--limit", "1", "--stability", "--out", str(tmp_path / "new")]) == 2
     assert "score more people, or leave stability out" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 @pytest.mark.long
-def test_numpy_s_numbers_one_dataset_alone_and_options_of_load(tmp_path):
+def test_run_accepts_numpy_numbers_and_options_of_load(tmp_path):
     run = evaluation.run("tiny", "bench", limit=np.int64(3), seed=np.int32(2), tta=2, sensor_unknown=True)
     evaluation.write(run, tmp_path / "new")
     assert evaluation.read_scores(tmp_path / "new").results == run.scores.results
@@ -541,11 +541,11 @@ def test_numpy_s_numbers_one_dataset_alone_and_options_of_load(tmp_path):
     assert run.scores.weights["tta"] == 2 and run.scores.results[0].setting.sensor == "unknown"
 
 
-def test_every_metric_can_be_computed_from_the_poses(written):
+def test_metrics_can_be_computed_from_poses_parquet(written):
     _, folder, _ = written
     scores, people = evaluation.read_scores(folder), evaluation.read_poses(folder / "poses.parquet")
     assert list(people) == ["waymo", "humanm3", "lidarpose-bench-1"]
-    # by anybody else, too, from the table alone
+    # also from the table alone, without this package
     table = pd.read_parquet(folder / "poses.parquet")
     for result in scores.results:
         again = metric_rows(people[result.setting.dataset], result.setting, dapt_compat=True)
@@ -555,7 +555,7 @@ def test_every_metric_can_be_computed_from_the_poses(written):
         assert each.mean() == pytest.approx(result.line("mpjpe").value, abs=1e-3)
 
 
-def test_scores_come_back_as_they_were(written):
+def test_scores_round_trip(written):
     run, folder, paths = written
     assert evaluation.read_scores(folder) == evaluation.read_scores(folder / "scores.json") == run.scores
     content = json.loads((folder / "scores.json").read_text())
@@ -573,38 +573,38 @@ def test_scores_come_back_as_they_were(written):
     assert lidarpose.evaluation.evaluate is evaluation.evaluate and "evaluation" in dir(lidarpose)
 
 
-def test_limits_baselines_and_released_arithmetic_are_in_the_rows(written):
+def test_rows_contain_limit_baselines_and_released_arithmetic(written):
     waymo, humanm3, result = written[0].scores.results
     assert result.setting.limit == 16 and result.setting.total == 2000
     assert all(row.limit == 16 for row in result.lines)
     baseline = result.line("mpjpe", method="floor: mean pose, true facing")
     assert result.line("mpjpe").value < baseline.value < result.line("mpjpe", method="floor: mean pose").value
     assert any("MPJPE" in line and "baseline mean pose:" in line for line in evaluating._lines(result))
-    # four waymo people are all there are
+    # the Waymo set contains only four people
     assert waymo.setting.limit is None
     people = evaluation.read_poses(written[1] / "poses.parquet")["waymo"]
     table = metrics.joint_errors(people.pred, people.true, people.labels > 0)
     wanted = metrics.by_group(table, "waymo14", empty=0.0)["head"]
     assert waymo.line("mpjpe", "joints", "head", arithmetic="released").value == pytest.approx(wanted)
-    # labels are missing there, so the released alignment has nothing to align
-    with pytest.raises(InputError, match="no line"):
+    # the released alignment is undefined with missing labels
+    with pytest.raises(InputError, match="no row"):
         waymo.line("pa_mpjpe", arithmetic="released")
     assert humanm3.line("pa_mpjpe", arithmetic="released").value > 0
 
 
-def test_all_files_or_none(written, tmp_path, monkeypatch):
+def test_write_creates_all_files_or_none(written, tmp_path, monkeypatch):
     run = replace(written[0], evaluations=written[0].evaluations[:1])
     with pytest.raises(InputError, match="holds other files"):
         evaluation.write(run, written[1])
 
-    # the last one cannot be written, no bytes
+    # the last file cannot be written, because its content is not bytes
     monkeypatch.setattr(run_module, "poses_parquet", lambda predictions: "half")
     with pytest.raises(TypeError):
         evaluation.write(run, tmp_path / "deep" / "new")
     assert not (tmp_path / "deep").exists()
 
 
-def test_other_files_are_no_scores(written, tmp_path):
+def test_read_scores_rejects_other_files(written, tmp_path):
     good = json.loads((written[1] / "scores.json").read_text())
     nameless = json.loads(json.dumps(good))
     nameless["results"][0]["setting"]["dataset"] = []
@@ -626,7 +626,7 @@ def test_other_files_are_no_scores(written, tmp_path):
         evaluation.read_poses(tmp_path / "poses.parquet")
 
 
-def test_a_table_never_replaces_its_scores(written, capsys):
+def test_table_command_never_overwrites_scores(written, capsys):
     path = written[1] / "scores.json"
     before = path.read_bytes()
     for named in (written[1], path):
@@ -635,7 +635,7 @@ def test_a_table_never_replaces_its_scores(written, capsys):
     assert path.read_bytes() == before
 
 
-def test_folders_are_numbered(tmp_path):
+def test_new_folder_numbers_folders(tmp_path):
     assert evaluation.new_folder("tiny", tmp_path) == tmp_path / "tiny"
     (tmp_path / "tiny").mkdir()
     (tmp_path / "tiny-2").mkdir()
@@ -644,7 +644,7 @@ def test_folders_are_numbered(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_figures_of_the_docs_are_those_of_the_bundled_weights_on_the_bench():
+def test_figures_in_docs_match_bundled_weights_on_bench():
     root = Path(__file__).parents[1]
     result = evaluation.evaluate(DEFAULT, "bench")
     stored = evaluation.read_scores(root / "docs" / "scores" / f"{DEFAULT}.json").results[0]
@@ -676,14 +676,14 @@ def made(tmp_path_factory):
         ({"seed": 0, "scene": "paper", "shards": []}, False),
     ],
 )
-def test_people_of_the_seed_that_a_network_was_trained_on_are_noted(made, recipe, noted):
+def test_notes_report_training_on_same_seed(made, recipe, noted):
     """Person i of a seed has the same body, pose and place at any difficulty."""
     card = {"recipe": {"seed": 5, "scene": "wild"}, "init_card": {"recipe": recipe}}
     notes = evaluated(made.parent, made.name, Fake(standing, card=card)).result.notes
     assert any("of seed 0, like these" in note for note in notes) == noted
 
 
-def test_what_is_hidden_is_not_visible(made):
+def test_predictions_hidden_is_complement_of_visible(made):
     hidden = evaluated(made.parent, made.name).predictions.hidden
     np.testing.assert_allclose(hidden, [1 - row["visible"] for row in open_dataset(made).rows()], atol=1e-6)
     predictions = evaluate_dataset(eval_setup(Fake(standing), open_eval_dataset("bench", limit=9))).predictions

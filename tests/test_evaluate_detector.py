@@ -1,4 +1,4 @@
-"""People found in whole scans: matching, recall at so many false people a scan, and the command."""
+"""Evaluation of detectors: matching, recall at a number of false positives per scan, and the command."""
 
 import json
 from dataclasses import replace
@@ -42,7 +42,7 @@ def box(x, y, height=1.8):
 
 
 def scan(people, **more):
-    """A scan of a point cloud about each person, a dict or x."""
+    """A labeled scan with a point cloud per person, each given as a dict or as x."""
     people = [{"x": entry} if isinstance(entry, float | int) else entry for entry in people]
     boxes = [box(entry["x"], entry.get("y", 0.0), entry.get("height", 1.8)) for entry in people]
     rng = np.random.default_rng(0)
@@ -64,7 +64,7 @@ def scan_set(scans):
 
 
 def answers(*scans):
-    """A detector that answers call after call with (x, score) pairs."""
+    """A detector that returns the given (x, score) pairs, one list per call."""
     left = iter(scans)
 
     def detect(points, origin):
@@ -80,13 +80,13 @@ places = st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), max_size=7).map
 
 
 def match_reference(centers, scores, people, wanted):
-    """`match`, a pair at a time."""
+    """`match`, one pair at a time."""
     of_person = [-1] * len(centers)
     for d in sorted(range(len(centers)), key=lambda d: -scores[d]):
         for only_wanted in (True, False):
             best = None
             for p in range(len(people)):
-                # by the same arithmetic: of places 1e-163 apart only the squares are equal
+                # the same arithmetic as in `match`, because squares of tiny distances underflow
                 away = np.linalg.norm(centers[d] - people[p : p + 1], axis=1)[0]
                 usable = p not in of_person and away <= MATCH_RADIUS and (wanted[p] or not only_wanted)
                 if usable and (best is None or away < best[0]):
@@ -98,7 +98,7 @@ def match_reference(centers, scores, people, wanted):
 
 
 @given(places, places, st.data())
-def test_matching_is_one_to_one_near_and_leaves_no_pair(centers, people, data):
+def test_match_is_one_to_one_within_radius_and_complete(centers, people, data):
     scores = np.array(
         data.draw(st.lists(st.sampled_from([0.1, 0.5, 0.9]), min_size=len(centers), max_size=len(centers)))
     )
@@ -112,31 +112,31 @@ def test_matching_is_one_to_one_near_and_leaves_no_pair(centers, people, data):
     assert (np.linalg.norm(centers[~matched][:, None] - people[free][None], axis=-1) > MATCH_RADIUS).all()
 
 
-def test_the_surer_detection_has_the_person_and_the_other_is_false():
+def test_score_scan_counts_second_detection_as_false_positive():
     own = scan([5.0])
     people, detections = score_scan(0, own, [box(5.0, 0.0), box(5.3, 0.0)], np.array([0.4, 0.8]), max_range=40)
     assert detections.status.tolist() == [FALSE, PERSON]
     assert people.score.tolist() == [0.8] and people.detection.tolist() == [1]
 
 
-def test_few_points_other_things_and_what_is_far_are_neither_wanted_nor_false():
+def test_score_scan_ignores_few_points_objects_and_far_people():
     own = scan([{"x": 5, "points": 9}, {"x": 10, "is_person": False}, 45, {"x": 15, "mounted": True}, 20])
     hidden = replace(own, num_points=own.num_points * [0, 1, 1, 1, 1])
     found = [box(x, 0.0) for x in (5, 10, 45, 50, 15, 20, 30)]
     people, detections = score_scan(0, own, found, np.linspace(0.9, 0.3, 7), max_range=40)
     assert detections.status.tolist() == [NEITHER] * 4 + [PERSON, PERSON, FALSE]
-    # whom nobody can see is no excuse
+    # a detection at a person without points is a false positive
     assert score_scan(0, hidden, found, np.ones(7), max_range=40)[1].status[0] == FALSE
     assert people.person.tolist() == [3, 4] and people.mounted.tolist() == [True, False]
 
 
-def test_who_is_wanted_comes_first():
+def test_score_scan_matches_scored_people_first():
     own = scan([{"x": 5.0, "points": 3}, 5.4])
     people, detections = score_scan(0, own, [box(5.0, 0.0)], np.array([0.5]), max_range=40)
     assert people.detection.tolist() == [0] and detections.status.tolist() == [PERSON]
 
 
-def test_conditions_and_what_false_people_are():
+def test_score_scan_conditions_and_things_of_false_positives():
     points = np.concatenate([box(x, 0).center + np.random.default_rng(1).uniform(-0.3, 0.3, (40, 3)) for x in (5, 20)])
     thing, person = np.repeat([-1, 1], 40), np.repeat([0, -1], 40)
     about = {"points": points, "thing": thing, "things": ("hedge", "pillar"), "person": person}
@@ -152,7 +152,7 @@ def test_conditions_and_what_false_people_are():
 
 
 def ten_scans():
-    """Ten scans of two people, 60 and 15 points; scores fall with the scan's number, a false one each in between."""
+    """Ten scans of two people, with 60 and 15 points, and a false positive; scores fall with the scan's number."""
     scans, found = [], []
     for k in range(10):
         people = [5, {"x": 10, "points": 15}]
@@ -161,10 +161,10 @@ def ten_scans():
     return scan_set(scans), answers(*found)
 
 
-def test_recall_at_so_many_false_people_is_what_counting_says():
+def test_score_detector_recall_equals_counting():
     scans, detect = ten_scans()
     result = score_detector(detect, scans, default_score=0.69)
-    # three false detections of ten scans, of scores 0.93, 0.88 and 0.83, lie above those that find the fifth
+    # three false positives in ten scans, of scores 0.93, 0.88 and 0.83, lie above the detection of the fifth person
     assert row_of(result, "recall", "0.3")["value"] == 100 * 4 / 20
     assert row_of(result, "recall", "0.3", "points", "50 and more")["value"] == 40
     assert row_of(result, "recall", "0.3", "points", "10 to 20")["value"] == 0
@@ -181,15 +181,15 @@ def test_recall_at_so_many_false_people_is_what_counting_says():
     assert row_of(result, "false_people", "1", "worst", "scan")["value"] == 1
     row = row_of(result, "recall", "1", "points", "10 to 20")
     assert row["low"] == 0 and 10 <= row["high"] <= 50 and row["count"] == 10
-    # where nobody is found in any draw, or everybody, there is no interval
+    # there is no interval if none or all are found in each draw
     row = row_of(result, "recall", "0.3", "points", "10 to 20")
     assert row["low"] is None and row["high"] is None
-    # of the detections at a recall of k / 20, k of 2 k - 1 are people
+    # at a recall of k / 20, k of 2 k - 1 detections are people
     expected = sum(k / (2 * k - 1) for k in range(1, 11)) / 20 + (11 / 21) / 20
     assert row_of(result, "average_precision")["value"] == pytest.approx(100 * expected, abs=0.01)
 
 
-def test_mounted_people_are_told_apart_and_change_nothing_for_the_others():
+def test_score_detector_reports_mounted_people_separately():
     others = [scan([5, {"x": 10, "mounted": True}]), scan([5, {"x": 10, "mounted": True}])]
     result = score_detector(answers([(5, 0.9), (10, 0.8)], [(5, 0.7)]), scan_set(others))
     assert row_of(result, "recall", "1")["value"] == 100 and row_of(result, "recall", "1")["count"] == 2
@@ -198,7 +198,7 @@ def test_mounted_people_are_told_apart_and_change_nothing_for_the_others():
     assert row_of(result, "said_mounted", "1", "mounted")["value"] == 0
 
 
-def test_who_is_said_to_ride_is_counted_of_those_who_do_and_of_the_others():
+def test_score_detector_said_mounted_for_riders_and_pedestrians():
     scans = scan_set([scan([5, {"x": 10, "mounted": True}, {"x": 15, "mounted": True}, 20])])
     plain = answers([(5, 0.9), (10, 0.8), (15, 0.7), (20, 0.1), (30, 0.6)])
 
@@ -209,16 +209,16 @@ def test_who_is_said_to_ride_is_counted_of_those_who_do_and_of_the_others():
     result = score_detector(detect, scans, default_score=0.5)
     shares = {group: row_of(result, "said_mounted", "default", group) for group in ("mounted", "on foot")}
     assert shares["mounted"]["value"] == 50 and shares["mounted"]["count"] == 2
-    # below the default score nobody is found
+    # people below the default score are not counted
     assert shares["on foot"]["value"] == 0 and shares["on foot"]["count"] == 1
     assert row_of(result, "said_mounted", "10", "on foot")["value"] == 50
 
 
-def test_calibration_is_of_people_and_false_ones():
+def test_calibration_error_uses_people_and_false_positives():
     scans = scan_set([scan([5, 10, {"x": 15, "points": 2}])])
     found = [(5, 0.75), (30, 0.75), (10, 1.0), (15, 0.4), (35, 0.0), (38, 0.0)]
     result = score_detector(answers(found), scans, default_score=1.0)
-    # those of no score are not counted
+    # detections of score 0 are not counted
     assert row_of(result, "calibration_error")["value"] == pytest.approx(100 * (2 * 0.25) / 3, abs=0.01)
     assert row_of(result, "calibration_error")["count"] == 3
     assert result.reliability == [
@@ -233,7 +233,7 @@ def test_calibration_is_of_people_and_false_ones():
     st.lists(st.integers(0, 3), min_size=4, max_size=4).filter(any),
     st.sampled_from([0.3, 1.0, 3.0]),
 )
-def test_no_lower_bound_has_so_few_false_people(found, weights, budget):
+def test_exclusive_thresholds_are_lowest_within_budget(found, weights, budget):
     false = pd.DataFrame(found, columns=["scan", "score"]).sort_values("score", ascending=False)
     weights = np.array([weights])
 
@@ -246,14 +246,14 @@ def test_no_lower_bound_has_so_few_false_people(found, weights, budget):
     assert all(above(other) > budget * weights.sum() for other in lower)
 
 
-def test_average_precision_does_not_depend_on_the_order_of_equal_scores():
+def test_average_precision_ignores_order_of_equal_scores():
     detections = pd.DataFrame({"scan": 0, "score": [0.5] * 4, "status": [PERSON, FALSE, FALSE, PERSON]})
     people = pd.DataFrame({"scan": [0, 0, 0, 0]})
     for order in ([0, 1, 2, 3], [1, 2, 0, 3]):
         assert average_precision(detections.iloc[order], people, np.ones((1, 1))) == 0.5 * 0.5
 
 
-def test_poses_in_found_boxes_are_compared_with_those_in_labeled_boxes():
+def test_score_detector_compares_poses_in_found_and_given_boxes():
     joints = np.stack([np.full((26, 3), (5.0, 0, 0)), np.full((26, 3), (10.0, 0, 0))])
 
     def predict(points, *, boxes, sensor_origin, skeleton):
@@ -268,7 +268,7 @@ def test_poses_in_found_boxes_are_compared_with_those_in_labeled_boxes():
     assert [row["value"] for row in values] == pytest.approx([30, 0, 30]) and values[0]["count"] == 1
 
 
-def test_poses_are_not_told_where_an_unknown_sensor_stands():
+def test_score_detector_passes_unknown_sensor_to_poses():
     origins = []
 
     def predict(points, *, boxes, sensor_origin, skeleton):
@@ -281,7 +281,7 @@ def test_poses_are_not_told_where_an_unknown_sensor_stands():
     assert origins == ["unknown"] * 2
 
 
-def test_nobody_to_find_is_an_error():
+def test_score_detector_rejects_scans_without_people():
     with pytest.raises(InputError, match="made has no people of 10 or more points within 3 m"):
         score_detector(answers([]), scan_set([scan([5])]), max_range=3.0)
 
@@ -289,7 +289,7 @@ def test_nobody_to_find_is_an_error():
 # ---- the frozen scenes
 
 
-def test_frozen_scenes_are_labeled_scans_and_said_to_be_changed_where_they_are():
+def test_heldout_scans_are_labeled_and_changes_are_counted():
     scans = heldout_scans(limit=120)
     first = scans.loaders[2]()
     wanted = first.num_points >= 10
@@ -303,7 +303,7 @@ def test_frozen_scenes_are_labeled_scans_and_said_to_be_changed_where_they_are()
 
     other = replace(first, changed=True)
     result = score_detector(perfect, scan_set([first, other]), max_range=100)
-    # somebody else's detection may be nearer only where two stand in one place
+    # another person's detection can be nearer only if two people stand in one place
     assert row_of(result, "recall", "0.3")["value"] == 100 and result.changed == 1 and not result.things
 
 
@@ -311,7 +311,7 @@ def test_frozen_scenes_are_labeled_scans_and_said_to_be_changed_where_they_are()
 
 
 @pytest.mark.parametrize("method", run_module.METHODS)
-def test_every_method_finds_who_stands_alone_on_a_plane(method):
+def test_methods_find_single_person_on_plane(method):
     def most_points(arrays):
         count = arrays["scalars"][:, 2]
         return np.stack([4 * count, *np.zeros((3, len(count))), 1.7 + 0 * count, -9 + 0 * count], 1).astype(np.float32)
@@ -332,7 +332,7 @@ def test_every_method_finds_who_stands_alone_on_a_plane(method):
 
 
 def write_scans(folder):
-    """Two scans: one of two people and a stroller, one of a rider; a false person in each."""
+    """Two scans: one of two people and a stroller, one of a rider; both with a false positive."""
     rng = np.random.default_rng(0)
     folder.mkdir()
     for name, xs, categories in (
@@ -350,13 +350,13 @@ def write_scans(folder):
 
 
 def fake(points, origin):
-    """Everything that stands on the x axis, at whole meters, the nearer the surer."""
+    """A detection at each whole meter with points on the x axis, with scores that fall with distance."""
     found = sorted(set(np.round(points[:, 0]).tolist()) - {12.0})
     assert origin is not None
     return [box(x, 0.0) for x in found], np.array([0.9 - 0.03 * x for x in found])
 
 
-def test_the_command_scores_labeled_scans(tmp_path, capsys, monkeypatch):
+def test_evaluate_detector_command_scores_labeled_scans(tmp_path, capsys, monkeypatch):
     write_scans(tmp_path / "labeled")
     monkeypatch.setattr(run_module, "detector_of", lambda method, detector, max_range: fake)
     arguments = ["evaluate", "detector", "--method", "pose", "--scans", str(tmp_path / "labeled"), "--range", "30"]
@@ -373,12 +373,12 @@ def test_the_command_scores_labeled_scans(tmp_path, capsys, monkeypatch):
     assert recall["1", "sensor", "os1-32"]["value"] == 100 and recall["1", "mounted, all", "all"]["value"] == 100
     false = next(row for row in rows if (row["figure"], row["at"], row["group"]) == ("false_people", "1", "all"))
     assert false["value"] == 1
-    # nobody is missed, so there is no picture of them
+    # no person is missed, so there is no picture of missed people
     assert [path.name for path in (tmp_path / "look").iterdir()] == ["labeled-false.png"]
     assert next((tmp_path / "look").iterdir()).read_bytes().startswith(b"\x89PNG")
 
 
-def test_missed_people_are_drawn(tmp_path, monkeypatch):
+def test_evaluate_detector_command_draws_missed_people(tmp_path, monkeypatch):
     write_scans(tmp_path / "labeled")
     monkeypatch.setattr(
         run_module, "detector_of", lambda method, detector, max_range: lambda points, origin: ([], np.zeros(0))
@@ -390,7 +390,7 @@ def test_missed_people_are_drawn(tmp_path, monkeypatch):
     assert {row["value"] for row in rows if row["figure"] == "recall"} <= {0, None}
 
 
-def test_labels_are_taken_by_their_whole_names(tmp_path):
+def test_labeled_scans_match_whole_category_names(tmp_path):
     on_foot = "PEDESTRIAN human.pedestrian.police_officer TYPE_PEDESTRIAN Person_sitting OFFICIAL_SIGNALER".split()
     mounted = ["BICYCLIST", "WHEELED_RIDER", "human.pedestrian.wheelchair", "Cyclist"]
     neither = ["STROLLER", "human.pedestrian.stroller", "vehicle.bicycle", "MOTORCYCLE", "static_object.bicycle_rack"]
@@ -421,7 +421,7 @@ def test_labels_are_taken_by_their_whole_names(tmp_path):
         (["detector", "--scans", "."], "expected labeled scans"),
     ],
 )
-def test_what_does_not_fit_is_one_line(arguments, message, tmp_path, capsys, monkeypatch):
+def test_evaluate_command_rejects_invalid_options(arguments, message, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(["evaluate", *arguments]) == 2
     error = capsys.readouterr().err
@@ -429,7 +429,7 @@ def test_what_does_not_fit_is_one_line(arguments, message, tmp_path, capsys, mon
     assert not list(tmp_path.iterdir())
 
 
-def test_labels_without_a_scan_and_wrong_ones_are_named(tmp_path):
+def test_labeled_scans_rejects_missing_scan_and_wrong_labels(tmp_path):
     write_scans(tmp_path / "labeled")
     (tmp_path / "labeled" / "a.npy").unlink()
     with pytest.raises(InputError, match=r"a\.json.*expected its scan beside it"):
@@ -445,7 +445,7 @@ def test_labels_without_a_scan_and_wrong_ones_are_named(tmp_path):
             labeled_scans(tmp_path / "labeled").loaders[0]()
 
 
-def test_figures_by_the_sensor_s_mount_and_without_its_place():
+def test_score_detector_groups_by_mount_with_unknown_origin():
     scans = [scan([8.0, 12.0], height="under 1 m", tilt="under 3 degrees"), scan([9.0], height="1 to 2.2 m")]
     origins = []
 
@@ -460,6 +460,6 @@ def test_figures_by_the_sensor_s_mount_and_without_its_place():
     assert row_of(result, "recall", "10", "tilt", "under 3 degrees")["count"] == 2
     score_detector(detect, scan_set(scans))
     assert all(origin is not None for origin in origins[2:])
-    # of synthesized scenes it is known
+    # the mount of synthesized scenes is known
     made = synthetic_scan(0, 3)
     assert made.height.endswith(("m", "more")) and "degrees" in made.tilt

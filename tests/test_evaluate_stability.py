@@ -1,4 +1,4 @@
-"""The stability study: what a perturbation does to points, and that curves say what was done."""
+"""The stability study: effect of perturbations on points, labels and boxes, and the resulting curves."""
 
 import json
 import zlib
@@ -49,7 +49,7 @@ def perturbed(name, points, amount, seed, box=None):
 
 
 def level_step(seed, length):
-    """What a generator of `seed` draws first, as a direction."""
+    """Horizontal step of `length` in the first direction that a generator of `seed` draws."""
     angle = np.random.default_rng(seed).uniform(0, 2 * np.pi)
     return length * np.array([np.cos(angle), np.sin(angle), 0])
 
@@ -60,7 +60,7 @@ def rows(points):
 
 @often
 @given(name=st.sampled_from(sorted(PERTURBATIONS)), seed=seeds, n=st.integers(1, 300), boxed=st.booleans())
-def test_nothing_changes_at_0_and_no_input_is_changed(name, seed, n, boxed):
+def test_perturbations_are_identity_at_zero_and_keep_input(name, seed, n, boxed):
     points = cloud(seed, n)
     before, box = points.copy(), box_of(points) if boxed else None
     np.testing.assert_allclose(perturbed(name, points, 0.0, seed, box), points)
@@ -70,7 +70,7 @@ def test_nothing_changes_at_0_and_no_input_is_changed(name, seed, n, boxed):
 
 @often
 @given(name=st.sampled_from(["dropped", "occluder"]), seed=seeds, n=st.integers(1, 300))
-def test_what_is_lost_at_one_share_is_lost_at_each_larger_one(name, seed, n):
+def test_dropped_and_occluder_losses_are_nested(name, seed, n):
     points, amounts = cloud(seed, n), (0.0, *PERTURBATIONS[name].amounts)
     left = [rows(perturbed(name, points, amount, seed)) for amount in amounts]
     assert all(less <= more for more, less in zip(left[:-1], left[1:], strict=True))
@@ -80,11 +80,11 @@ def test_what_is_lost_at_one_share_is_lost_at_each_larger_one(name, seed, n):
 
 @often
 @given(seed=seeds, amount=st.sampled_from([0.1, 0.4, 0.7]))
-def test_an_occluder_s_edge_is_straight_as_the_sensor_sees_it(seed, amount):
+def test_occluder_edge_is_straight_seen_from_sensor(seed, amount):
     points = cloud(seed, 120)
     left = rows(perturbed("occluder", points, amount, seed))
     is_left = np.array([tuple(point) in left for point in points.tolist()])
-    # a plane through the sensor parts the two: the edge and the sensor span it
+    # a plane through the sensor separates the kept points from the hidden ones
     heading = np.arctan2(*points.mean(0)[[1, 0]])
     seen = np.stack([np.sin(heading) * -points[:, 0] + np.cos(heading) * points[:, 1], points[:, 2]], 1)
     seen /= (np.cos(heading) * points[:, 0] + np.sin(heading) * points[:, 1])[:, None]
@@ -94,27 +94,27 @@ def test_an_occluder_s_edge_is_straight_as_the_sensor_sees_it(seed, amount):
 
 @often
 @given(seed=seeds, clip=st.floats(0.001, 0.5))
-def test_jitter_stays_within_its_clip(seed, clip):
+def test_jitter_stays_within_clip(seed, clip):
     points = cloud(seed, 400)
     step = perturbed("jitter", points, clip, seed) - points
     assert np.abs(step).max() <= clip + 1e-9
     assert step.std() == pytest.approx(0.48 * clip, rel=0.15)
 
 
-def test_as_many_are_dropped_as_the_share_says():
+def test_dropped_removes_given_share():
     assert len(perturbed("dropped", cloud(0, 20_000), 0.75, 1)) == pytest.approx(5000, rel=0.05)
 
 
 @often
 @given(seed=seeds, count=st.integers(0, 200))
-def test_two_clusters_are_added_and_stay_where_they_are_while_they_grow(seed, count):
+def test_clusters_adds_two_that_stay_in_place_as_they_grow(seed, count):
     points = cloud(seed, 150)
     more = perturbed("clusters", points, count, seed)
     np.testing.assert_array_equal(more[:150], points)
     assert len(more) == 150 + 2 * count
     for added in (more[150 : 150 + count], more[150 + count :]):
         assert (np.abs(added - center_of(points)) <= np.array([0.4, 0.4, 0.8]) + 0.3).all()
-        # a ball of 30 cm holds them
+        # each cluster fits into a ball of radius 30 cm
         assert not count or np.ptp(added, axis=0).max() <= 0.6
     few, many = (perturbed("clusters", points, count, 5)[150:] for count in (40, 150))
     for first, second in ((few[:40], many[:150]), (few[40:], many[150:])):
@@ -122,7 +122,7 @@ def test_two_clusters_are_added_and_stay_where_they_are_while_they_grow(seed, co
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_cluster_alone_is_one_of_those_of_training(seed):
+def test_noise_clusters_match_single_clusters(seed):
     rng, twin = np.random.default_rng(seed), np.random.default_rng(seed)
     counts = range(twin.integers(1, 3))
     slow = [noise_cluster(np.zeros(3), count=int(twin.integers(0, 61)), rng=twin) for _ in counts]
@@ -131,7 +131,7 @@ def test_a_cluster_alone_is_one_of_those_of_training(seed):
 
 @often
 @given(seed=seeds, amount=st.floats(0, 0.5))
-def test_a_displaced_box_loses_one_side(seed, amount):
+def test_crop_drops_points_outside_displaced_box(seed, amount):
     points = cloud(seed, 200)
     box = box_of(points)
     inside = (np.abs(points - box.center - level_step(seed, amount)) <= box.size / 2).all(1)
@@ -142,7 +142,7 @@ def test_a_displaced_box_loses_one_side(seed, amount):
 
 
 def people_of(error):
-    """Predictions of human15, of errors (n, 15) m along x; NaN has no label."""
+    """Predictions of human15 with errors (n, 15) in m along x; NaN: unlabeled."""
     people = []
     for k, own in enumerate(error):
         labels = np.where(np.isnan(own), 0, 2)
@@ -152,19 +152,19 @@ def people_of(error):
     return stack(HUMAN15, people)
 
 
-def test_end_joints_are_of_the_worst_people():
+def test_end_errors_use_worst_people():
     error = np.full((10, 15), 0.01)
     error[:3] = 0.2
     error[0, HUMAN15.index("left_wrist")] = 0.6
     error[1, HUMAN15.index("right_wrist")] = np.nan
     ends = {end.group: end for end in end_errors(people_of(error))}
     assert set(ends) == {"head", "wrists", "ankles"}
-    # 30 % of ten people are the three with 20 cm
+    # the worst 30 % of ten people are the three with errors of 20 cm
     assert all(end.worst == 3 and end.people == 3 for end in ends.values())
     assert (ends["head"].mean, ends["head"].deviation) == pytest.approx((200, 0), abs=1e-3)
     assert ends["wrists"].mean == pytest.approx((600 + 4 * 200) / 5, abs=1e-3)
     assert ends["wrists"].quartiles == pytest.approx((200, 200, 200), abs=1e-3)
-    # at most 600
+    # at most 600 people
     error = np.random.default_rng(0).uniform(0, 1, (2500, 1)) + np.zeros((2500, 15))
     head = next(end for end in end_errors(people_of(error)) if end.group == "head")
     assert head.worst == head.people == 600
@@ -194,7 +194,7 @@ def studied(setup, **options):
     return study(setup, evaluate_dataset(setup).predictions, **options)
 
 
-def test_plain_people_of_a_synthesized_folder_have_a_row(synthetic):
+def test_evaluate_dataset_reports_plain_synthetic_people(synthetic):
     wanted = [
         row["upright"] and row["visible"] > 0.8 and row["clutter"] < 0.05 and len(row["points"]) >= 300
         for row in open_dataset(synthetic).rows()
@@ -206,10 +206,10 @@ def test_plain_people_of_a_synthesized_folder_have_a_row(synthetic):
 
 
 @pytest.mark.long
-def test_curves_say_what_was_done(synthetic, monkeypatch):
+def test_study_curves_match_perturbations(synthetic, monkeypatch):
     monkeypatch.setattr(module, "CAST", 2)
     monkeypatch.setattr(module, "SENSORS", ("vlp-16", "os1-128"))
-    # no answer for thinned people, and one that notices noise
+    # no pose for fewer than 60 points; other poses depend on the points
     setup = set_up(synthetic, lambda points: None if len(points) < 60 else standing(points))
     base = evaluate_dataset(setup).predictions
     done = []
@@ -227,17 +227,17 @@ def test_curves_say_what_was_done(synthetic, monkeypatch):
     assert added == [0, 20, 50, 100, 200, 400]
     assert [point.label for point in curves["sensors"]] == ["vlp-16", "os1-128"]
     assert curves["sensors"][0].points < curves["sensors"][1].points
-    # the same numbers whoever asks again, and they can be written and drawn
+    # a repeated study gives the same numbers; results can be written and drawn
     assert study(setup, base) == result
     written = json.loads(to_json([result], head={"command": "x"}))
     assert written["schema"] == "lidarpose.stability/1" and len(written["studies"][0]["curves"]) == len(result.curves)
     assert draw_stability(result)[:4] == b"\x89PNG"
 
 
-def test_a_frame_out_of_level_moves_points_and_labels_alike(synthetic, monkeypatch):
+def test_tilt_rotates_points_labels_and_boxes(synthetic, monkeypatch):
     monkeypatch.setattr(module, "PERTURBATIONS", {"tilt": PERTURBATIONS["tilt"]})
     monkeypatch.setattr(module, "SENSORS", ())
-    # who knows no up errs as much in any frame; who takes z for up does not
+    # errors of rotation-invariant predictions are the same in any frame; those that assume z up are not
     careless = studied(set_up(synthetic, lambda points: np.repeat(points.mean(0)[None], 26, 0))).curves[0].points
     assert [point.label for point in careless] == ["0", "5", "10", "15", "20", "30"]
     assert [point.mpjpe for point in careless] == pytest.approx([careless[0].mpjpe] * 6, abs=0.01)
@@ -253,7 +253,7 @@ def test_a_frame_out_of_level_moves_points_and_labels_alike(synthetic, monkeypat
         np.testing.assert_allclose(moved.center, R @ still.center, atol=1e-3)
 
 
-def test_nobody_posed_is_drawn_and_without_the_extra_other_sensors_are_left_out(synthetic, monkeypatch):
+def test_study_without_poses_or_numba_can_be_drawn(synthetic, monkeypatch):
     def missing(*_):
         raise ModuleNotFoundError("numba", name="numba")
 
@@ -265,20 +265,20 @@ def test_nobody_posed_is_drawn_and_without_the_extra_other_sensors_are_left_out(
     assert draw_stability(replace(nobody, curves=(*nobody.curves, sensors)))[:4] == b"\x89PNG"
 
 
-def test_a_displaced_box_lets_in_what_lies_around(humanm3):
+def test_displaced_crop_includes_surrounding_points(humanm3):
     setup, gained = set_up(humanm3), 0
     for person in module.people_to_perturb(setup):
         whole, box = person.whole.points, person.shown.crop_box
         np.testing.assert_array_equal(person.shown.points, whole[box.contains(whole)])
-        # a box so small that the person reaches beyond it
+        # a box smaller than the person
         small = replace(box, size=box.size * 0.6)
         shown = replace(person.shown, points=whole[small.contains(whole)], crop_box=small)
         perturbed = module._perturbed(setup, replace(person, shown=shown), "crop", 0.2)
         points = perturbed.points
-        # the same draws as of the perturbation
+        # the same random draws as in the perturbation
         step = level_step([0, zlib.crc32(b"crop"), shown.shard, shown.row], 0.2)
         inside = replace(small, center=small.center + step).contains(whole)
-        # the network is told where the displaced box is
+        # the network gets the displaced box
         np.testing.assert_allclose(perturbed.crop_box.center, small.center + step)
         assert rows(points) == rows(whole[inside].astype(float))
         gained += (inside & ~small.contains(whole)).sum()
@@ -286,15 +286,15 @@ def test_a_displaced_box_lets_in_what_lies_around(humanm3):
 
 
 @pytest.mark.parametrize("protocol", ["clean", "dapt"])
-def test_a_crop_moved_by_nothing_is_the_crop(humanm3, protocol):
-    """In the protocol dapt too, whose box is another one."""
+def test_crop_displaced_by_zero_is_unchanged(humanm3, protocol):
+    """Also in the protocol dapt, which uses another box."""
     setup = set_up(humanm3, protocol=protocol)
     for person in module.people_to_perturb(setup):
         points = module._perturbed(setup, person, "crop", 0.0).points
         np.testing.assert_array_equal(points, person.shown.points.astype(float))
 
 
-def test_no_pose_stays_out_of_the_increase_and_intervals_are_of_the_seed():
+def test_curve_point_excludes_missing_poses_and_uses_seed():
     def point(base, errors, clusters=None, seed=0):
         errors = np.array(errors, float)[:, None]
         posed = ~np.isnan(errors[:, 0])
@@ -304,7 +304,7 @@ def test_no_pose_stays_out_of_the_increase_and_intervals_are_of_the_seed():
 
     found = point([100.0, 200.0, 300.0], [110.0, np.nan, 330.0])
     assert (found.mpjpe, found.increase, found.no_pose, found.people, found.points) == (220.0, 20.0, 1, 3, 6.0)
-    # whoever had none unperturbed has none here either
+    # people without a pose on the unperturbed points are counted, too
     assert point([100.0, np.nan, 300.0], [110.0, np.nan, np.nan]).no_pose == 2
     assert point([100.0, np.nan, 300.0], [100.0, np.nan, 300.0]).no_pose == 1
     alone = point([100.0, 200.0, 300.0], [110.0, np.nan, 330.0], np.array(["a", "a", "a"]))
@@ -314,8 +314,8 @@ def test_no_pose_stays_out_of_the_increase_and_intervals_are_of_the_seed():
     assert first == again and first.mpjpe == other.mpjpe and first.low != other.low
 
 
-def test_other_sensors_see_the_same_people_at_the_same_places(synthetic, monkeypatch):
-    """Few beams do not bring them nearer: who is hardly seen then has no pose, and is counted."""
+def test_sensor_curve_casts_same_people_at_same_places(synthetic, monkeypatch):
+    """Sensors with few beams keep the distance; people with too few points have no pose and are counted."""
     monkeypatch.setattr(module, "CAST", 12)
     monkeypatch.setattr(module, "SENSORS", ("vlp-16", "livox-mid360", "os1-128"))
     asked, predict = [], EvalSetup.predict

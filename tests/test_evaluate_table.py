@@ -1,4 +1,4 @@
-"""The table: published figures as printed, ours from scores.json alone, by protocol; and the command line."""
+"""The table of published figures and those of scores.json, by protocol, and its command line."""
 
 import json
 
@@ -10,7 +10,7 @@ from lidarpose.eval.scores import MetricRow, Result, Scores, Setting
 
 
 def scores(folder, *, method="mine", kind="waymo", protocol="clean", value=70.0, digest="ab" * 32, **more):
-    """Writes a scores.json of one dataset, PA-MPJPE not found."""
+    """Writes a scores.json of one dataset, without PA-MPJPE."""
     shared = {"protocol": protocol, "centring": "somewhere", "split": "val", "limit": more.get("limit")}
     setting = Setting(
         dataset=more.get("dataset", kind), kind=kind, method=method, crop="so", split_source="a list",
@@ -36,7 +36,7 @@ def scores(folder, *, method="mine", kind="waymo", protocol="clean", value=70.0,
     return folder
 
 
-def test_published_figures_are_the_paper_s():
+def test_published_figures_match_paper():
     published = evaluation.published()
     methods = {method["method"]: method["figures"] for method in published["methods"]}
     assert list(methods) == ["LiDARCap", "NE", "LPFormer", "PRN", "DAPT"]
@@ -47,11 +47,11 @@ def test_published_figures_are_the_paper_s():
         "sloper4d": {"mpjpe": 28.01, "pa_mpjpe": 21.52, "pck3": 99.30, "pck5": 99.87},
     }
     assert set(methods["NE"]) == set(methods["LiDARCap"]) == {"lidarhuman26m", "sloper4d"}
-    assert "not run here" in published["note"] and "Table 1" in published["source"]
+    assert "not reproduced here" in published["note"] and "Table 1" in published["source"]
     assert all("oracle" in about["protocol"] for about in published["datasets"].values())
 
 
-def test_without_scores_there_is_no_figure_of_ours():
+def test_table_without_scores_has_only_published_figures():
     text = evaluation.table([])
     assert "Evaluated here" not in text and text.count("| DAPT |") == 1
     # 3 + 3 + 4 + 4 figures of DAPT, PRN and LPFormer, 8 of the others
@@ -60,7 +60,7 @@ def test_without_scores_there_is_no_figure_of_ours():
     assert len(rows) == 5 and len(figures) == 70 and figures.count("-") == 12
 
 
-def test_protocols_stand_in_blocks_of_their_own(tmp_path):
+def test_table_separates_protocols(tmp_path):
     paths = [scores(tmp_path / "a"), scores(tmp_path / "b", protocol="dapt", value=66.0, leaks="much")]
     text = evaluation.table(paths)
     published, dapt, clean = text.split("**Evaluated here")
@@ -72,23 +72,23 @@ def test_protocols_stand_in_blocks_of_their_own(tmp_path):
     note = next(line for line in text.splitlines() if line.startswith(mark + " "))
     words = "protocol clean", "center: somewhere", "crop: so", "split: val (a list)", "9 people", "2 joints", "abababab"
     assert all(word in note for word in (*words, "2 without a pose")) and "which leaks: much" in text
-    # other sets stand apart
+    # datasets that are not in the paper have their own block
     text = evaluation.table([scores(tmp_path / "c", kind="bench", dataset="lidarpose-bench-1", limit=9)])
     assert "9 people, evenly picked from 200" in text
     assert "**Evaluated here on sets that the paper does not have.**" in text and "| baseline: nobody | 300.00" in text
 
 
-def test_two_weights_of_one_name_are_two_rows(tmp_path):
+def test_table_has_one_row_per_weights_digest(tmp_path):
     paths = [scores(tmp_path / k, digest=k * 64, value=v) for k, v in (("a", 71.0), ("b", 72.0))]
     both = evaluation.table(paths)
     assert both.count("| mine |") == 2
-    # one network on two sets is one row
+    # one network on two datasets is one row
     more = evaluation.table([paths[0], scores(tmp_path / "c", kind="humanm3", digest="a" * 64, value=80.0)])
     row = next(line for line in more.splitlines() if line.startswith("| mine |"))
     assert "71.00" in row and "80.00" in row
 
 
-def test_json_holds_both(tmp_path):
+def test_table_json_has_published_and_evaluated(tmp_path):
     content = json.loads(evaluation.table([scores(tmp_path / "a")], format="json"))
     assert content["published"] == evaluation.published()
     assert [entry["row"] for entry in content["evaluated"]] == ["mine", "mine, released arithmetic", "floor: nobody"]
@@ -108,7 +108,7 @@ def run(*arguments):
 
 
 @pytest.mark.long
-def test_evaluate_and_table_from_the_command_line(tmp_path, monkeypatch, capsys):
+def test_cli_evaluate_then_table(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run("evaluate", "tiny", "bench", "--limit", "12", "--seed", "3") == 0
     shown = capsys.readouterr()
@@ -116,7 +116,7 @@ def test_evaluate_and_table_from_the_command_line(tmp_path, monkeypatch, capsys)
         "scores.json", "poses.parquet", "lidarpose-bench-1-errors.png", "lidarpose-bench-1-reliability.png",
         "lidarpose-bench-1-worst.png",
     }  # fmt: skip
-    # the headline first, then once how it was found
+    # the headline first, then the setting, printed once
     headline, setting, *rows = shown.out.splitlines()
     assert "clean · points alone · no split · 12 of 2,000 people" in setting
     assert not any("points alone · no split" in row for row in rows) and sum("MPJPE" in row for row in rows) > 10
@@ -132,7 +132,7 @@ def test_evaluate_and_table_from_the_command_line(tmp_path, monkeypatch, capsys)
     assert run("table", "evaluation/tiny", "--out", "table.csv") == 2 and not (tmp_path / "table.csv").exists()
     capsys.readouterr()
 
-    # the same folder is not written twice
+    # a folder that contains files is not overwritten
     assert run("evaluate", "tiny", "bench", "--limit", "5", "--out", "evaluation/tiny") == 2
     assert "holds other files" in capsys.readouterr().err
 
@@ -150,7 +150,7 @@ def test_evaluate_and_table_from_the_command_line(tmp_path, monkeypatch, capsys)
         (("table", "--format", "tex"), "markdown or json, got 'tex'"),
     ],
 )
-def test_what_is_wrong_is_one_line_and_nothing_is_written(arguments, words, tmp_path, monkeypatch, capsys):
+def test_cli_errors_are_one_line_and_write_nothing(arguments, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run(*arguments) == 2
     shown = capsys.readouterr()

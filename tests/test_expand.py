@@ -1,4 +1,4 @@
-"""A larger network that begins where a smaller one is."""
+"""Initialization of a larger network from a smaller one."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ from lidarpose.train.setup import make_setup
 def arrays():
     generator, rng = Generator(scene=scene_config("wild"), measure=False), np.random.default_rng(0)
     people = [example(generator.person(77, k).sample, rng, refined=0.0) for k in range(24)]
-    # with the tables that convolutions read; others leave them
+    # with the neighbor tables of convolutions, which other networks ignore
     return PoseNetObjective(config=preset("tiny")).collate(people)
 
 
@@ -36,7 +36,7 @@ def outputs_of(network, arrays):
 
 @pytest.mark.long
 @pytest.mark.parametrize("heatmap", ["window", "full", "none"])
-def test_more_blocks_and_convolutions_change_nothing(arrays, heatmap):
+def test_expand_weights_keeps_outputs(arrays, heatmap):
     torch.manual_seed(0)
     config = replace(preset("tiny"), heatmap=heatmap, convolution=0)
     small = PoseNet(config)
@@ -46,8 +46,8 @@ def test_more_blocks_and_convolutions_change_nothing(arrays, heatmap):
         torch.testing.assert_close(getattr(after, name), getattr(before, name), atol=1e-5, rtol=1e-5)
 
 
-def test_small_begins_where_tiny_is(arrays):
-    """What is left is the norm of the joint head's two streams: joints move by next to nothing and are as good."""
+def test_expand_weights_tiny_to_small_keeps_joints(arrays):
+    """Joints move by less than 2 % of their error, due to the norm of the joint head's two streams."""
     network, _ = load_checkpoint(bundled_path("tiny"))
     torch.manual_seed(0)
     before, after = (
@@ -58,12 +58,12 @@ def test_small_begins_where_tiny_is(arrays):
     errors = [float((joints - true).norm(dim=-1).mean()) for joints in (before, after)]
     moved = float((after - before).norm(dim=-1).mean())
     assert moved < 0.02 * errors[0] and errors[1] < 1.05 * errors[0], (moved, errors)
-    # a network that is not expanded is elsewhere
+    # a network with random weights predicts other joints
     assert (outputs_of(PoseNet(preset("small")), arrays).joints() - before).norm(dim=-1).mean() > 0.2
 
 
 @pytest.mark.long
-def test_all_that_is_new_learns(arrays):
+def test_expanded_network_trains_all_weights(arrays):
     torch.manual_seed(0)
     network, _ = load_checkpoint(bundled_path("tiny"))
     larger = expand_weights(network, preset("small"))
@@ -79,12 +79,12 @@ def test_all_that_is_new_learns(arrays):
     for name, value in larger.named_parameters():
         still = value == before[name]
         if value.ndim > 1:
-            # whole rows or columns that never move would be dead
+            # no row or column stays unchanged
             assert not still.all(-1).any(), name
             assert not still.flatten(0, -2).all(0).any(), name
 
 
-def test_growing_needs_room_and_the_same_meaning():
+def test_expand_weights_rejects_incompatible_configs():
     tiny = PoseNet(preset("tiny"))
     for change, words in (
         ({"channels": (32, 64, 96)}, "must not shrink"),
@@ -99,7 +99,7 @@ def test_growing_needs_room_and_the_same_meaning():
             expand_weights(tiny, replace(preset("tiny"), **change))
 
 
-def test_pretraining_goes_on_from_weights(tmp_path):
+def test_pretrain_initializes_from_smaller_network(tmp_path):
     setup = make_setup(Pretrain(size="small", init="tiny"))
     torch.manual_seed(0)
     network = setup.network()

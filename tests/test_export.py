@@ -1,4 +1,4 @@
-"""Networks as files that run elsewhere: the same answers at other sizes, and one line for every fault."""
+"""Export to ONNX and torch programs: equal outputs at other sizes, and errors of one line."""
 
 import json
 import shutil
@@ -34,7 +34,7 @@ from lidarpose.models.onnx import (
 from lidarpose.models.posenet import ArrayModule, PoseNet
 
 CARD = {"command": "none", "note": "random"}
-# every kind of layer, few of each: what is traced takes as long as there are layers
+# every kind of layer, few of each: tracing time grows with the number of layers
 SMALL = NetworkConfig(
     size="small", channels=(16, 32, 32), head_channels=16, blocks=(0, 1, 0), convolution=8, person=True
 )
@@ -44,7 +44,7 @@ def stored_network(path, config, seed=0):
     torch.manual_seed(seed)
     network = PoseNet(config)
     with torch.no_grad():
-        # untrained outputs hardly differ from joint to joint, which would hide a mix-up
+        # untrained outputs hardly differ between joints, which would hide swapped joints
         for parameter in network.parameters():
             parameter += 0.1 * torch.randn_like(parameter)
     save_checkpoint(path, network, card=CARD, half=True)
@@ -53,7 +53,7 @@ def stored_network(path, config, seed=0):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A checkpoint and its ONNX file: bundled ones, since making one takes half a minute."""
+    """A bundled checkpoint and its ONNX file, since an export takes half a minute."""
     folder = tmp_path_factory.mktemp("export")
     for suffix in (".safetensors", ".onnx"):
         shutil.copy(bundled_path(DEFAULT, suffix), folder / f"net{suffix}")
@@ -62,7 +62,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """As `folder`, of a random network, with the graph before its weights became float16."""
+    """Like `folder`, of a random network; also contains the graph before its weights became float16."""
     folder = tmp_path_factory.mktemp("exported")
     path = stored_network(folder / "net.safetensors", SMALL)
     pack = exporting._pack
@@ -79,7 +79,7 @@ def exported(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def program(tmp_path_factory):
-    """A network, what a user of its program has, and what the program's file tells."""
+    """A network, its exported torch program, and the metadata in the program's file."""
     folder = tmp_path_factory.mktemp("program")
     path = stored_network(folder / "net.safetensors", SMALL)
     export(path, folder / "net.pt2", format="torch")
@@ -105,7 +105,7 @@ SIZES = [(1,), (5000, 1, 20, 0), (0,), (40, 40), (3, 700, 90, 8, 15, 2, 1)]
 
 
 @pytest.mark.parametrize("sizes", SIZES, ids=str)
-def test_a_program_of_torch_gives_what_torch_gives(program, sizes):
+def test_export_torch_program_matches_network(program, sizes):
     network, module, entry = program
     assert entry["config"]["size"] == "small"
     arrays = voxelize_people(*people(*sizes), network.config).arrays()
@@ -126,14 +126,14 @@ class Halved(torch.nn.Module):
 
 
 @pytest.mark.long
-def test_a_module_becomes_onnx_of_free_length_that_tells_only_what_it_is_told():
+def test_module_to_onnx_has_dynamic_rows_and_only_given_metadata():
     module = Halved()
     content = module_to_onnx(module, (torch.ones(3, 5, 8),), ({0: "rows"},), ["x"], ["sum", "half"], {"note": "a note"})
     session = open_session(content)
     assert session.get_modelmeta().custom_metadata_map == {"note": "a note"}
     assert [value.shape for value in session.get_inputs()] == [["rows", 5, 8]]
     assert b"test_export.py" not in content
-    # weights of which half precision keeps all
+    # weights that half precision represents exactly
     assert onnx.TensorProto.FLOAT16 in {each.data_type for each in onnx.load_from_string(content).graph.initializer}
     for rows in (1, 7):
         x = torch.rand(rows, 5, 8)
@@ -143,7 +143,7 @@ def test_a_module_becomes_onnx_of_free_length_that_tells_only_what_it_is_told():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sizes", SIZES, ids=str)
-def test_onnx_gives_what_torch_gives(exported, sizes):
+def test_onnx_backend_matches_torch_backend(exported, sizes):
     clouds, view = people(*sizes)
     network, header = load_checkpoint(exported / "net.safetensors")
     ours = OnnxBackend(exported / "net.onnx", threads=1).run(clouds, view)
@@ -155,8 +155,8 @@ def test_onnx_gives_what_torch_gives(exported, sizes):
 
 
 @pytest.mark.slow
-def test_float16_weights_stay_float16(exported):
-    """A smaller file, and not a bit of any output is lost."""
+def test_export_stores_float16_weights_without_loss(exported):
+    """The file is smaller and all outputs are bit-identical."""
     network, header = load_checkpoint(exported / "net.safetensors")
     packed = (exported / "net.onnx").read_bytes()
     assert_no_path_of_this_machine(exported / "net.onnx")
@@ -171,7 +171,7 @@ def test_float16_weights_stay_float16(exported):
         np.testing.assert_array_equal(ours, due)
 
 
-def test_weights_that_need_all_of_float32_keep_it():
+def test_pack_keeps_float32_where_float16_loses_precision():
     rng = np.random.default_rng(0)
     kept = {
         "fine": rng.normal(size=100).astype(np.float32),
@@ -213,16 +213,16 @@ def assert_tells_what_it_is(folder):
     assert_no_path_of_this_machine(folder / "net.onnx")
 
 
-def test_the_bundled_file_tells_what_it_is(folder):
+def test_open_onnx_reads_header_of_bundled_file(folder):
     assert_tells_what_it_is(folder)
 
 
 @pytest.mark.slow
-def test_a_new_file_tells_what_it_is(exported):
+def test_open_onnx_reads_header_of_exported_file(exported):
     assert_tells_what_it_is(exported)
 
 
-def test_an_exported_file_is_a_model_of_its_own(folder, capfd):
+def test_load_accepts_onnx_file(folder, capfd):
     model = lidarpose.load(folder / "net.onnx")
     assert model.backend.name == "onnx" and model.model["name"] == "net"
     beside = lidarpose.load(folder / "net.safetensors", backend="onnx")
@@ -233,7 +233,7 @@ def test_an_exported_file_is_a_model_of_its_own(folder, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-# ---- what is wrong with a file
+# ---- errors of files
 
 
 def assert_one_line(path, *parts, read=OnnxBackend):
@@ -246,7 +246,7 @@ def assert_one_line(path, *parts, read=OnnxBackend):
 
 
 def changed(folder, path, change):
-    """The exported file, its protocol buffer changed in place, without the digest, which would not fit."""
+    """Writes the exported file with a changed protocol buffer, without the digest, which would not match."""
     model = onnx.load(folder / "net.onnx")
     with_entry(DIGEST, None)(model)
     change(model)
@@ -269,7 +269,7 @@ def with_entry(key, value):
     [*((slice(end), "") for end in (1, 50, 20_000, -1, -3000)), (b"text", ""), (bytes(64), ""), (b"", "is empty")],
     ids=str,
 )
-def test_a_truncated_file_or_one_of_another_kind(folder, tmp_path, content, words, capfd):
+def test_onnx_backend_rejects_truncated_and_foreign_files(folder, tmp_path, content, words, capfd):
     path = tmp_path / "bad.onnx"
     path.write_bytes(content if isinstance(content, bytes) else (folder / "net.onnx").read_bytes()[content])
     assert_one_line(path, words)
@@ -280,7 +280,7 @@ def test_a_truncated_file_or_one_of_another_kind(folder, tmp_path, content, word
 
 @settings(max_examples=120, deadline=None)
 @given(at=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
-def test_a_flipped_bit_is_noticed(folder, at, bit):
+def test_check_digest_detects_flipped_bit(folder, at, bit):
     content = bytearray((folder / "net.onnx").read_bytes())
     content[int(at * len(content))] ^= 1 << bit
     try:
@@ -288,11 +288,11 @@ def test_a_flipped_bit_is_noticed(folder, at, bit):
     except InputError as error:
         assert str(error) == f"x.onnx: {DAMAGED}"
         return
-    # of the digest's own name
+    # the flipped bit is in the name of the digest's entry
     assert not has_digest
 
 
-def test_a_file_without_a_digest_loads_with_a_note(folder, tmp_path):
+def test_open_onnx_warns_without_digest(folder, tmp_path):
     older = changed(folder, tmp_path / "older.onnx", lambda model: None)
     with pytest.warns(UserWarning, match="older.onnx: has no digest, so damage goes unnoticed"):
         open_onnx(older)
@@ -303,8 +303,8 @@ def test_a_file_without_a_digest_loads_with_a_note(folder, tmp_path):
             assert check_digest(name, bundled_path(name, ".onnx").read_bytes())
 
 
-def test_weights_in_other_files_are_refused(folder, tmp_path, monkeypatch):
-    """They would be looked up in the current folder."""
+def test_onnx_backend_rejects_external_weights(folder, tmp_path, monkeypatch):
+    """They would be read from the current folder."""
     model = onnx.load(folder / "net.onnx")
     path = tmp_path / "x.onnx"
     onnx.save(model, path, save_as_external_data=True, location="weights.bin", size_threshold=0)
@@ -313,7 +313,7 @@ def test_weights_in_other_files_are_refused(folder, tmp_path, monkeypatch):
     assert_one_line(path, "keeps its weights in other files", "lidarpose export")
 
 
-def test_weights_that_are_no_numbers_are_said_to_be_damaged(folder, tmp_path):
+def test_predict_reports_nan_weights_as_damaged(folder, tmp_path):
     def without_numbers(model):
         for weight in model.graph.initializer:
             values = onnx.numpy_helper.to_array(weight)
@@ -328,7 +328,7 @@ def test_weights_that_are_no_numbers_are_said_to_be_damaged(folder, tmp_path):
 
 
 @pytest.mark.long
-def test_another_program_s_onnx_and_another_version_s(folder, tmp_path):
+def test_onnx_backend_rejects_foreign_and_other_version_models(folder, tmp_path):
     entry = json.loads(read_header(folder / "net.safetensors").to_json())
     for change, words in (
         (with_entry("lidarpose", None), "not a checkpoint of lidarpose"),
@@ -343,7 +343,7 @@ def test_another_program_s_onnx_and_another_version_s(folder, tmp_path):
         assert_one_line(changed(folder, tmp_path / "x.onnx", change), words)
 
 
-def test_the_twin_beside_a_checkpoint(folder, tmp_path):
+def test_exported_beside_requires_onnx_of_same_weights(folder, tmp_path):
     path = tmp_path / "net.safetensors"
     path.write_bytes((folder / "net.safetensors").read_bytes())
     assert_one_line(path, "net.onnx beside it, which does not exist", "lidarpose export", read=exported_beside)
@@ -354,10 +354,10 @@ def test_the_twin_beside_a_checkpoint(folder, tmp_path):
         exported_beside(path)
 
 
-# ---- what is wrong with an export
+# ---- errors of export
 
 
-def test_what_cannot_be_exported_is_one_line(folder, tmp_path, monkeypatch):
+def test_export_rejects_bad_format_name_and_path(folder, tmp_path, monkeypatch):
     out = tmp_path / "out.onnx"
     with pytest.raises(InputError, match="unknown format 'tflite': known are onnx, torch"):
         export(folder / "net.safetensors", out, format="tflite")
@@ -367,14 +367,14 @@ def test_what_cannot_be_exported_is_one_line(folder, tmp_path, monkeypatch):
         with pytest.raises(InputError, match=f"give a name that ends in {ending}"):
             export(folder / "net.safetensors", tmp_path / name, format=format)
     (tmp_path / "file").write_text("")
-    # at once, not after a minute of tracing
+    # before tracing, which takes a minute
     monkeypatch.setattr("lidarpose.models.export.onnx_bytes", None)
     with pytest.raises(InputError, match="a part of the path is a file"):
         export(folder / "net.safetensors", tmp_path / "file" / "out.onnx")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_without_onnx_the_extra_is_named(folder, tmp_path, monkeypatch):
+def test_export_names_missing_extra(folder, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "onnxscript", None)
     with pytest.raises(MissingExtra, match=r"pip install '\.\[export\]'"):
         export(folder / "net.safetensors", tmp_path / "out.onnx")
@@ -382,7 +382,7 @@ def test_without_onnx_the_extra_is_named(folder, tmp_path, monkeypatch):
 
 
 @pytest.mark.long
-def test_a_wrong_export_is_not_written(folder, tmp_path, monkeypatch):
+def test_export_writes_nothing_if_outputs_differ(folder, tmp_path, monkeypatch):
     network, _ = load_checkpoint(folder / "net.safetensors")
     other, _ = load_checkpoint(stored_network(tmp_path / "other.safetensors", SMALL, seed=5))
     content = (folder / "net.onnx").read_bytes()
@@ -408,7 +408,7 @@ def test_a_wrong_export_is_not_written(folder, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("change", [{"heatmap": "full"}, {"heatmap": "none"}, {"convolution": 0, "blocks": (2, 1, 1)}])
-def test_every_kind_of_network_is_exported(tmp_path, change):
+def test_export_supports_network_variants(tmp_path, change):
     path = stored_network(tmp_path / "net.safetensors", replace(SMALL, **change))
     export(path, tmp_path / "net.onnx")
     export(path, tmp_path / "net.pt2", format="torch")
@@ -420,6 +420,6 @@ def test_every_kind_of_network_is_exported(tmp_path, change):
 
 
 @pytest.mark.slow
-def test_bundled_weights_are_exported_by_name(tmp_path):
+def test_export_accepts_bundled_name(tmp_path):
     export("tiny", tmp_path / "tiny.onnx")
     assert OnnxBackend(tmp_path / "tiny.onnx").source == content_digest(bundled_path("tiny"), expected="a checkpoint")

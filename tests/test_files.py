@@ -1,4 +1,4 @@
-"""Writing in one step: the old content or the new one, nothing left behind, one line when the disk refuses."""
+"""Atomic writes, locked folders, bounded npz files, and disk errors of one line."""
 
 import errno
 import io
@@ -28,7 +28,7 @@ def tree(folder):
 
 @settings(max_examples=30, deadline=None)
 @given(data=st.binary() | st.text())
-def test_round_trip(tmp_path_factory, data):
+def test_write_atomic_round_trip(tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("files")
     path = folder / "deep" / "er" / "a.json"
     for content in (b"the older content", data):
@@ -40,13 +40,13 @@ def test_round_trip(tmp_path_factory, data):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="modes are POSIX's")
-def test_new_files_have_the_usual_mode(tmp_path):
+def test_write_atomic_uses_default_mode(tmp_path):
     write_atomic(tmp_path / "a.txt", "new")
     (tmp_path / "b.txt").write_text("plain")
     assert stat.S_IMODE((tmp_path / "a.txt").stat().st_mode) == stat.S_IMODE((tmp_path / "b.txt").stat().st_mode)
 
 
-def test_other_libraries_see_the_suffix(tmp_path):
+def test_atomic_path_keeps_suffix(tmp_path):
     path = tmp_path / "a.npz"
     with atomic_path(path) as temporary:
         assert temporary.parent == tmp_path and temporary.suffix == ".npz" and temporary != path
@@ -57,14 +57,14 @@ def test_other_libraries_see_the_suffix(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a.txt", "a" * 250 + ".png", "点" * 84, "é" * 125 + ".png"])
-def test_names_long_and_relative(tmp_path, monkeypatch, name):
+def test_write_atomic_accepts_long_and_relative_names(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     write_atomic(name, b"x")
     assert tree(tmp_path) == [name] and (tmp_path / name).read_bytes() == b"x"
 
 
-def test_temporary_names_are_nobody_elses(tmp_path, monkeypatch):
-    """A container that was killed left a file of this very process id, and numbers may be drawn from one seed."""
+def test_atomic_path_temporary_names_are_unique(tmp_path, monkeypatch):
+    """Also after a killed process with the same id, and with equal random seeds."""
     monkeypatch.setattr(os, "getpid", lambda: 1)
     for number in range(9):
         (tmp_path / f".1-{number}-a.txt").write_text("left")
@@ -78,7 +78,7 @@ def test_temporary_names_are_nobody_elses(tmp_path, monkeypatch):
     assert all(re.fullmatch(files._TEMPORARY + "a.txt", name) for name in (*names, ".1-8-a.txt"))
 
 
-def test_nested_and_simultaneous_paths_differ(tmp_path):
+def test_atomic_path_nested_calls_use_different_files(tmp_path):
     with atomic_path(tmp_path / "a.txt") as one, atomic_path(tmp_path / "a.txt") as two:
         assert one != two
         one.write_text("one")
@@ -90,7 +90,7 @@ def test_nested_and_simultaneous_paths_differ(tmp_path):
 @pytest.mark.parametrize(
     "error", [RuntimeError("boom"), KeyboardInterrupt(), SystemExit(1), OSError(errno.EIO, "far away")]
 )
-def test_failure_leaves_the_old_file_and_nothing_else(tmp_path, error):
+def test_atomic_path_failure_leaves_only_old_file(tmp_path, error):
     write_atomic(tmp_path / "a.txt", "old")
     for path in (tmp_path / "a.txt", tmp_path / "made" / "for" / "b.txt"):
         with pytest.raises(type(error)) as caught, atomic_path(path) as temporary:
@@ -100,7 +100,7 @@ def test_failure_leaves_the_old_file_and_nothing_else(tmp_path, error):
     assert tree(tmp_path) == ["a.txt"] and (tmp_path / "a.txt").read_text() == "old"
 
 
-def test_failure_keeps_folders_that_others_use(tmp_path):
+def test_atomic_path_failure_keeps_folders_in_use(tmp_path):
     with pytest.raises(RuntimeError), atomic_path(tmp_path / "made" / "a.txt") as temporary:
         (temporary.parent / "other.txt").write_text("mine")
         raise RuntimeError
@@ -109,7 +109,7 @@ def test_failure_keeps_folders_that_others_use(tmp_path):
 
 @pytest.mark.parametrize("number", ["ENOSPC", "EDQUOT", "EROFS"])
 @pytest.mark.parametrize("call", ["mkdir", "open", "write", "fsync", "replace"])
-def test_disk_that_refuses(tmp_path, monkeypatch, call, number):
+def test_atomic_path_reports_disk_errors(tmp_path, monkeypatch, call, number):
     number = getattr(errno, number)
     error = OSError(number, os.strerror(number))
 
@@ -142,7 +142,7 @@ def test_disk_that_refuses(tmp_path, monkeypatch, call, number):
         *((path, "expected the path of a file to write") for path in (3, None, "a\0b")),
     ],
 )
-def test_what_is_no_place_for_a_file(tmp_path, monkeypatch, path, words):
+def test_write_atomic_rejects_invalid_paths(tmp_path, monkeypatch, path, words):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("x")
     with pytest.raises(InputError, match=words) as caught:
@@ -153,7 +153,7 @@ def test_what_is_no_place_for_a_file(tmp_path, monkeypatch, path, words):
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
-def test_folder_without_write_access(tmp_path):
+def test_write_atomic_reports_missing_permission(tmp_path):
     tmp_path.chmod(0o500)
     for path in (tmp_path / "a.txt", tmp_path / "made" / "a.txt"):
         with pytest.raises(InputError, match="Permission denied.*choose another folder"):
@@ -161,7 +161,7 @@ def test_folder_without_write_access(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes with names are POSIX's")
-def test_pipes_and_devices_are_never_replaced(tmp_path):
+def test_write_atomic_never_replaces_pipes(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InputError, match="device or pipe"):
         write_atomic(tmp_path / "pipe", "x")
@@ -169,7 +169,7 @@ def test_pipes_and_devices_are_never_replaced(tmp_path):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="links need rights elsewhere")
-def test_links_are_followed(tmp_path):
+def test_write_atomic_follows_links(tmp_path):
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / "a.txt").write_text("old")
     (tmp_path / "link.txt").symlink_to(tmp_path / "there" / "a.txt")
@@ -178,7 +178,7 @@ def test_links_are_followed(tmp_path):
 
 
 @pytest.mark.long
-def test_npz_of_zeros_is_bounded(tmp_path, monkeypatch):
+def test_read_npz_bounds_unpacked_size(tmp_path, monkeypatch):
     np.savez_compressed(tmp_path / "a.npz", zeros=np.zeros(2**24), ones=np.ones(3))
     arrays, names = read_npz(tmp_path / "a.npz", ["ones", "none"], expected="an npz")
     assert list(arrays) == ["ones"] and names == ["ones", "zeros"]
@@ -188,9 +188,9 @@ def test_npz_of_zeros_is_bounded(tmp_path, monkeypatch):
     assert read_npz(tmp_path / "a.npz", ["zeros"], expected="an npz")[0]["zeros"].shape == (2**24,)
 
 
-# the fields of an archive's table that announce how large a member is, packed and unpacked
+# offsets in the archive's directory of a member's sizes: 20 compressed, 24 uncompressed
 @pytest.mark.parametrize("compression, field", [("DEFLATED", 24), ("DEFLATED", 20), ("BZIP2", 24), ("LZMA", 20)])
-def test_npz_that_announces_another_size_is_bounded(tmp_path, monkeypatch, compression, field):
+def test_read_npz_bounds_memory_if_sizes_are_wrong(tmp_path, monkeypatch, compression, field):
     array = io.BytesIO()
     monkeypatch.setenv("LIDARPOSE_MAX_UNPACKED", "1000000")
     np.save(array, np.zeros((2**20, 3)))
@@ -210,13 +210,13 @@ def test_npz_that_announces_another_size_is_bounded(tmp_path, monkeypatch, compr
         tracemalloc.stop()
 
 
-def test_messages_are_printable_lines():
+def test_file_error_message_is_one_printable_line():
     message = str(file_error("a\nb\x1b[31m\udcff.pcd", "one\r\ntwo\tthree\x00"))
     assert message.isprintable() and message.encode()
     assert message.startswith("a b") and "one two" in message
 
 
-def test_a_locked_folder_is_tidied_and_has_one_writer(tmp_path):
+def test_locked_allows_one_writer_and_removes_leftovers(tmp_path):
     folder, left = tmp_path / "out", ".0123456789abcdef-a.json"
     with locked(folder, r"a\.json", busy="somebody writes"):
         assert is_unused(folder, r"a\.json")
@@ -225,7 +225,7 @@ def test_a_locked_folder_is_tidied_and_has_one_writer(tmp_path):
             locked(folder, r"a\.json", busy="somebody writes"),
         ):
             pass
-    # made for nothing
+    # a folder that was created and not used is removed
     assert not folder.exists()
     (folder / "deep").mkdir(parents=True)
     for name in (left, f"deep/{left}", ".0123456789abcdef-b.json", LOCK):
@@ -238,7 +238,7 @@ def test_a_locked_folder_is_tidied_and_has_one_writer(tmp_path):
 @pytest.mark.parametrize(
     "error, message", [(NotImplementedError(), None), (PermissionError(13, "no"), "cannot write into")]
 )
-def test_a_file_system_without_locks_does_without(tmp_path, monkeypatch, error, message):
+def test_locked_if_lock_cannot_be_acquired(tmp_path, monkeypatch, error, message):
     filelock = pytest.importorskip("filelock")
     monkeypatch.setattr(filelock.FileLock, "acquire", mock.Mock(side_effect=error))
     if message is None:
@@ -252,12 +252,12 @@ def test_a_file_system_without_locks_does_without(tmp_path, monkeypatch, error, 
 
 @pytest.mark.skipif(os.name != "posix", reason="modes are POSIX's")
 @pytest.mark.parametrize("mode", [0o600, 0o440])
-def test_a_replaced_file_keeps_its_mode(tmp_path, mode):
+def test_write_atomic_keeps_mode(tmp_path, mode):
     path = tmp_path / "a.txt"
     path.write_text("old")
     path.chmod(mode)
     with atomic_path(path) as temporary:
-        # nobody else reads it meanwhile
+        # other users cannot read the temporary file
         assert not stat.S_IMODE(temporary.stat().st_mode) & 0o077
         temporary.write_text("half")
     write_atomic(path, "new")

@@ -1,4 +1,4 @@
-"""Datasets to learn from: what is read, how it is shown, and runs on each of the four, from raw files to scores."""
+"""Fine-tuning: reading of datasets, augmentation, sampling, and runs from raw files to scores."""
 
 import itertools
 import json
@@ -62,7 +62,7 @@ WRITERS = {
 
 @pytest.fixture(scope="module")
 def datasets(tmp_path_factory):
-    """Name -> the folder that prepare wrote."""
+    """Name -> prepared folder."""
     root = tmp_path_factory.mktemp("datasets")
     smpl, out = files.write_smpl(root / "SMPL_NEUTRAL.npz"), {}
     for name, write in WRITERS.items():
@@ -79,11 +79,11 @@ def synthetic(tmp_path_factory):
     return folder
 
 
-# --- what is read
+# --- reading of datasets
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_everything_that_was_prepared_is_there(datasets, name):
+def test_in_memory_dataset_equals_prepared_dataset(datasets, name):
     dataset, items = InMemoryDataset.load([datasets[name]]), list(open_dataset(datasets[name]))
     of = skeleton(dataset.skeleton)
     others = [k for k, joint in enumerate(BODY26.joints) if joint not in of.joints]
@@ -105,32 +105,32 @@ def test_everything_that_was_prepared_is_there(datasets, name):
                 np.testing.assert_array_equal([*sample.box.size, sample.box.yaw], [*item.box.size, item.box.yaw])
     if name in ("humanm3", "waymo"):
         assert all(item.box is not None and item.sensor_known == (name == "waymo") for item in items)
-    # only a dataset that says hidden tells what is seen
+    # only datasets that label hidden joints have visibility
     visible = np.stack([dataset.sample(row).pose.visible for row in range(len(dataset))])
     assert set(visible[~np.isnan(visible)]) == ({0.0, 1.0} if name == "waymo" else set())
 
 
-def test_splits_intervals_and_sequences_leave_people_out(datasets):
+def test_in_memory_dataset_selects_split_interval_and_sequences(datasets):
     folder = datasets["humanm3"]
     everybody = InMemoryDataset.load([folder])
     train, test = (InMemoryDataset.load([folder], split=split) for split in ("train", "test"))
     assert len(train) + len(test) == len(everybody) and test.sequences == ("test/d",)
     assert set(train.sequences) == {"train/a", "train/b", "train/c"}
     assert len(everybody.without(["train/a"])) == len(everybody) * 3 // 4
-    # frames 7, 8, 9 of everybody
+    # every person has frames 7, 8 and 9
     assert len(InMemoryDataset.load([folder], interval=4)) == len(everybody) // 3
     assert len(InMemoryDataset.load([folder, folder])) == 2 * len(everybody)
-    # Waymo's frames are time stamps: two of each person's, in order
+    # Waymo's frames are time stamps, two per person, in order
     waymo = datasets["waymo"]
     frames = [(item.sequence, item.track, item.frame) for item in open_dataset(waymo).items()]
     first = {whose: min(f for *w, f in frames if tuple(w) == whose) for whose in {tuple(w) for *w, _ in frames}}
     assert len(InMemoryDataset.load([waymo], interval=2)) == len(first) < len(frames)
 
 
-def test_synthesized_shards_are_people_too(synthetic):
-    """What is seen is told, and they can be disturbed, as people who are made meanwhile."""
+def test_synthetic_shards_have_visibility_and_accept_noise(synthetic):
+    """Joint visibility is known and noise can be added, as with people synthesized during training."""
     dataset, items = InMemoryDataset.load([synthetic]), list(open_dataset(synthetic))
-    # single people are nobody's frames
+    # single people belong to no sequence: the interval does not apply
     assert len(InMemoryDataset.load([synthetic], interval=5)) == len(dataset) == 6
     assert dataset.dataset == "" and dataset.skeleton == "body26"
     samples = [dataset.sample(row) for row in range(6)]
@@ -146,7 +146,7 @@ def test_synthesized_shards_are_people_too(synthetic):
     assert sorted(len(plain.example(k).points) for k in range(6)) == sorted(len(item.points) for item in items)
 
 
-def test_a_damaged_shard_is_left_out_and_named(datasets, tmp_path):
+def test_in_memory_dataset_skips_and_names_damaged_shard(datasets, tmp_path):
     folder = shutil.copytree(datasets["humanm3"], tmp_path / "copy")
     broken = shard_path(folder, "labelled", 1)
     broken.write_bytes(broken.read_bytes()[:-200])
@@ -155,13 +155,13 @@ def test_a_damaged_shard_is_left_out_and_named(datasets, tmp_path):
     assert len(dataset.damaged) == 1 and str(broken) in dataset.damaged[0]
     warning, _ = make_setup(Finetune(data=(str(folder),), mix=0.0)).warnings
     assert str(broken) in warning and warning.startswith("left out 1 damaged shards: ")
-    # a missing one is something else: the dataset is not finished
+    # a missing shard is an error: the dataset is incomplete
     broken.unlink()
     with pytest.raises(InputError, match="is missing"):
         InMemoryDataset.load([folder])
 
 
-# --- how people are shown
+# --- augmentation
 
 
 def someone(seed=0, count=80):
@@ -190,7 +190,7 @@ RIGID = Augmentation(turn=1.0, flip=0.5)
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**31), st.integers(0, 100))
-def test_points_joints_and_the_view_move_together(seed, number):
+def test_augmented_moves_points_joints_and_view_together(seed, number):
     person = someone(number)
     shown = augmented(person, RIGID, np.random.default_rng(seed))
     before = np.linalg.norm(person.points[:, None] - person.joints, axis=-1)
@@ -198,20 +198,20 @@ def test_points_joints_and_the_view_move_together(seed, number):
     flip = list(BODY26.flip)
     mirrored = np.allclose(np.nan_to_num(after), np.nan_to_num(before[:, flip]), atol=1e-4)
     assert mirrored or np.allclose(np.nan_to_num(after), np.nan_to_num(before), atol=1e-4)
-    # left and right are exchanged where the points are mirrored, and nowhere else
+    # left and right are swapped only if the points are mirrored
     R = np.linalg.lstsq(person.points - person.points.mean(0), shown.points - shown.points.mean(0))[0]
     assert (np.linalg.det(R) < 0) == mirrored
     unlabelled = np.isnan(person.joints).any(-1)
     np.testing.assert_array_equal(np.isnan(shown.joints).any(-1), unlabelled[flip] if mirrored else unlabelled)
     if shown.view[4]:
-        # the sensor is as far from every point as it was
+        # distances between sensor and points stay the same
         sensor = shown.view[:3] * np.exp(shown.view[3])
         np.testing.assert_allclose(
             np.linalg.norm(shown.points - sensor, axis=1), np.linalg.norm(person.points, axis=1), atol=1e-3
         )
 
 
-def test_a_person_scaled_is_scaled_with_their_joints():
+def test_augmented_scales_points_and_joints_alike():
     person, scales = someone(), []
     before = np.linalg.norm(person.points[:, None] - person.joints, axis=-1)
     for seed in range(40):
@@ -222,7 +222,7 @@ def test_a_person_scaled_is_scaled_with_their_joints():
     assert 0.9 <= min(scales) < 0.93 and 1.07 < max(scales) <= 1.1
 
 
-def test_a_mirror_exchanges_what_is_seen_and_left_and_right_parts():
+def test_augmented_flip_swaps_visibility_and_parts():
     sample, mirrored = someone(), 0
     visible = np.where(np.isnan(sample.pose.visible), np.nan, np.arange(26) % 2).astype(np.float32)
     sample = replace(sample, pose=body26(sample.joints, visible))
@@ -240,7 +240,7 @@ def test_a_mirror_exchanges_what_is_seen_and_left_and_right_parts():
 
 
 @pytest.mark.parametrize("labeled", [True, False])
-def test_half_of_people_are_centered_on_a_guess_of_the_pelvis(labeled):
+def test_augmented_refined_centers_on_noisy_pelvis(labeled):
     joints = np.nan_to_num(someone().joints, nan=6.0)
     hips = [BODY26.index(f"{side}_hip") for side in ("left", "right")]
     if not labeled:
@@ -260,10 +260,10 @@ def test_half_of_people_are_centered_on_a_guess_of_the_pelvis(labeled):
 
 
 @pytest.mark.parametrize("how", [Augmentation(cut=1.0), Augmentation(box=1.0)], ids=["cut", "box"])
-def test_what_an_augmentation_hides_is_not_told_visible(how):
+def test_augmented_cut_and_box_update_visibility(how):
     person, hidden = someone(count=60), 0
     body = person.part != 0
-    # labels that tell the truth before
+    # labels that are correct before the augmentation
     visible = np.where(np.isnan(person.pose.visible), np.nan, visible_joints(person.joints, person.points[body]))
     person = replace(person, pose=body26(person.joints, visible))
     for index in range(40):
@@ -275,7 +275,7 @@ def test_what_an_augmentation_hides_is_not_told_visible(how):
 
 
 @pytest.mark.parametrize("name", AUGMENTATIONS)
-def test_augmentations_are_functions_of_the_generator_and_change_nothing_given(name):
+def test_augmented_is_deterministic_and_keeps_input(name):
     person, kept = someone(), someone()
     a, b = (augmented(person, augmentation(name), np.random.default_rng(4)) for _ in range(2))
     for field in ("points", "part", "joints", "visible", "view", "seed"):
@@ -284,13 +284,13 @@ def test_augmentations_are_functions_of_the_generator_and_change_nothing_given(n
         np.testing.assert_array_equal(getattr(person, field), getattr(kept, field))
     np.testing.assert_array_equal(person.pose.visible, kept.pose.visible)
     assert a.points.dtype == a.joints.dtype == a.view.dtype == np.float32 and len(a.points) == len(a.part)
-    # a few points can be shown too
+    # few points
     for seed, count in itertools.product(range(20), (1, 2, 6)):
         few = augmented(someone(count=count), augmentation(name), np.random.default_rng(seed))
         assert np.isfinite(few.points).all()
 
 
-def test_the_paper_centers_on_what_it_knows():
+def test_paper_augmentation_uses_available_center():
     person, still = someone(), replace(augmentation("paper"), turn=0.0, scale=0.0, flip=0.0, jitter=0.0, drop=0.0)
     shown = augmented(person, still, np.random.default_rng(0))
     inside = person.box.contains(person.points)
@@ -305,7 +305,7 @@ def test_the_paper_centers_on_what_it_knows():
     np.testing.assert_allclose(shown.points, person.points[kept] - [6.0, 2.0, 0.0], atol=1e-5)
 
 
-# --- whom a run sees
+# --- sampling of people
 
 
 def stored(datasets, name="humanm3", **more):
@@ -314,10 +314,10 @@ def stored(datasets, name="humanm3", **more):
     )
 
 
-def test_an_epoch_shows_everybody_once_in_an_order_of_its_own(datasets):
+def test_stored_source_epochs_are_different_permutations(datasets):
     source = stored(datasets)
     count = len(source.dataset)
-    # nobody's pelvis lies as another's does from the middle of their points
+    # the vector between two joints identifies a person
     everybody = {tuple(p.joints[0] - p.joints[1]) for p in map(source.dataset.sample, range(count))}
     epochs = [
         [tuple((e.joints[0] - e.joints[1]).round(4)) for e in map(source.example, range(n * count, (n + 1) * count))]
@@ -326,18 +326,18 @@ def test_an_epoch_shows_everybody_once_in_an_order_of_its_own(datasets):
     for epoch in epochs:
         assert len(set(epoch)) == len(everybody) == count
     assert epochs[0] != epochs[1] != epochs[2]
-    # whatever was asked for before
+    # independent of earlier requests
     again = stored(datasets)
     np.testing.assert_array_equal(again.example(2 * count + 1).points, source.example(2 * count + 1).points)
 
 
-def test_synthesized_people_are_mixed_in_by_their_share(datasets):
+def test_mixed_source_mixes_by_share(datasets):
     main, other = stored(datasets), SyntheticSource(scene="paper", seed=1)
     mixed = MixedSource(main=main, other=other, share=0.3)
     shown = [mixed.example(k) for k in range(120)]
     synthesized = np.array([not np.isnan(one.joints).any() for one in shown])
     assert synthesized.sum() == 36 and all(synthesized[k : k + 10].sum() == 3 for k in range(0, 120, 10))
-    # nobody is left out on either side
+    # neither source skips a person
     for source, people in ((main, np.flatnonzero(~synthesized)), (other, np.flatnonzero(synthesized))):
         for place, k in enumerate(people[:20]):
             np.testing.assert_array_equal(shown[k].points, source.example(place).points)
@@ -349,14 +349,14 @@ def test_synthesized_people_are_mixed_in_by_their_share(datasets):
     "name, settings, held_out, watched",
     [
         ("humanm3", {}, ["train/c"], 6),
-        # Waymo has a split for it, but whoever learns from that one is not judged on it
+        # Waymo has a validation split; training on it leaves no validation people
         ("waymo", {}, [], 4),
         ("waymo", {"split": "val"}, [], 0),
-        # one sequence for training leaves nobody
+        # a single training sequence is not held out
         ("sloper4d", {}, [], 0),
     ],
 )
-def test_sequences_are_held_out_unless_the_dataset_has_a_split_for_it(datasets, name, settings, held_out, watched):
+def test_finetune_holds_out_sequences_without_val_split(datasets, name, settings, held_out, watched):
     setup = make_setup(Finetune(data=(str(datasets[name]),), mix=0.0, **settings))
     assert setup.card["held_out_sequences"] == held_out and not {*held_out} & {*setup.source.dataset.sequences}
     assert len(setup.validation()) == watched
@@ -365,13 +365,13 @@ def test_sequences_are_held_out_unless_the_dataset_has_a_split_for_it(datasets, 
     assert setup.warnings == (() if watched else (lost,))
 
 
-def test_everybody_is_seen_as_often_as_epochs_say(datasets):
+def test_finetune_people_follow_epochs_and_mix(datasets):
     for mix, people in ((0.0, 72), (0.25, 96)):
         setup = make_setup(Finetune(data=(str(datasets["humanm3"]),), epochs=6, mix=mix, hold_out=0.34))
         assert len((setup.source.main if mix else setup.source).dataset) == 12 and setup.people == people
 
 
-def test_a_dataset_is_remembered_by_the_name_that_an_evaluation_gives_it(datasets, tmp_path, monkeypatch):
+def test_finetune_card_names_dataset_as_in_evaluation(datasets, tmp_path, monkeypatch):
     (tmp_path / "link").symlink_to(datasets["humanm3"])
     monkeypatch.chdir(datasets["humanm3"])
     for folder in (".", tmp_path / "link"):
@@ -379,7 +379,7 @@ def test_a_dataset_is_remembered_by_the_name_that_an_evaluation_gives_it(dataset
         assert card["data"] == [open_eval_dataset(folder).name] == ["humanm3"]
 
 
-def test_pretraining_takes_nobody_who_is_kept_for_testing(datasets, tmp_path):
+def test_pretrain_rejects_test_people(datasets, tmp_path):
     with pytest.raises(InputError, match="contains test people, by the split official.*--split train") as error:
         make_setup(Pretrain(shards=(datasets["humanm3"],)))
     assert "\n" not in str(error.value)
@@ -387,7 +387,7 @@ def test_pretraining_takes_nobody_who_is_kept_for_testing(datasets, tmp_path):
     prepare("humanm3", raw, tmp_path / "train", split="train", progress=False)
     dataset = make_setup(Pretrain(shards=(tmp_path / "train",))).source.dataset
     assert dataset.sequences == ("train/a", "train/b", "train/c")
-    # a corpus has no split
+    # LIPD has no split
     files.write_lipd(tmp_path / "raw", files.write_smpl(tmp_path / "SMPL_NEUTRAL.npz"))
     prepare("lipd", tmp_path / "raw", tmp_path / "corpus", progress=False)
     assert len(make_setup(Pretrain(shards=(tmp_path / "corpus",))).source.dataset)
@@ -399,7 +399,7 @@ SHORT = {"workers": 0, "pictures": 0, "validate": 1000}
 
 
 @pytest.mark.long
-def test_pretraining_on_shards(synthetic, tmp_path):
+def test_pretrain_records_shards_in_card(synthetic, tmp_path):
     recipe = Pretrain(shards=(str(synthetic),), people=32, batch=4, scene="paper", **SHORT)
     loop.train(recipe, tmp_path / "run")
     assert read_header(tmp_path / "run" / run_dir.MODEL).card["recipe"]["shards"] == ["people"]
@@ -407,13 +407,13 @@ def test_pretraining_on_shards(synthetic, tmp_path):
 
 @pytest.mark.long
 @pytest.mark.parametrize("name, epochs", [("humanm3", 6), ("lidarhuman26m", 20), ("sloper4d", 30), ("waymo", 20)])
-def test_from_raw_files_to_scores(datasets, name, epochs, tmp_path, capsys, monkeypatch):
-    """Raw files, prepare, a few steps, evaluate: the joints come out where they went in, and the steps pay."""
+def test_finetune_from_raw_files_to_scores(datasets, name, epochs, tmp_path, capsys, monkeypatch):
+    """Prepare, train a few steps, evaluate: labels are unchanged and the error decreases."""
     monkeypatch.chdir(tmp_path)
     words = ["finetune", str(datasets[name]), "--out", "run", "--workers", "0", "--batch", "8", "--mix", "0"]
     assert not main([*words, "--init", "tiny", "--epochs", str(epochs), "--pictures", "2"])
     network, header = load_checkpoint("run/model.safetensors")
-    # one skeleton for all: anchors and heads are those of the bundled weights
+    # same skeleton for all datasets, so the configuration is that of the bundled weights
     assert header.config == load("tiny").header.config and header.card["data"] == [name]
     assert not main(["evaluate", "run/model.safetensors", str(datasets[name]), "--out", "scores"])
     assert "MPJPE" in capsys.readouterr().out
@@ -433,7 +433,7 @@ PAPER = ["--recipe", "paper", "--batch", "4", "--workers", "0", "--pictures", "0
 
 
 def two_stages(people, neck, *words):
-    """Both stages of the paper's network from the command line, evaluated."""
+    """Trains both stages of the paper's network on the command line and evaluates it."""
     assert not main(["pretrain", "first", "--size", "paper-tiny", "--neck", neck, "--people", "16", *PAPER])
     tuned = ["finetune", str(people), "--out", "second", "--init", "first/model.safetensors", "--epochs", "1"]
     assert not main([*tuned, *words, *PAPER])
@@ -441,7 +441,7 @@ def two_stages(people, neck, *words):
 
 
 @pytest.mark.long
-def test_the_paper_s_two_stages(datasets, tmp_path, capsys, monkeypatch):
+def test_cli_trains_paper_network_in_two_stages(datasets, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     two_stages(datasets["humanm3"], "mde", "--keep-anchors", "true")
     assert "MPJPE" in capsys.readouterr().out
@@ -458,7 +458,7 @@ def test_the_paper_s_two_stages(datasets, tmp_path, capsys, monkeypatch):
 
 @pytest.mark.long
 @pytest.mark.parametrize("neck", ["finest", "prn"])
-def test_necks_from_the_command_line_and_coordinates_in_both_stages(datasets, tmp_path, capsys, monkeypatch, neck):
+def test_cli_trains_necks_with_coordinate_head(datasets, tmp_path, capsys, monkeypatch, neck):
     monkeypatch.chdir(tmp_path)
     two_stages(datasets["humanm3"], neck, "--head", "coordinates")
     assert "MPJPE" in capsys.readouterr().out
@@ -466,19 +466,19 @@ def test_necks_from_the_command_line_and_coordinates_in_both_stages(datasets, tm
     assert header.config.neck == neck and header.config.coordinates and not header.config.bins
     log = [json.loads(line) for line in (tmp_path / "second" / run_dir.LOG).read_text().splitlines()]
     assert "regression" in log[-1] and ("vote" in log[-1]) == (neck == "prn")
-    # random weights have the neck that is asked for, and so for a dataset without pre-training
+    # training from random weights uses the given neck and head
     scratch = {"init": "random", "size": "paper-tiny", "neck": neck, "head": "coordinates", "augment": "paper"}
     setup = make_setup(Finetune(data=(str(datasets["humanm3"]),), mix=0.0, **scratch))
     assert setup.network().state_dict().keys() == trained.state_dict().keys()
 
 
 @pytest.mark.long
-def test_a_run_on_a_dataset_is_taken_up(datasets, tmp_path):
+def test_finetune_resumes_killed_run(datasets, tmp_path):
     data = (str(datasets["lidarhuman26m"]),)
     recipe = Finetune(data=data, init="tiny", epochs=3, batch=2, scene="paper", **SHORT)
     loop.train(recipe, tmp_path / "whole")
     train_until_killed(recipe, tmp_path / "run", "_chunk", 2)
-    # the dataset may have moved meanwhile
+    # the dataset may have been moved
     moved = shutil.copytree(datasets["lidarhuman26m"], tmp_path / "lidarhuman26m")
     loop.train(replace(recipe, data=(str(moved),)), tmp_path / "run", resume=True)
     with pytest.raises(InputError, match="a run keeps its recipe"):
@@ -510,7 +510,9 @@ def test_a_run_on_a_dataset_is_taken_up(datasets, tmp_path):
         ([], "fine-tuning needs a dataset"),
     ],
 )
-def test_wrong_words_are_one_line_and_leave_no_folder(datasets, synthetic, tmp_path, monkeypatch, capsys, words, told):
+def test_cli_finetune_errors_are_one_line_and_leave_no_folder(
+    datasets, synthetic, tmp_path, monkeypatch, capsys, words, told
+):
     monkeypatch.chdir(tmp_path)
     words = [word.format(**datasets, synthetic=synthetic) for word in words]
     assert main(["finetune", *words, "--workers", "0"]) == 2
@@ -519,7 +521,7 @@ def test_wrong_words_are_one_line_and_leave_no_folder(datasets, synthetic, tmp_p
     assert not list(tmp_path.iterdir())
 
 
-def test_the_sensor_s_place_is_often_kept_from_the_network_and_never_made_up():
+def test_augmented_hides_sensor_at_rate_or_if_unknown():
     person = someone()
     known = [augmented(person, Augmentation(), np.random.default_rng(k)).view[4] for k in range(400)]
     assert np.mean(known) == pytest.approx(1 - BLIND, abs=0.07)
@@ -530,18 +532,18 @@ def test_the_sensor_s_place_is_often_kept_from_the_network_and_never_made_up():
     assert np.mean(known) == pytest.approx(1 - BLIND, abs=0.07)
 
 
-def test_points_are_jittered_lost_and_added():
+def test_augmented_jitters_drops_and_adds_points():
     plain, jittered, clutter, lost = (
         augmented(someone(count=500), Augmentation(refined=0.0, **more), np.random.default_rng(3))
         for more in ({}, {"jitter": 0.005}, {"strays": 1.0}, {"drop": 1.0})
     )
     assert (jittered.points - plain.points).std() == pytest.approx(0.005, rel=0.1)
     assert len(clutter.points) > 500 and len(clutter.points) == len(clutter.part) and not clutter.part[500:].any()
-    # 400 of 500, drawn one by one
+    # about 400 of 500 are kept
     assert len(lost.points) == len(lost.part) and 370 < len(lost.points) < 430
 
 
-def test_weights_that_pose_nobody_are_no_beginning():
+def test_init_rejects_networks_without_poses():
     for name in ("verifier", "detector"):
         with pytest.raises(InputError, match=f"contains the network {name}, which predicts no poses"):
             initial_network(Finetune(data=("any",), init=str(weights_file(f"{name}.safetensors"))))

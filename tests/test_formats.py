@@ -1,4 +1,4 @@
-"""Every format of points: round trips, other writers' files, and one line for each bad input."""
+"""Point cloud formats: round trips, files of other programs, and bad input reported in one line."""
 
 import gzip
 import io
@@ -67,7 +67,7 @@ TYPES = ["<f4", "<f8", "i1", "<i2", "<i4", "<i8", "u1", "<u2", "<u4", "<u8"]
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
 @settings(max_examples=40, deadline=None)
 @given(data=st.data(), names=st.permutations(["x", "Y", "z", "ring", "_"]), count=st.integers(1, 20))
-def test_pcd_of_any_types_and_order(folder, encoding, data, names, count):
+def test_read_pcd_any_types_and_order(folder, encoding, data, names, count):
     types = {name: data.draw(st.sampled_from(TYPES)) for name in names}
     columns = {name: data.draw(hnp.arrays(kind, (count,), elements=ELEMENTS[kind[-2]])) for name, kind in types.items()}
     rows = np.rec.fromarrays(columns.values(), dtype=[(f"c{i}", kind) for i, kind in enumerate(types.values())])
@@ -92,7 +92,7 @@ def test_pcd_of_any_types_and_order(folder, encoding, data, names, count):
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
 @settings(max_examples=40, deadline=None)
 @given(data=st.data(), names=st.permutations(["x", "y", "Z", "red"]), count=st.integers(1, 20))
-def test_ply_of_any_types_and_order(folder, encoding, data, names, count):
+def test_read_ply_any_types_and_order(folder, encoding, data, names, count):
     kinds = {name: data.draw(st.sampled_from(sorted(PLY_TYPES))) for name in names}
     columns = {
         name: data.draw(hnp.arrays(PLY_TYPES[kind], (count,), elements=ELEMENTS[PLY_TYPES[kind][0]]))
@@ -116,11 +116,11 @@ def test_ply_of_any_types_and_order(folder, encoding, data, names, count):
     kind=st.integers(0, 10),
     shift=st.tuples(*[st.sampled_from([0.0, 5_414_000.0, -0.5])] * 3),
 )
-def test_las_and_laz_of_all_point_formats(folder, packed, points, kind, shift):
+def test_read_las_and_laz_all_point_formats(folder, packed, points, kind, shift):
     version = "1.2" if kind < 4 else "1.4"
     expected = points * 1e-3 + np.array(shift)
     content = las(expected, version=version, kind=kind, packed=packed, shift=shift)
-    # the suffix does not say whether points are packed
+    # the suffix does not determine the compression
     for name in ("a.las", "a.LAZ"):
         cloud = read(folder, name, content)
         np.testing.assert_allclose(cloud.points, expected, rtol=0, atol=1e-9)
@@ -128,14 +128,14 @@ def test_las_and_laz_of_all_point_formats(folder, packed, points, kind, shift):
     assert cloud.fields[:4] == ("x", "y", "z", "intensity") and set(cloud.fields[4:]) == has
 
 
-def test_laz_needs_an_extra_and_las_does_not(folder, monkeypatch):
+def test_read_laz_needs_extra_and_las_does_not(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "lazrs", None)
     same(read(folder, "a.las", las()))
     with pytest.raises(MissingExtra, match=r"'.\[recordings\]'"):
         read(folder, "a.laz", las(packed=True))
 
 
-# what pypcd4 1.5 and trimesh 5.2 write
+# files written by pypcd4 1.5 and trimesh 5.2
 _PYPCD4 = (
     "VERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH {0}\nHEIGHT 1\n"
     "VIEWPOINT 0.0 0.0 0.0 1.0 0.0 0.0 0.0\nPOINTS {0}\nDATA {1}\n"
@@ -161,7 +161,7 @@ OTHER_WRITERS = {
 
 
 @pytest.mark.parametrize("name", OTHER_WRITERS)
-def test_files_of_other_writers(folder, name):
+def test_read_points_reads_files_of_other_writers(folder, name):
     cloud = read(folder, name, OTHER_WRITERS[name])
     same(cloud, np.tile(POINTS, (len(cloud.points) // 3, 1)))
     assert cloud.num_dropped == 0 and cloud.warnings == ()
@@ -169,8 +169,8 @@ def test_files_of_other_writers(folder, name):
 
 @settings(max_examples=40, deadline=None)
 @given(points=float32_points, order=st.sampled_from("<>"), newline=st.sampled_from(["\n", "\r\n", "\r"]))
-def test_ply_binary_orders_and_line_ends(folder, points, order, newline):
-    # the first byte of the rows may be one of a line end
+def test_read_ply_byte_orders_and_line_ends(folder, points, order, newline):
+    # the first byte of the data may be a newline character
     points[0, 0] = np.frombuffer(b"\n\r\n?", order + "f4")[0]
     form = {"<": "binary_little_endian", ">": "binary_big_endian"}[order]
     content = ply_header(len(points), form, newline=newline) + points.astype(order + "f4").tobytes()
@@ -179,7 +179,7 @@ def test_ply_binary_orders_and_line_ends(folder, points, order, newline):
 
 @settings(max_examples=40, deadline=None)
 @given(points=float64_points, fortran=st.booleans())
-def test_npy_and_npz_keep_every_bit(folder, points, fortran):
+def test_read_npy_and_npz_are_exact(folder, points, fortran):
     points = np.asfortranarray(points) if fortran else points
     same(read(folder, "a.npy", npy(points)), points)
     same(read(folder, "a.npz", npz(points=points, labels=np.zeros((9, 3)))), points)
@@ -194,7 +194,7 @@ def test_npy_and_npz_keep_every_bit(folder, points, fortran):
     decimal=st.sampled_from(".,"),
     comment=st.booleans(),
 )
-def test_text_of_any_style(folder, points, separator, header, newline, decimal, comment):
+def test_read_text_any_separator_header_and_decimal(folder, points, separator, header, newline, decimal, comment):
     if separator.strip(" ") == ",":
         decimal = "."
     lines = [separator.join(repr(float(v)) for v in row).replace(".", decimal) for row in points]
@@ -205,13 +205,13 @@ def test_text_of_any_style(folder, points, separator, header, newline, decimal, 
         lines.insert(3, "  # and another")
         lines.append("")
     cloud = read(folder, "a.csv", newline.join(lines) + newline)
-    # pandas may round the last bit otherwise than repr
+    # pandas may round the last bit differently from repr
     same(cloud, points, rtol=1e-15)
     assert cloud.warnings == ()
 
 
 @pytest.mark.parametrize("dtype", ["float16", "float32", "float64", "int8", "int64", "uint16", ">f4", ">f8", ">i4"])
-def test_number_types_of_numpy(folder, dtype):
+def test_read_npy_number_types_and_records(folder, dtype):
     points = np.arange(12).reshape(4, 3).astype(dtype)
     same(read(folder, "a.npy", npy(points)), points)
     records = np.zeros(4, [("i", "u1"), ("Z", dtype), ("y", dtype), ("X", dtype)])
@@ -219,14 +219,14 @@ def test_number_types_of_numpy(folder, dtype):
     same(read(folder, "a.npy", npy(records)), points, ("i", "Z", "y", "X"))
 
 
-# ---- what the formats allow
+# ---- variants of the formats
 
 
 @pytest.mark.parametrize(
     "name, text, expected",
     [
         *(("a.csv", f"x,y,z\n{q}1.5{q},{q}-2{q},{q}3{q}\n4,{q}5{q},6\n", [[1.5, -2, 3], [4, 5, 6]]) for q in "'\""),
-        # a separator in quotes separates nothing
+        # separators within quotes are ignored
         *(
             (
                 f"a.{suffix}",
@@ -236,22 +236,22 @@ def test_number_types_of_numpy(folder, dtype):
             for mark, suffix in ((",", "csv"), (";", "csv"), ("\t", "txt"), (" ", "xyz"))
         ),
         ("a.xyz", "1,5 2,5 3,5\n4 5 6,5\n", [[1.5, 2.5, 3.5], [4, 5, 6.5]]),
-        # a missing value has many spellings
+        # spellings of missing values
         *(
             ("a.csv", f"x,y,z\n1,2,3\n{missing},{missing},{missing}\n4,5,6\n", [[1, 2, 3], [4, 5, 6]])
             for missing in "nan NAN NaN Nan -NAN NULL Null n/a N/A none".split()
         ),
     ],
 )
-def test_cells_of_text(folder, name, text, expected):
+def test_read_text_quotes_decimals_and_missing_values(folder, name, text, expected):
     same(read(folder, name, text), expected)
 
 
-def test_pcd_variants(folder):
+def test_read_pcd_variants(folder):
     rows = POINTS.tobytes()
     same(read(folder, "A.PCD", pcd_header() + rows), fields=("x", "y", "z", "i"))
     same(read(folder, "a.pcd", pcd_header().replace(b"\n", b"\r\n") + rows))
-    # an old version without COUNT and POINTS, an organised cloud, and rows after the last
+    # an old version without COUNT and POINTS, an organized cloud, and rows after the last
     old = b"VERSION .5\nFIELDS x y z i\nSIZE 4 4 4 4\nTYPE F F F F\nWIDTH 3\nHEIGHT 1\nDATA binary\n"
     same(read(folder, "a.pcd", old + rows + b"more"))
     # padding fields named _ twice, and a field of several values
@@ -263,14 +263,14 @@ def test_pcd_variants(folder):
     same(read(folder, "a.pcd", header.replace(b"DATA binary", b"DATA ascii") + text))
     one = pcd_header(points=1, data="ascii") + b"1.5 -2.25 0.125 0\n"
     same(read(folder, "a.pcd", one), POINTS[:1])
-    # a field without values, lower-case types, blank lines, more rows than told, signed nan as printf writes it
+    # a field without values, lower-case types, blank lines, more rows than in the header, signed nan as in printf
     odd = pcd_header("e X Y Z", "4 4 4 4", "f f f u", "0 1 1 1", points=2, data="ascii")
     cloud = read(folder, "a.pcd", odd + b"\n-nan nan 3\n\n10  20\t5\n7 7 7\n")
     same(cloud, [[10, 20, 5]], ("e", "X", "Y", "Z"))
     assert cloud.num_dropped == 1
 
 
-def test_ply_variants(folder):
+def test_read_ply_variants(folder):
     rows = POINTS.tobytes()
     before = "element camera 2\nproperty double a\nproperty uchar b\n"
     same(read(folder, "a.ply", ply_header(before=before) + bytes(18) + rows))
@@ -281,7 +281,7 @@ def test_ply_variants(folder):
     body = struct.pack("<B3i", 3, 0, 1, 2) + struct.pack("<B4i", 4, 0, 1, 2, 0)
     same(read(folder, "a.ply", ply_header(after=faces) + rows + body))
     same(read(folder, "a.ply", ply_header(form="ascii", after=faces).decode() + text + "3 0 1 2\n4 0 1 2 0\n"))
-    # names that mean normals and texture elsewhere, and one name twice
+    # names of normals and texture coordinates, and one name twice
     for names in ("x y z nx ny nz u v", "x y z a a a red green"):
         eight = np.hstack([POINTS, POINTS]).astype("f4").tobytes()
         same(read(folder, "a.ply", ply_header(names=names) + eight))
@@ -292,18 +292,18 @@ def test_ply_variants(folder):
     same(read(folder, "a.ply", ply_header(kind="double", names="X Y Z i") + twice), fields=("X", "Y", "Z", "i"))
 
 
-def test_bin_columns(folder):
+def test_read_bin_columns(folder):
     rng = np.random.default_rng(0)
     meters = rng.normal(scale=20, size=(8, 3)).astype(np.float32)
     ring = np.arange(8, dtype=np.float32)[:, None]
     nuscenes = np.hstack([meters, meters[:, :1], ring])
     fields = ("x", "y", "z", "intensity", "ring")
-    # 7 rows of 5 do not divide by 4; 8 rows of 5 are also 10 rows of 4, and only the beams tell
+    # 7 rows of 5 do not divide by 4; 8 rows of 5 could be 10 rows of 4, only the ring column decides
     for rows in (7, 8):
         cloud = read(folder, "a.bin", nuscenes[:rows].tobytes())
         same(cloud, nuscenes[:rows], fields)
         assert len(cloud.warnings) == 1 and "columns 4" in cloud.warnings[0]
-    # the converse: 10 rows of KITTI's 4 are also 8 rows of 5
+    # conversely, 10 rows of KITTI's 4 could be 8 rows of 5
     kitti = np.hstack([rng.normal(scale=20, size=(10, 3)), rng.uniform(0, 1, (10, 1))]).astype(np.float32)
     cloud = read(folder, "a.bin", kitti.tobytes())
     same(cloud, kitti)
@@ -328,8 +328,8 @@ def _person(rng, n):
 
 @pytest.mark.parametrize("cloud", [_sweep, _person])
 @pytest.mark.parametrize("n", [20, 21, 24, 30, 40, 45, 60, 75, 100, 240, 999, 1000, 2000])
-def test_bin_columns_are_told_by_the_values(folder, cloud, n):
-    """Sizes that divide by 3, 4 and 5 alike say nothing, and a fifth column need not be a beam's number."""
+def test_read_bin_infers_columns_from_values(folder, cloud, n):
+    """Also for sizes divisible by 3, 4 and 5, and with a fifth column that is not a beam number."""
     rng = np.random.default_rng(n)
     xyz = cloud(rng, n)
     for intensity in (rng.uniform(0, 1, n), rng.beta(1, 5, n), rng.integers(0, 256, n), np.zeros(n)):
@@ -350,8 +350,8 @@ def test_bin_columns_are_told_by_the_values(folder, cloud, n):
 
 @pytest.mark.parametrize("cloud", [_sweep, _person])
 @pytest.mark.parametrize("n", [22, 40, 60, 100, 999, 2000])
-def test_bin_rows_of_six_are_told_by_the_values(folder, cloud, n):
-    """x y z intensity beam time, whose size divides by 3 too and may by 4 and 5."""
+def test_read_bin_infers_six_columns_from_values(folder, cloud, n):
+    """Rows of x y z intensity beam time; their size is divisible by 3 and may be by 4 and 5."""
     rng = np.random.default_rng(n)
     rows = np.column_stack([cloud(rng, n), rng.uniform(0, 1, n), rng.integers(0, 64, n), np.linspace(0, 0.1, n)])
     found = read(folder, "a.bin", rows.astype(np.float32).tobytes())
@@ -362,18 +362,18 @@ def test_bin_rows_of_six_are_told_by_the_values(folder, cloud, n):
 @pytest.mark.parametrize(
     "header", ["Points_m_XYZ:0,Points_m_XYZ:1,Points_m_XYZ:2", '"Points:0","Points:1","Points:2"', "x [m],Y(m),z [m]"]
 )
-def test_axes_as_other_programs_name_them(folder, header):
+def test_read_text_accepts_axis_names_of_other_programs(folder, header):
     same(read(folder, "a.csv", f"{header},intensity\n1.5,-2.25,0.125,7\n10,20,-1,8\n3,4,5,9\n"), fields=None)
 
 
 @pytest.mark.parametrize("mark", [" ", ","])
-def test_a_number_of_points_above_them_is_none_of_them(folder, mark):
+def test_read_text_skips_point_count_line(folder, mark):
     rows = "\n".join(mark.join(row) for row in (["1.5", "-2.25", "0.125"], ["10", "20", "-1"], ["3", "4", "5"]))
     same(read(folder, "a.xyz", f"3\n{rows}\n"), fields=None)
 
 
-def test_bin_columns_that_nothing_tells(folder):
-    """All columns alike: KITTI's four, which a warning tells where another number fits better by chance."""
+def test_read_bin_assumes_four_columns_if_ambiguous(folder):
+    """If all columns are alike, it takes KITTI's four and warns if another number fits better by chance."""
     warned = 0
     for seed in range(30):
         rows = np.random.default_rng(seed).normal(size=(60, 4)).astype(np.float32)
@@ -385,13 +385,13 @@ def test_bin_columns_that_nothing_tells(folder):
     assert 0 < warned < 30
 
 
-def test_bin_of_printable_bytes(folder):
+def test_read_bin_accepts_printable_bytes(folder):
     points = np.full((2, 4), 837282, np.float32)
     assert points.tobytes().isascii() and points.tobytes().decode().isprintable()
     same(read(folder, "a.bin", points.tobytes()), points)
 
 
-def test_npz_choices(folder):
+def test_read_npz_chooses_array(folder):
     other = POINTS + 1
     same(read(folder, "a.npz", npz(xyz=other, points=POINTS)))
     same(read(folder, "a.npz", npz(other=other, xyz=POINTS)))
@@ -401,31 +401,31 @@ def test_npz_choices(folder):
     same(read(folder, "a.npz", file.getvalue()))
 
 
-def test_text_variants(folder):
+def test_read_text_variants(folder):
     same(read(folder, "a.xyz", "\ufeff1.5 -2.25 .125 7\n1e1 +20 -1 8\n\n3 4 5 9 # the last\n"))
     same(read(folder, "a.txt", "//X,Y,Z,Intensity\n1.5,-2.25,0.125,7\n10,20,-1,8\n3,4,5,9"))
     same(read(folder, "a.csv", "time,z,label,y,x\n0,0.125,a b,-2.25,1.5\n0,-1,c,20,10\n0,5,,4,3\n"))
-    # the order that a comment tells counts: numpy.savetxt writes its header so
+    # a header in a comment gives the order, as written by numpy.savetxt
     cloud = read(folder, "a.txt", "# i z y x\n7 0.125 -2.25 1.5\n8 -1 20 10\n9 5 4 3\n")
     same(cloud, fields=("i", "z", "y", "x"))
-    # the row numbers that pandas writes have no name
+    # a column of row numbers without a name, as written by pandas
     same(read(folder, "a.csv", ",x,y,z\n0,1.5,-2.25,0.125\n1,10,20,-1\n2,3,4,5\n"), fields=("", "x", "y", "z"))
     cloud = read(folder, "a.txt", "# a comment\n1.5 -2.25 0.125 7 0\n10 20 -1 8 0\n3 4 5 9 0\n")
     same(cloud, fields=("x", "y", "z", "column_4", "column_5"))
     same(read(folder, "a.csv", "x\ty\tz\tname of it\n1.5\t-2.25\t0.125\tme too\n10\t20\t-1\t\n3\t4\t5\tb\n"))
 
 
-def test_decimal_commas_that_only_later_lines_show(folder):
+def test_read_text_detects_decimal_commas_in_later_lines(folder):
     expected = [[1e-05, 1, 2], [0.5, 1, 2.25]]
     for content in ("1e-05;1;2\n0,5;1;2,25\n", "x;y;z\n1e-05;1;2\n0,5;1;2,25\n", "1e-05 1 2\n0,5 1 2,25\n"):
         same(read(folder, "a.csv", content), expected)
-    # a comma within words is none
+    # a comma within words is not a decimal comma
     same(read(folder, "a.csv", "x\ty\tz\tname\n1e-05\t1\t2\tno 1,5\n0.5\t1\t2.25\tb\n"), expected)
     same(read(folder, "a.csv", "x;y;z;name\n1e-05;1;2;a,1\n0.5;1;2.25;b\n"), expected)
 
 
-def test_map_coordinates_keep_their_millimeters(folder):
-    """Float64 is read whole, and text has the digits of the text, not of the type that a header gives it."""
+def test_read_points_keeps_precision_of_map_coordinates(folder):
+    """Float64 is kept, and text keeps all digits, whatever the type in its header."""
     points = np.array([[500000.001, 5000000.002, 100.003], [500001.0, 5000001.0, 99.999]])
     text = "\n".join(" ".join(map(str, row)) for row in points.tolist()).encode()
     wide, narrow = (
@@ -438,7 +438,7 @@ def test_map_coordinates_keep_their_millimeters(folder):
     same(read(folder, "utm.ply", ply_header(2, "ascii", names="x y z") + text), points)
 
 
-def test_not_finite_rows_are_dropped_and_counted(folder):
+def test_read_points_drops_and_counts_nonfinite_rows(folder):
     points = POINTS.copy()
     points[0, 1], points[1, 3] = np.nan, np.inf  # the second row has finite coordinates
     contents = {
@@ -594,7 +594,7 @@ BAD = {
 }
 
 
-def test_archives_do_not_unpack_to_far_more_than_they_are(folder, monkeypatch):
+def test_read_npz_limits_unpacked_size(folder, monkeypatch):
     zeros, file = np.zeros((2**20, 3), np.float32), io.BytesIO()
     np.savez_compressed(file, points=zeros)
     same(read(folder, "zeros.npz", file.getvalue()), zeros)
@@ -612,13 +612,13 @@ def test_archives_do_not_unpack_to_far_more_than_they_are(folder, monkeypatch):
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_one_line(tmp_path, case):
+def test_read_points_reports_bad_content_in_one_line(tmp_path, case):
     name, content, words = BAD[case]
     message = refusal(read, tmp_path, name, content, words=words)
     assert message.startswith(f"{tmp_path / name}: ") or not name.isprintable()
 
 
-def test_bad_paths(tmp_path):
+def test_read_points_rejects_bad_paths(tmp_path):
     (tmp_path / "sweep_1.pcd").write_bytes(b"x")
     (tmp_path / "folder.pcd").mkdir()
     cases = {
@@ -640,7 +640,7 @@ def test_bad_paths(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may read everything")
-def test_unreadable_file(tmp_path):
+def test_read_points_reports_unreadable_file(tmp_path):
     path = tmp_path / "a.pcd"
     path.write_bytes(b"x")
     path.chmod(0)
@@ -649,12 +649,12 @@ def test_unreadable_file(tmp_path):
 
 
 @pytest.mark.parametrize("columns", [0, 2, -4, True, 4.0, "4"])
-def test_bad_columns(tmp_path, columns):
+def test_read_bin_rejects_bad_columns(tmp_path, columns):
     with pytest.raises(InputError, match="columns must be a whole number of at least 3"):
         read(tmp_path, "a.bin", ROWS, columns=columns)
 
 
-def test_import_loads_no_heavy_library():
+def test_import_point_cloud_loads_no_heavy_library():
     heavy = {"pandas", "lzf", "torch"}
     code = f"import sys, lidarpose.io.point_cloud; print(sorted({heavy} & set(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -664,8 +664,8 @@ def test_import_loads_no_heavy_library():
 @pytest.mark.parametrize(
     "text", ['"x" "y" "z"\n"1" 0.1 0.2 0.3\n"2" 1.1 1.2 1.3\n', "x,y,z\n0,0.1,0.2,0.3\n", "# rows\nx y z\n\n1 2 3 4\n"]
 )
-def test_more_values_than_the_header_names_are_refused(tmp_path, text):
-    """Row numbers, as of R or pandas: all would move by a column."""
+def test_read_text_rejects_rows_longer_than_header(tmp_path, text):
+    """Row numbers, as written by R or pandas, would shift all columns by one."""
     path = tmp_path / "r.txt"
     path.write_text(text)
     with pytest.raises(InputError, match=r"expected 3 values per row, as its header says, got 4 on line \d"):
@@ -675,8 +675,8 @@ def test_more_values_than_the_header_names_are_refused(tmp_path, text):
 
 
 @pytest.mark.parametrize("text", ["1 2 3{}# note\n", "1e-05{}2 3\n0,5 1 2\n", "1\t2{}\t3 # a\n4\t{}5,5\t6\n"])
-def test_long_runs_of_blanks_are_read(tmp_path, text):
-    """Where every blank is tried as the first of its run, this takes an hour."""
+def test_read_text_with_long_runs_of_blanks(tmp_path, text):
+    """With backtracking over the blanks this would take an hour."""
     path = tmp_path / "b.txt"
     path.write_text(text.format(" " * 200_000, " " * 200_000))
     assert len(read_points(path).points) == text.count("\n")

@@ -1,6 +1,6 @@
-"""Any file is read or refused in one line: damaged ones, and hostile ones put together from the parts of good ones.
+"""Readers accept a file or reject it in one line: damaged files, and hostile files made of parts of valid ones.
 
-`make fuzz` runs this for about ten minutes, on other examples each time.
+`make fuzz` runs this for about ten minutes, with new examples each time.
 """
 
 import os
@@ -39,7 +39,7 @@ def folder(tmp_path_factory):
 
 
 def read_or_refuse(read, path, content):
-    """What `read` gives, or None for an error of one line that names the file."""
+    """Result of `read`, or None if it raises an error of one line that names the file."""
     path.write_bytes(content)
     try:
         return read(path)
@@ -49,14 +49,14 @@ def read_or_refuse(read, path, content):
 
 
 @pytest.mark.parametrize("read, files", [(read_points, POINT_FILES), (load_pickle, PICKLES)])
-def test_undamaged_files_are_read(folder, read, files):
+def test_readers_accept_undamaged_files(folder, read, files):
     for name, content in files.items():
         assert read_or_refuse(read, folder / name, content) is not None
 
 
 @fuzz
 @given(file=damaged(POINT_FILES))
-def test_points(folder, file):
+def test_read_points_accepts_or_rejects_damaged_files(folder, file):
     cloud = read_or_refuse(read_points, folder / file[0], file[1])
     if cloud is not None:
         assert cloud.points.ndim == 2 and cloud.points.shape[1] == 3 and np.isfinite(cloud.points).all()
@@ -64,7 +64,7 @@ def test_points(folder, file):
 
 @fuzz
 @given(file=damaged(BOX_FILES), calibration=damaged({"calib.txt": CALIBRATION}), is_damaged=st.booleans())
-def test_boxes(folder, file, calibration, is_damaged):
+def test_read_boxes_accepts_or_rejects_damaged_files(folder, file, calibration, is_damaged):
     calib = folder / "calib.txt"
     calib.write_bytes(calibration[1] if is_damaged else CALIBRATION)
     for path in (folder / file[0], calib):
@@ -72,7 +72,7 @@ def test_boxes(folder, file, calibration, is_damaged):
     try:
         boxes = read_or_refuse(lambda path: read_boxes(path, calib=calib), folder / file[0], file[1])
     except AssertionError:
-        # the error names the calibration
+        # the error is about the calibration file
         with pytest.raises(InputError, match="calib.txt: "):
             read_boxes(folder / file[0], calib=calib)
         boxes = None
@@ -94,7 +94,7 @@ JSON = st.recursive(
 
 @fuzz
 @given(content=JSON)
-def test_structures_of_boxes(content):
+def test_read_boxes_accepts_or_rejects_any_json(content):
     if isinstance(content, list | dict):
         try:
             read_boxes(content)
@@ -108,8 +108,8 @@ def test_structures_of_boxes(content):
     | st.binary(max_size=80).map(lambda data: b"\x80\x02" + data + b".")
     | st.lists(st.sampled_from(PICKLE_PIECES), max_size=40).map(lambda pieces: b"".join(pieces) + b".")
 )
-def test_pickles(folder, content):
-    """Also instructions in any order, with small arguments: they reach what random bytes hardly ever do."""
+def test_load_pickle_accepts_or_rejects_damaged_files(folder, content):
+    """Also opcodes in any order with small arguments, which reach code that random bytes hardly reach."""
     read_or_refuse(load_pickle, folder / "f.pkl", content)
 
 
@@ -119,10 +119,10 @@ WEIGHTS = {"w.safetensors": safetensors.numpy.save({"a": np.zeros(3, np.float32)
 
 @fuzz
 @given(file=damaged(WEIGHTS), is_fitted=st.booleans())
-def test_headers_of_weights(folder, file, is_fitted):
+def test_read_header_accepts_or_rejects_damaged_weights(folder, file, is_fitted):
     name, content = file
     if is_fitted:
-        # with the length that the damaged header has, so that its content is looked at
+        # with the length of the damaged header, so that its content is parsed
         content = struct.pack("<Q", max(len(content) - 8 - 12, 0)) + content[8:]
     read_or_refuse(read_header, folder / name, content)
     read_or_refuse(lambda path: SafetensorsFile.open(path).check_digest(), folder / name, content)
@@ -141,8 +141,8 @@ LISTS = st.none() | st.lists(st.none() | st.floats() | st.integers(-9, 300), max
     values=st.tuples(SCALARS, SCALARS) | st.tuples(LISTS, LISTS),
     is_typed=st.booleans(),
 )
-def test_columns_of_shards(folder, column, values, is_typed):
-    """Each as learned from, and with the type that the column has where its values allow that."""
+def test_dataset_accepts_or_rejects_damaged_columns(folder, column, values, is_typed):
+    """Random values in one column, with the column's type if the values allow it."""
     path = folder / "people-00000.parquet"
     write_card(folder, DatasetCard(settings={"what": "people"}, count=2, per_shard=2, tables=("people",)))
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Synthetic people: the same for a seed, and right in space."""
+"""Synthetic people: determinism and spatial correctness."""
 
 from dataclasses import replace
 from functools import cache
@@ -20,7 +20,7 @@ from lidarpose.synth.generator import BLOCK, LEAST_POINTS, Generator
 from lidarpose.synth.scene import SCENES
 
 SEED = 11
-# no mask, no noise, nothing in between: all that a dense sensor sees of a person
+# no mask and no occluders: everything that a dense sensor sees of a person
 CLEAN = replace(SCENES["paper"], noise=replace(SCENES["paper"].noise, mask=0.0), hard=0.0, distance=(4.0, 8.0))
 
 
@@ -38,25 +38,25 @@ def assert_same(a, b):
     assert a.source == b.source
 
 
-# --- the same for a seed
+# --- determinism
 
 
 @pytest.mark.parametrize("scene", ["paper", "wild"])
-def test_a_person_is_the_same_alone_in_any_order_and_from_another_generator(scene):
+def test_generator_person_depends_only_on_seed_and_index(scene):
     known = Generator(scene=SCENES[scene], measure=False)
     maker = Generator(scene=SCENES[scene])
-    # back and forth over the border of two blocks, other seeds in between
+    # both ways across the border of two blocks, with other seeds in between
     for index in (BLOCK + 3, 0, 95, BLOCK - 1, 0):
         maker.person(SEED + 1, index)
         assert_same(maker.person(SEED, index).sample, known.person(SEED, index).sample)
-    # the facts change nothing
+    # facts do not change the sample
     for index in range(0, 96, 9):
         person = known.person(SEED, index)
         assert person.facts is None
         assert_same(person.sample, people(scene)[index].sample)
 
 
-def test_a_scene_s_name_and_numpy_s_numbers_do():
+def test_generator_accepts_scene_names_and_numpy_integers():
     maker = Generator(scene="paper", measure=False)
     known = Generator(scene=SCENES["paper"], measure=False).person(SEED, 3)
     assert_same(maker.person(np.int64(SEED), np.int32(3)).sample, known.sample)
@@ -80,7 +80,7 @@ def test_a_scene_s_name_and_numpy_s_numbers_do():
         ({"slope": 5.0}, "SceneConfig.slope must be a number from 0 to 0.785 rad, got 5.0"),
     ],
 )
-def test_scenes_of_nonsense_are_refused(changes, told):
+def test_scene_config_rejects_invalid_values(changes, told):
     with pytest.raises(InputError, match=told):
         replace(SCENES["wild"], **changes)
     assert replace(SCENES["wild"], distance=[4, 12]).distance == (4, 12)
@@ -90,19 +90,19 @@ def test_scenes_of_nonsense_are_refused(changes, told):
         replace(SCENES["wild"].noise, mask_keep=(0.5, 1.5))
 
 
-def test_difficulty_asked_for_leaves_the_others_alone():
+def test_generator_hard_argument_does_not_affect_other_people():
     maker = Generator(scene=SCENES["wild"])
     assert maker.person(SEED, 5, hard=0.0).facts.distance > 0
     for hard in (None, 1.0):
         assert_same(maker.person(SEED, 5, hard=hard).sample, people("wild")[5].sample)
     with pytest.raises(InputError, match="hard must be a number from 0 to 1, got 1.5"):
         maker.person(SEED, 5, hard=1.5)
-    # other seeds and other indices are other people
+    # different seeds and indices give different people
     points = {maker.person(seed, index).sample.points.tobytes() for seed in (1, 2, 3) for index in (0, 1, BLOCK)}
     assert len(points) == 9
 
 
-def test_cyclists_ride_and_sitters_sit_on_something_however_easy_the_scene(monkeypatch):
+def test_generator_adds_bicycles_and_seats_in_easy_scenes(monkeypatch):
     drawn, draw_scene = [], generator._draw_scene
 
     def spy(config, bodies, row, *others):
@@ -121,11 +121,11 @@ def test_cyclists_ride_and_sitters_sit_on_something_however_easy_the_scene(monke
     assert np.mean(seats) > 0.5
 
 
-# --- right in space
+# --- spatial correctness
 
 
 @pytest.mark.parametrize("scene", ["paper", "wild", "clean"])
-def test_samples_are_whole(scene):
+def test_generator_samples_are_valid(scene):
     for person in people(scene):
         sample = person.sample
         assert sample.pose.skeleton is BODY26 and sample.pose.frame == "sensor"
@@ -140,14 +140,14 @@ def test_samples_are_whole(scene):
         assert 0 <= sample.ring.min() and sample.ring.max() < rings
 
 
-def test_the_skeleton_lies_inside_the_points_and_behind_the_surface():
+def test_generator_skeleton_is_inside_body_behind_surface():
     gaps, nearer = [], []
     for sample in (person.sample for person in people("clean")):
         body, joints = sample.points[sample.part > 0].astype(float), sample.pose.joints[: len(SMPL24)]
         gap = bone_distance(body, sample.pose.joints, BODY26.bones).min(1)
         assert np.quantile(gap, 0.99) < 0.28 and gap.max() < 0.32
         gaps.append(gap.mean())
-        # seen from the sensor the surface lies before the bones
+        # seen from the sensor, the surface is in front of the bones
         low, high = body.min(0) - 0.3, body.max(0) + 0.3
         assert ((joints > low) & (joints < high)).all(1).mean() > 0.75
         chest = sample.part == 1 + SMPL24.index("spine3")
@@ -158,7 +158,7 @@ def test_the_skeleton_lies_inside_the_points_and_behind_the_surface():
     assert len(nearer) > 30 and np.mean(nearer) > 0.9
 
 
-def test_feet_stand_on_the_ground():
+def test_generator_feet_are_on_ground():
     feet = [BODY26.index(f"{side}_foot") for side in ("left", "right")]
     height = sensor("dapt64").height
     upright = 0
@@ -177,12 +177,12 @@ def test_feet_stand_on_the_ground():
 
 
 @pytest.mark.parametrize("name", ["hand", "wrist", "elbow", "knee", "ankle", "foot", "hip", "shoulder"])
-def test_parts_carry_the_name_of_the_nearer_side(name):
+def test_generator_part_labels_match_nearer_side(name):
     right = total = 0
     for person in people("clean") + people("wild"):
         sample = person.sample
         ends = {side: sample.pose.joints[BODY26.index(f"{side}_{name}")] for side in ("left", "right")}
-        # crossed or clasped limbs say nothing
+        # crossed or clasped limbs are ambiguous
         if np.linalg.norm(ends["left"] - ends["right"]) < (0.08 if name == "hip" else 0.25):
             continue
         for side, other in (("left", "right"), ("right", "left")):
@@ -191,11 +191,11 @@ def test_parts_carry_the_name_of_the_nearer_side(name):
             right += np.count_nonzero(near < far)
             total += len(points)
     assert total > 100
-    # thighs and shanks are long: crossed legs bring them to the other side's joint
+    # crossed legs bring thighs and shanks close to the other side's joint
     assert right / total > (0.94 if name in ("hip", "knee") else 0.97)
 
 
-def test_a_part_lies_about_the_bones_of_its_joint():
+def test_generator_part_points_are_near_their_bones():
     of_joint = {j: [] for j in range(len(SMPL24))}
     for person in people("clean"):
         joints = person.sample.pose.joints
@@ -209,7 +209,7 @@ def test_a_part_lies_about_the_bones_of_its_joint():
         assert np.quantile(gap, 0.98) < (0.3 if "spine" in SMPL24.joints[j] else 0.21), SMPL24.joints[j]
 
 
-def test_left_is_left():
+def test_generator_left_hip_is_on_left_side():
     """A person who stands upright and looks along +x' has the left hip at +y'."""
     upright = [person.sample.pose.joints for person in people("clean") + people("wild") if person.facts.upright]
     at = {name: np.array(upright)[:, BODY26.index(name)] for name in ("nose", "head", "neck", "left_hip", "right_hip")}
@@ -217,11 +217,11 @@ def test_left_is_left():
     assert len(upright) > 60 and ((np.cross(up, ahead) * (at["left_hip"] - at["right_hip"])).sum(1) > 0).mean() > 0.9
 
 
-def test_facts_say_what_is_seen():
+def test_generator_facts_match_visibility_in_scenes():
     clean, wild, paper = (people(name) for name in ("clean", "wild", "paper"))
     assert all(p.facts.visible > 0.9 for p in clean)
     assert any(p.facts.plain for p in clean)
-    # the mask keeps about 0.6 of the beams, and cuts nothing else in the paper's scene
+    # the mask keeps about 0.6 of the beams; the paper's scene hides nothing else
     assert np.mean([p.facts.visible for p in paper]) == pytest.approx(0.6, abs=0.04)
     for person in (*clean, *wild, *paper):
         facts = person.facts
@@ -229,11 +229,11 @@ def test_facts_say_what_is_seen():
     assert np.mean([p.facts.plain for p in wild]) < np.mean([p.facts.plain for p in clean])
 
 
-def test_the_paper_s_distances():
-    """Paper: uniform between 4 and 20 m. Somebody of too few returns comes nearer, so the far end thins a little."""
+def test_paper_scene_distances():
+    """Paper: uniform between 4 and 20 m. People with too few returns are moved nearer."""
     distance = np.array([p.facts.distance for p in people("paper")])
     assert 3.2 < distance.min() and distance.max() < 20.8
-    # the middle of the points and of the box is within a body's half width of it
+    # the centers of points and box are within half a body's width of that distance
     boxes = np.array([p.sample.box.center[:2] for p in people("paper")])
     points = np.array([np.median(p.sample.points[p.sample.part > 0], axis=0)[:2] for p in people("paper")])
     for places in (boxes, points):
@@ -245,7 +245,7 @@ def test_the_paper_s_distances():
 # --- clips
 
 
-def test_a_clip_is_one_person_who_moves_before_things_that_do_not():
+def test_generator_clip_is_one_moving_person():
     maker = Generator(scene=replace(SCENES["wild"], sensors=("os1-128",), distance=(4.0, 9.0)))
     lengths, steps = [], []
     for index in range(6):
@@ -254,7 +254,7 @@ def test_a_clip_is_one_person_who_moves_before_things_that_do_not():
         joints = np.array([p.sample.pose.joints for p in clip])
         bones = np.array(BODY26.bones[: len(SMPL24) - 1])
         long = np.linalg.norm(joints[:, bones[:, 0]] - joints[:, bones[:, 1]], axis=-1)
-        # the same bones, moving at people's speeds
+        # constant bone lengths and human speeds
         np.testing.assert_allclose(long, np.broadcast_to(long[0], long.shape), atol=2e-3)
         steps.append(np.linalg.norm(np.diff(joints, axis=0), axis=-1).max())
         lengths.append(long[0].sum())
@@ -269,7 +269,7 @@ def test_a_clip_is_one_person_who_moves_before_things_that_do_not():
 
 
 @pytest.mark.parametrize("which", [np.argmin, np.argmax], ids=["small", "tall"])
-def test_feet_stay_where_they_stand_however_long_the_legs(which, monkeypatch):
+def test_draw_moving_bodies_feet_do_not_slide(which, monkeypatch):
     crowd = sample_people(np.random.default_rng(0), 200)
     one = crowd.coefficients[which(crowd.height)][None]
     monkeypatch.setattr("lidarpose.body.rig.sample_people", lambda rng, n: SimpleNamespace(coefficients=one))
@@ -279,13 +279,13 @@ def test_feet_stay_where_they_stand_however_long_the_legs(which, monkeypatch):
         if somebody.kinds[0] == "walk":
             walks += 1
             feet = somebody.joints[:, [BODY26.index("left_foot"), BODY26.index("right_foot")], :2]
-            # at any time one of them stands
+            # one foot stands at any time
             slides += np.linalg.norm(np.diff(feet, axis=0), axis=-1).min(1).tolist()
     assert walks > 3 and np.median(slides) < 0.02
 
 
-def test_bodies_move_while_a_rosette_looks():
-    """The points of somebody who cycles past lie between where they were and where they went."""
+def test_draw_bodies_moved_shifts_body_within_frame():
+    """`moved` gives a person's pose at the end of a frame, for sensors that scan slowly."""
     block = draw_bodies(None, 0.0, BLOCK, SEED, 3)
     row = block.kinds.index("cycle") if "cycle" in block.kinds else block.kinds.index("walk")
     vertices, joints = block.moved(row)

@@ -1,4 +1,4 @@
-"""Rotations, spherical coordinates, up axes, alignment: properties."""
+"""Properties of rotations, spherical coordinates, up axes and alignment."""
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ from lidarpose.geometry import (
     distance_to_segments,
     from_spherical,
     inverse_transform,
+    is_rotation,
     quaternion_to_matrix,
     rigid_transform,
     rotation_about,
@@ -40,7 +41,7 @@ def assert_rotation(matrix, atol=1e-9):
 
 @quick
 @given(vectors)
-def test_axis_angle_gives_rotations_about_their_axis(vector):
+def test_axis_angle_to_matrix_rotates_about_axis(vector):
     vector = vector * 0.2
     matrix = axis_angle_to_matrix(vector)
     assert_rotation(matrix)
@@ -52,7 +53,7 @@ def test_axis_angle_gives_rotations_about_their_axis(vector):
 
 @quick
 @given(st.sampled_from("xyz"), angles, angles)
-def test_rotation_about_adds_up_and_agrees_with_rodrigues(axis, a, b):
+def test_rotation_about_composes_and_matches_axis_angle(axis, a, b):
     matrix = rotation_about(axis, a)
     assert_rotation(matrix)
     np.testing.assert_allclose(matrix @ rotation_about(axis, b), rotation_about(axis, a + b), atol=1e-9)
@@ -72,7 +73,7 @@ directions = vectors.filter(lambda v: (np.linalg.norm(v, axis=-1) > 1e-3).all())
 
 @quick
 @given(directions, directions)
-def test_rotation_between_turns_one_onto_the_other(a, b):
+def test_rotation_between_maps_first_to_second_direction(a, b):
     matrix = rotation_between(a, b)
     assert_rotation(matrix)
     np.testing.assert_allclose((matrix @ unit(a)[..., None])[..., 0], unit(b), atol=1e-6)
@@ -82,7 +83,7 @@ def test_rotation_between_turns_one_onto_the_other(a, b):
 
 
 @pytest.mark.parametrize("a", [[1.0, 0, 0], [0, 0, -2.0], [0.6, 0.8, 0], [0.95, 0.1, 0.3]])
-def test_rotation_between_of_opposite_and_of_equal_directions(a):
+def test_rotation_between_opposite_and_equal_directions(a):
     a = np.array(a)
     opposite, same = rotation_between(a, -3 * a), rotation_between(a, 2 * a)
     assert_rotation(opposite)
@@ -92,7 +93,7 @@ def test_rotation_between_of_opposite_and_of_equal_directions(a):
 
 @quick
 @given(vectors)
-def test_unit_vectors_and_spherical_coordinates_and_back(points):
+def test_unit_and_spherical_round_trip(points):
     distance, azimuth, elevation = to_spherical(points)
     np.testing.assert_allclose(np.linalg.norm(unit(points), axis=-1)[distance > 1e-9], 1, atol=1e-12)
     assert (distance >= 0).all() and (np.abs(azimuth) <= np.pi).all() and (np.abs(elevation) <= np.pi / 2).all()
@@ -109,17 +110,19 @@ def test_spherical_conventions():
 
 
 @pytest.mark.parametrize("up", UP_AXES)
-def test_up_axes_are_proper_rotations_that_put_the_axis_up(up):
+def test_rotation_from_up_maps_axis_to_z(up):
     rotation = rotation_from_up(up)
     np.testing.assert_array_equal(rotation @ rotation.T, np.eye(3))
     assert np.linalg.det(rotation) == pytest.approx(1)
     sign = -1 if up[0] == "-" else 1
     np.testing.assert_array_equal(rotation @ np.eye(3)["xyz".index(up[-1])], [0, 0, sign])
+    # forward is x of an input with z up or down, else its z
+    np.testing.assert_array_equal(rotation @ np.eye(3)["xyz".index("x" if up[-1] == "z" else "z")], [1, 0, 0])
 
 
-def test_up_axes_known_and_unknown():
+def test_rotation_from_up_known_and_invalid_axes():
     np.testing.assert_array_equal(rotation_from_up("z"), np.eye(3))
-    # a camera looks along z, its x to the right and its y down
+    # camera frame: z forward, x right, y down
     np.testing.assert_array_equal(rotation_from_up("-y"), np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
     for wrong in ("Z", None, 3, (1, 2), (0, 0, 0), (0, np.nan, 1), "1,2", "a,b,c", ["x", "y", "z"]):
         with pytest.raises(InputError, match="a direction x,y,z, got"):
@@ -127,7 +130,7 @@ def test_up_axes_known_and_unknown():
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3).filter(lambda v: np.abs(v).max() > 1e-3))
-def test_a_direction_is_put_up_by_the_smallest_rotation(direction):
+def test_rotation_from_up_is_smallest_for_direction(direction):
     rotation = rotation_from_up(direction)
     up = unit(np.array(direction))
     np.testing.assert_allclose(rotation @ up, [0, 0, 1], atol=1e-9)
@@ -136,11 +139,11 @@ def test_a_direction_is_put_up_by_the_smallest_rotation(direction):
     np.testing.assert_array_equal(rotation_from_up(",".join(map(repr, direction))), rotation)
 
 
-# a batch of 3 is the trap: an axis of 3 can be taken for x, y, z
+# a batch axis of 3 could be mistaken for x, y, z
 @pytest.mark.parametrize("batch", [1, 2, 3, 4, 5])
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), joints=st.sampled_from([3, 4, 14]))
-def test_alignment_recovers_a_similarity_and_is_least_squares_without_reflections(batch, joints, seed):
+def test_similarity_align_is_least_squares_without_reflection(batch, joints, seed):
     rng = np.random.default_rng(seed)
     rotation = axis_angle_to_matrix(rng.normal(0, 2, (batch, 3)))
     scale, shift = np.exp(rng.normal(0, 0.7, batch)), rng.normal(0, 5, (batch, 1, 3))
@@ -151,7 +154,7 @@ def test_alignment_recovers_a_similarity_and_is_least_squares_without_reflection
 
     np.testing.assert_allclose(similarity_align(source, moved(source)), moved(source), atol=1e-6)
     np.testing.assert_allclose(similarity_align(source[0], moved(source)[0]), moved(source)[0], atol=1e-6)
-    # a mirror image invites a reflection
+    # for a mirror image, the best fit without constraint is a reflection
     source = rng.normal(size=(batch, 9, 3))
     target = moved(source * [1, -1, 1]) + rng.normal(0, 0.1, source.shape)
     aligned = similarity_align(source, target)
@@ -168,7 +171,7 @@ def test_alignment_recovers_a_similarity_and_is_least_squares_without_reflection
         assert (((other - target) ** 2).sum((1, 2)) >= best - 1e-9).all()
 
 
-def test_alignment_leaves_its_input_and_survives_a_single_place():
+def test_similarity_align_keeps_input_and_accepts_equal_points():
     source, target = np.ones((2, 5, 3)), np.random.default_rng(0).normal(size=(2, 5, 3))
     kept = source.copy(), target.copy()
     aligned = similarity_align(source, target)
@@ -191,6 +194,15 @@ def test_rigid_transforms_and_quaternions(seed):
     np.testing.assert_allclose(quaternion_to_matrix(-7 * quaternion), R, atol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("factor", "is_one"), [(1.0, True), (1.004, True), (1.02, False), (-1.0, False), (1e300, False)]
+)
+def test_is_rotation_rejects_scales_and_mirrors(factor, is_one):
+    R = axis_angle_to_matrix(np.array([0.3, -1.2, 0.5]))
+    assert is_rotation(factor * R) is is_one
+    assert not is_rotation(R @ np.diag([1, 1, -1])) and not is_rotation(np.zeros((3, 3)))
+
+
 @quick
 @given(
     points=arrays(float, st.tuples(st.integers(0, 40), st.just(3)), elements=coordinate),
@@ -198,7 +210,7 @@ def test_rigid_transforms_and_quaternions(seed):
     reach=st.one_of(st.floats(0.1, 20), st.lists(st.floats(0.1, 1e6), min_size=4, max_size=4)),
     scale=st.sampled_from([1.0, 1e5]),
 )
-def test_rows_near_are_those_of_a_square(points, centers, reach, scale):
+def test_rows_near_matches_brute_force(points, centers, reach, scale):
     points, centers, reach = scale * points, scale * centers, np.broadcast_to(reach, 4)[: len(centers)]
     for center, own_reach, rows in zip(centers, reach, rows_near(centers, points, reach), strict=True):
         assert rows.tolist() == np.flatnonzero((np.abs(points[:, :2] - center) < own_reach).all(1)).tolist()
@@ -206,10 +218,10 @@ def test_rows_near_are_those_of_a_square(points, centers, reach, scale):
 
 @quick
 @given(seed=st.integers(0, 2**32 - 1))
-def test_the_nearest_segment_is_as_near_as_its_nearest_point(seed):
+def test_distance_to_segments_matches_brute_force(seed):
     rng = np.random.default_rng(seed)
     points, starts, ends = rng.normal(size=(20, 3)), rng.normal(size=(5, 3)), rng.normal(size=(5, 3))
-    # one of no length
+    # a segment of zero length
     ends[0] = starts[0]
     along = (starts + np.linspace(0, 1, 2001)[:, None, None] * (ends - starts)).reshape(-1, 3)
     brute = np.linalg.norm(points[:, None] - along, axis=-1).min(1)
@@ -218,5 +230,5 @@ def test_the_nearest_segment_is_as_near_as_its_nearest_point(seed):
 
 
 @pytest.mark.parametrize(("up", "axis"), [("-y", "-y"), ("0.3,0,0.9", "z"), ("0.3,-0.9,0.1", "-y"), ((-2, 1, 0), "-x")])
-def test_the_upright_axis_is_the_nearest_one(up, axis):
+def test_upright_axis_is_nearest_axis(up, axis):
     assert upright_axis(up) == axis

@@ -1,7 +1,7 @@
-"""What users, their files and their trained weights rely on, as it was recorded: tests/goldens/*.json.
+"""Interface, file formats, bundled weights, samples and losses match those recorded in tests/goldens/*.json.
 
-A change that breaks one of these on purpose records it anew with `python tests/test_goldens.py NAME` (interface,
-formats, weights, samples or losses), says so in the changelog, and gives written files a new schema.
+To change one of them on purpose, record it again with `python tests/test_goldens.py NAME` (interface, formats,
+weights, samples or losses), add a line to the changelog, and give changed files a new schema.
 """
 
 import contextlib
@@ -34,7 +34,7 @@ SEED = 3
 SCENES, INDICES, FRAMES = ("wild", "paper", "reference"), (0, 1, 2, 33, 70), 2
 PEOPLE = [f"{scene} {index}" for scene in SCENES for index in INDICES]
 PEOPLE += [f"clip, frame {frame}" for frame in range(FRAMES)] + ["street"]
-# as far as another processor may round: m, m of a predicted joint, and points of a cloud at the edge of a body
+# tolerances for other processors: m, m of a predicted joint, and points of a cloud at the edge of a body
 POSITION, POSE, COUNT = 1e-3, 5e-4, 2
 
 
@@ -49,7 +49,7 @@ def printed(*arguments):
 
 
 def differences(golden, found, path=""):
-    """What of a recorded tree is gone or changed; what was added is no difference."""
+    """Yields removed and changed entries of a recorded tree; additions are ignored."""
     if isinstance(golden, dict) and isinstance(found, dict):
         for key, value in golden.items():
             if key in found:
@@ -64,7 +64,7 @@ def differences(golden, found, path=""):
 
 
 def parameters(function):
-    """Name -> how it is given; of what is given by position, where."""
+    """Name -> position or "keyword", and whether it is optional."""
     kinds = {}
     for place, parameter in enumerate(inspect.signature(function).parameters.values()):
         by_position = parameter.kind is not inspect.Parameter.KEYWORD_ONLY
@@ -118,15 +118,15 @@ def interface():
     }  # fmt: skip
 
 
-def test_the_interface_only_grows():
+def test_interface_keeps_recorded_names():
     assert list(differences(recorded("interface"), interface())) == []
 
 
-# ---- what is written: columns of Parquet files, keys of JSON files
+# ---- file formats: columns of Parquet files, keys of JSON files
 
 
 def keys(tree):
-    """The keys of a document; of a list of objects those of the first."""
+    """The nested keys of a document; for a list of objects, those of the first one."""
     if isinstance(tree, dict):
         return {key: keys(value) for key, value in tree.items()}
     return {"[]": keys(tree[0])} if isinstance(tree, list) and tree and isinstance(tree[0], dict) else {}
@@ -163,11 +163,11 @@ def formats():
     return found  # fmt: skip
 
 
-def test_files_keep_their_columns_and_keys():
+def test_file_formats_keep_recorded_columns_and_keys():
     assert list(differences(recorded("formats"), formats())) == []
 
 
-# ---- the weights that ship
+# ---- bundled weights
 
 
 def weights():
@@ -177,41 +177,41 @@ def weights():
             tensors = {key: file.get_slice(key).get_shape() for key in file.keys()}
             entry = json.loads(file.metadata()["lidarpose"])
         assert entry["card"]["people_seen"] > 0 and entry["card"]["command"]
-        # strict: every tensor is there, and no other
+        # loading is strict: no tensor is missing or additional
         skeleton = lidarpose.load(path.stem, backend="torch").skeleton.name
         found[path.stem] = {"skeleton": skeleton, "tensors": tensors}
         found[path.stem] |= {key: entry[key] for key in ("schema", "network", "config")}
     return found
 
 
-def test_the_shipped_weights_are_of_the_recorded_networks():
+def test_bundled_weights_match_recorded_networks():
     assert list(differences(recorded("weights"), weights())) == []
 
 
-# ---- what the weights that ship say of one cloud, on any machine and by either backend
+# ---- poses that the bundled weights predict from a fixed cloud, with both backends
 
-# a synthesized walker of 221 points, 10 m from a VLP-32C; its joints were written by tools/ship_weights.py
+# a synthetic walking person of 221 points, 10 m from a VLP-32C; joints written by tools/ship_weights.py
 GOLDEN_POSES = json.loads((FOLDER.parent / "golden_poses.json").read_text())
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("backend", ["onnx", "torch"])
 @pytest.mark.parametrize("name", BUNDLED)
-def test_the_pose_of_a_fixed_cloud(name, backend):
+def test_predict_matches_golden_pose(name, backend):
     model = lidarpose.load(name, backend=backend, tta=1)
     pose = model.predict(np.array(GOLDEN_POSES["points"]), sensor_origin=GOLDEN_POSES["sensor_origin"])
     np.testing.assert_allclose(pose.joints, GOLDEN_POSES["joints"][name], atol=POSE)
 
 
 @pytest.mark.parametrize("name", BUNDLED)
-def test_the_golden_pose_is_a_good_one(name):
-    """Within 6 cm of the truth on average, so that what is held is no nonsense."""
+def test_golden_pose_is_accurate(name):
+    """The recorded joints are within 6 cm of the truth on average."""
     error = np.linalg.norm(np.array(GOLDEN_POSES["joints"][name]) - np.array(GOLDEN_POSES["truth"]), axis=-1)
     assert len(error) == len(SMPL24) and error.mean() < 0.06, f"{error.mean() * 1e3:.0f} mm"
 
 
-def test_the_files_are_small():
-    """What is taken by default is at most 6.1 MB with its ONNX twin, any file at most 12."""
+def test_bundled_files_are_small():
+    """The default weights and their ONNX file have at most 6.1 MB together, every file at most 12 MB."""
     sizes = {name: [bundled_path(name, end).stat().st_size for end in (".safetensors", ".onnx")] for name in BUNDLED}
     assert sum(sizes[DEFAULT]) < 6.1e6 and max(map(max, sizes.values())) < 12e6
 
@@ -262,7 +262,7 @@ def drawn():
 
 
 @pytest.mark.parametrize("which", PEOPLE)
-def test_people_of_a_seed_stay_the_same(drawn, which):
+def test_generator_matches_golden_samples(drawn, which):
     golden, found = recorded("samples")[which], drawn[which]
     assert found["source"] == golden["source"]
     np.testing.assert_allclose(found["joints"], golden["joints"], atol=POSITION)
@@ -271,7 +271,7 @@ def test_people_of_a_seed_stay_the_same(drawn, which):
     for part in found["parts"] | golden["parts"]:
         assert found["parts"].get(part, 0) == pytest.approx(golden["parts"].get(part, 0), abs=COUNT, rel=1e-3), part
     if "middle" in golden:
-        # a point more or less moves the mean of few
+        # one point more or less moves the mean of few points
         np.testing.assert_allclose(found["middle"], golden["middle"], atol=POSITION + 1.0 / golden["points"])
     for name, value in golden.get("facts", {}).items():
         assert found["facts"][name] == (pytest.approx(value, abs=0.02) if isinstance(value, float) else value), name
@@ -281,7 +281,7 @@ def test_people_of_a_seed_stay_the_same(drawn, which):
 
 
 def losses():
-    """Of each term the mean over the first ten chunks of eight steps, on one thread."""
+    """Mean of each loss term over each of the first ten chunks of eight steps, on one thread."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as root, mock.patch("lidarpose.train.setup.VALIDATION", 0):
@@ -293,11 +293,11 @@ def losses():
     return {"tiny": {name: [line[name] for line in lines] for name in lines[0] if name not in ("people", "seconds")}}
 
 
-def test_ten_training_losses():
+def test_pretrain_matches_golden_losses():
     golden, found = recorded("losses")["tiny"], losses()["tiny"]
     assert set(golden) <= set(found) and len(golden["joints"]) == 10
     for name, values in golden.items():
-        # rounding grows from step to step
+        # rounding errors grow from step to step
         np.testing.assert_allclose(found[name][:5], values[:5], rtol=1e-3, atol=1e-4, err_msg=name)
         np.testing.assert_allclose(found[name], values, rtol=5e-2, atol=5e-3, err_msg=name)
 
@@ -332,7 +332,7 @@ BAD_CALLS = {
 
 
 @pytest.mark.parametrize("case", BAD_CALLS)
-def test_a_bad_call_is_an_input_error_of_one_line(case):
+def test_bad_call_raises_input_error_of_one_line(case):
     with pytest.raises(InputError) as caught:
         BAD_CALLS[case]()
     assert isinstance(caught.value, ValueError) and "\n" not in str(caught.value)
@@ -342,7 +342,7 @@ GOLDENS = {"interface": interface, "formats": formats, "weights": weights, "samp
 
 
 def text_of(tree):
-    """JSON of one line for each of the first two levels' entries."""
+    """JSON with one line per entry of the first two levels."""
     parts = []
     for name, entries in tree.items():
         lines = ",\n".join(f"  {json.dumps(key)}: {json.dumps(value, default=float)}" for key, value in entries.items())

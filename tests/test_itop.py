@@ -1,4 +1,4 @@
-"""ITOP: people come out of its HDF5 files where they went in, without the room, and joints within 10 cm are counted."""
+"""ITOP: reading of its HDF5 files, removal of the room, and the share of joints within 10 cm."""
 
 import re
 import sys
@@ -29,7 +29,7 @@ LABELS, CLOUDS = "ITOP_side_test_labels.h5", "ITOP_side_test_point_cloud.h5"
 
 @pytest.fixture(scope="module")
 def raw(tmp_path_factory, smpl):
-    """Both views, their second frames unchecked, and what must come out."""
+    """Files of both views, whose second frames are invalid, and the true joints."""
     root = tmp_path_factory.mktemp("itop")
     return root, files.write_itop(root, smpl, parts=itop.PARTS, frames=3, invalid=(1,))
 
@@ -46,7 +46,7 @@ def everything(root):
     return [record for record in records if isinstance(record, LabeledSample)], records
 
 
-def test_a_known_pose_comes_back_in_the_level_frame_and_unchecked_frames_do_not(raw):
+def test_itop_reads_known_poses_and_skips_invalid_frames(raw):
     root, truth = raw
     people, records = everything(root)
     assert {(person.sequence, person.frame, person.track) for person in people} == truth.keys()
@@ -64,12 +64,12 @@ def test_a_known_pose_comes_back_in_the_level_frame_and_unchecked_frames_do_not(
     assert skipped[0].where == "side/test/00_00008"
 
 
-def test_the_side_view_s_room_is_cut_away_without_labels(raw):
+def test_itop_side_view_removes_room_without_labels(raw):
     people, _ = everything(raw[0])
     for person in people:
         if person.sequence.startswith("side"):
             distance = np.linalg.norm(person.points[:, None] - person.joints, axis=-1).min(1)
-            # the floor goes, and with it the soles; half the skin is nearer than 15 cm to a joint
+            # the floor is removed with the soles; half of the skin is within 15 cm of a joint
             assert distance.max() < 0.4 and np.median(distance) < 0.15 and 2400 < len(person.points) < 3100
             assert person.box is None and not person.centers
         else:
@@ -77,11 +77,25 @@ def test_the_side_view_s_room_is_cut_away_without_labels(raw):
             np.testing.assert_array_equal(person.centers["joints_box"], person.box.center)
 
 
-def test_a_file_whose_x_is_left_is_told_by_its_forearms(tmp_path, smpl, monkeypatch):
+def test_person_of_room_keeps_outstretched_arms():
+    rng = np.random.default_rng(0)
+
+    def blob(count, *place):
+        return rng.uniform(-0.05, 0.05, (count, 3)) + place
+
+    # x right, y up, z away; fewer points below, so that there is no floor
+    body = np.stack([rng.uniform(-0.2, 0.2, 4000), 1.4 * rng.random(4000) ** 0.5 - 1, rng.uniform(2.8, 3, 4000)], 1)
+    arms = np.concatenate([blob(50, 0.1, 0.2, 2.1), blob(50, 0.0, 0.7, 2.9)])
+    others = np.concatenate([blob(50, 0.0, 0.0, 3.4), blob(50, 0.6, 0.0, 2.9), blob(9, 0.0, 0.2, 2.4)])
+    found = itop.person_of_room(np.concatenate([others, arms, body]))
+    np.testing.assert_array_equal(found, np.concatenate([arms, body]))
+
+
+def test_itop_detects_mirrored_files(tmp_path, smpl, monkeypatch):
     joints = files.itop_joints(motion_files.joints_of(motion_files.a_clip(300)[0]))
     joints = np.delete(joints, files.ITOP_JOINTS.index("torso"), 1)
     assert not itop.is_mirrored(joints) and itop.is_mirrored(joints * [1, -1, 1])
-    # too few to tell; unlabeled joints tell nothing
+    # too few frames, and unlabeled joints, are not enough
     assert not itop.is_mirrored(joints[:99] * [1, -1, 1])
     joints[99:, 3] = np.nan
     assert not itop.is_mirrored(joints * [1, -1, 1])
@@ -93,7 +107,7 @@ def test_a_file_whose_x_is_left_is_told_by_its_forearms(tmp_path, smpl, monkeypa
         assert person.source.endswith(", x left")
 
 
-def test_views_are_not_mixed(raw, prepared, tmp_path):
+def test_prepare_itop_does_not_mix_views(raw, prepared, tmp_path):
     out, summary = prepared
     assert summary["splits"] == {"none": 4, "test": 2, "train": 2}
     assert {sample.sequence for sample in open_dataset(out).samples("test")} == {"side/00"}
@@ -101,7 +115,7 @@ def test_views_are_not_mixed(raw, prepared, tmp_path):
     assert summary["splits"] == {"test": 2} and summary["sources"] == {"itop/top": 2}
 
 
-def test_whoever_has_one_split_alone_is_not_told_that_the_other_is_missing(tmp_path, smpl):
+def test_prepare_itop_ignores_missing_other_split(tmp_path, smpl):
     files.write_itop(tmp_path / "raw", smpl, parts=("side/test",), frames=1)
     warnings = {
         split: prepare("itop", tmp_path / "raw", tmp_path / f"{split}", split=split)["warnings"]
@@ -110,7 +124,7 @@ def test_whoever_has_one_split_alone_is_not_told_that_the_other_is_missing(tmp_p
     assert warnings == {"test": [], None: ["side/train of train by side are missing"]}
 
 
-def test_a_split_that_is_still_being_loaded_stops_no_other(tmp_path, smpl):
+def test_prepare_itop_ignores_damaged_other_split(tmp_path, smpl):
     raw = tmp_path / "raw"
     files.write_itop(raw, smpl, parts=("side/test", "side/train"), frames=1)
     cut_off(raw / LABELS.replace("test", "train"))
@@ -120,7 +134,7 @@ def test_a_split_that_is_still_being_loaded_stops_no_other(tmp_path, smpl):
 
 
 def scored(out, shift=0.0, joints=ITOP14.joints):
-    """The result of a network that knows the truth, but that `joints` are off by `shift` m."""
+    """The result of predictions that equal the truth, except that `joints` are off by `shift` m."""
     dataset = open_eval_dataset(out)
     people = {tuple(person.points[0]): person for person in dataset}
     moved = shift * np.isin(ITOP14.joints, joints)[:, None] * [0.6, 0.0, 0.8]
@@ -133,7 +147,7 @@ def scored(out, shift=0.0, joints=ITOP14.joints):
     return evaluate_dataset(eval_setup(Fake(answer), dataset)).result
 
 
-def test_joints_within_10_cm_are_counted_by_half_and_joint(prepared):
+def test_pck_10cm_by_body_half_and_joint(prepared):
     for shift, value in ((0.0, 100.0), (0.09, 100.0), (0.11, 0.0)):
         rows = [row for row in scored(prepared[0], shift).lines if row.figure == "pck_10cm"]
         assert len(rows) == 1 + 2 + 14 and {row.value for row in rows} == {value}
@@ -178,7 +192,7 @@ def replaced(path, name, values):
         (lambda root: (root / LABELS).unlink() or (root / CLOUDS).unlink(), "is not the root of ITOP"),
     ],
 )
-def test_a_damaged_file_is_one_line_and_nothing_is_written(tmp_path, smpl, capsys, change, message):
+def test_prepare_itop_reports_damaged_file_and_writes_nothing(tmp_path, smpl, capsys, change, message):
     files.write_itop(tmp_path / "raw", smpl, parts=("side/test",), frames=1)
     change(tmp_path / "raw")
     assert main(["prepare", "itop", str(tmp_path / "raw"), str(tmp_path / "out")]) == 2
@@ -187,7 +201,7 @@ def test_a_damaged_file_is_one_line_and_nothing_is_written(tmp_path, smpl, capsy
     assert not (tmp_path / "out").exists()
 
 
-def test_frames_that_cannot_be_used_are_counted(tmp_path, smpl):
+def test_itop_skips_unusable_frames_with_reasons(tmp_path, smpl):
     files.write_itop(tmp_path, smpl, parts=("side/test", "top/test"), frames=4)
     names = np.array(["00_00007", "nobody", "00_00009", "00_00010"], "S8")
     for path in sorted(tmp_path.iterdir()):
@@ -200,19 +214,19 @@ def test_frames_that_cannot_be_used_are_counted(tmp_path, smpl):
     people, records = everything(tmp_path)
     assert [person.frame for person in people] == [10, 10]
     assert [record.reason for record in records if isinstance(record, Skipped)] == [
-        "no person stands out from the room", "id in another format", "no joint is labelled",
-        "no points in the box", "id in another format", "no joint is labelled",
+        "no person stands out from the room", "id in another format", "no joint is labeled",
+        "no points in the box", "id in another format", "no joint is labeled",
     ]  # fmt: skip
 
 
-def test_without_h5py_the_extra_is_named(raw, monkeypatch):
+def test_itop_names_missing_extra(raw, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(MissingExtra, match=r"'.\[itop\]'"):
         reader("itop").check(raw[0], "side/test")
 
 
 def clusters_reference(points):
-    """`itop._clusters` by flooding from point to point."""
+    """`itop._clusters` by a flood fill from point to point."""
     cells = np.floor((points - points.min(0)) / 0.075).astype(int)
     cluster = np.full(len(points), -1)
     for k in range(len(points)):
@@ -226,7 +240,7 @@ def clusters_reference(points):
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 120), st.sampled_from([0.2, 0.6, 1.5]))
-def test_clusters_are_those_of_the_reference(seed, count, wide):
+def test_itop_clusters_match_reference(seed, count, wide):
     points = np.random.default_rng(seed).uniform(0, wide, (count, 3))
     ours, theirs = itop._clusters(points), clusters_reference(points)
     np.testing.assert_array_equal(ours[:, None] == ours, theirs[:, None] == theirs)

@@ -1,4 +1,4 @@
-"""Which way is up before a sensor that is mounted askew, told by people."""
+"""Leveling of a tilted sensor by the people in its scans."""
 
 import json
 
@@ -16,7 +16,7 @@ AXIS = np.array([0.6, 0.8, 0.0])
 
 
 def tilt(degrees):
-    """R_sensor_level of a LiDAR out of level by so much."""
+    """R_sensor_level of a LiDAR tilted by `degrees`."""
     return axis_angle_to_matrix(np.radians(degrees) * AXIS)
 
 
@@ -25,22 +25,34 @@ def people(degrees, frames=2 * LEAST_FRAMES):
 
 
 @pytest.mark.parametrize("degrees", [0, 5, 15, 40])
-def test_people_who_turn_round_tell_what_is_up(degrees):
+def test_leveling_finds_up_from_turning_people(degrees):
     up, doubt = up_of_people(people(degrees))
     assert np.degrees(np.arccos(up @ tilt(degrees)[:, 2])) < 2 and np.degrees(doubt) == pytest.approx(3)
     found = leveling(people(degrees))
     assert (found is None) == (degrees == 0)
     if degrees:
         np.testing.assert_allclose(found @ up, [0, 0, 1], atol=1e-9)
-        # the smallest such rotation: nothing turns about z
+        # the smallest such rotation, without rotation about z
         assert np.degrees(np.arccos((np.trace(found) - 1) / 2)) == pytest.approx(degrees, abs=2)
 
 
-def test_too_few_people_say_nothing():
+def test_leveling_compensates_forward_lean():
+    joints, lean = people(0), np.radians(12)
+    left = joints[:, 1] - joints[:, 2]
+    headings = np.linspace(-1.2, 1.2, len(joints))
+    for k, yaw in enumerate(np.arctan2(left[:, 1], left[:, 0])):
+        # the left side along y, then forward over the hips, then to the heading
+        ahead = joints[k] @ rotation_about("z", np.pi / 2 - yaw).T @ rotation_about("y", lean).T
+        joints[k] = ahead @ rotation_about("z", headings[k]).T
+    up, _ = up_of_people(joints)
+    assert np.degrees(np.arccos(up[2])) < 4
+
+
+def test_leveling_is_none_for_few_frames():
     assert up_of_people(people(15, frames=LEAST_FRAMES - 1)) is None and leveling(people(15, frames=3)) is None
 
 
-def test_who_leans_and_never_turns_is_no_reason_to_turn_the_frame():
+def test_leveling_is_none_for_leaning_people_who_never_turn():
     joints = people(0)
     left = joints[:, 1] - joints[:, 2]
     for k, yaw in enumerate(np.arctan2(left[:, 1], left[:, 0])):
@@ -52,21 +64,21 @@ def test_who_leans_and_never_turns_is_no_reason_to_turn_the_frame():
 
 @pytest.fixture(scope="module")
 def raw(tmp_path_factory):
-    """A root whose sequence 5 was seen by a LiDAR out of level by 15 degrees, and SMPL."""
+    """Dataset whose sequence 5 was recorded by a LiDAR tilted by 15 degrees, SMPL file, and true joints."""
     root = tmp_path_factory.mktemp("raw")
     smpl = files.write_smpl(root / "SMPL_NEUTRAL.npz")
     truth = files.write_lidarhuman26m(root, smpl, sequences=("5",), frames=LEAST_FRAMES, R_sensor_level=tilt(15))
     return root, smpl, truth
 
 
-def test_lidarhuman26m_is_turned_level(raw):
+def test_lidarhuman26m_reader_levels_tilted_sensor(raw):
     root, smpl, truth = raw
     kept, leveled = (list(reader("lidarhuman26m", smpl, level=level).read(root, "5")) for level in (False, True))
     assert {item.source for item in kept} == {"lidarhuman26m"}
     assert {item.source for item in leveled} == {"lidarhuman26m, turned level by 15 deg"}
     for a, b in zip(kept, leveled, strict=True):
         np.testing.assert_allclose(a.joints, truth["5", a.frame, "0"] @ tilt(15).T, atol=1e-4)
-        # one rotation about the LiDAR for points, joints and trans; heights come out as they were to 2 degrees
+        # one rotation about the LiDAR for points, joints and trans; heights are right to 2 degrees
         np.testing.assert_allclose(b.joints[:, 2], truth["5", a.frame, "0"][:, 2], atol=15 * 0.035)
         for before, after in (
             (a.points, b.points),
@@ -74,15 +86,15 @@ def test_lidarhuman26m_is_turned_level(raw):
             (a.centers["trans"], b.centers["trans"]),
         ):
             np.testing.assert_allclose(np.linalg.norm(after, axis=-1), np.linalg.norm(before, axis=-1), atol=1e-4)
-        # and all together: trans stays where it is on the person
+        # distances between joints and trans do not change
         before, after = (np.linalg.norm(x.joints - x.centers["trans"], axis=-1) for x in (a, b))
         np.testing.assert_allclose(after, before, atol=1e-4)
-        # the points stay on the person
+        # the points stay near the joints
         apart = np.linalg.norm(b.points[:, None] - b.joints, axis=-1).min(1)
         assert np.median(apart) < 0.3
 
 
-def test_the_release_s_own_frame_can_be_had(raw, tmp_path):
+def test_prepare_lidarhuman26m_without_leveling(raw, tmp_path):
     root, smpl, _ = raw
     found = prepare("lidarhuman26m", root, tmp_path / "own", smpl=smpl, level=False)
     assert list(found["sources"]) == ["lidarhuman26m"]

@@ -1,4 +1,4 @@
-"""tools/make_motion.py: an archive's files become the file of captured motion that training takes."""
+"""tools/make_motion.py: converts archives of captured motion to a file for training."""
 
 import motion_files as files
 import numpy as np
@@ -11,7 +11,7 @@ make_motion = load_script("tools/make_motion.py")
 
 
 def write_archive(folder):
-    """Two subjects of the CMU database at 120 Hz, one of HDM05: 25 frames, every frame the first's pose held still."""
+    """Two subjects of the CMU database at 120 Hz, one of HDM05: 25 frames with the same pose."""
     rotations, way = files.a_clip(1)
     rotations, way = np.repeat(rotations, 25, axis=0), np.repeat(way, 25, axis=0)
     asf, axes = files.asf_text()
@@ -27,7 +27,7 @@ def write_archive(folder):
     return files.joints_of(rotations[:1], way[:1])
 
 
-def test_an_archive_becomes_a_file_that_training_reads(tmp_path, capsys):
+def test_make_motion_output_is_read_by_load_motion(tmp_path, capsys):
     joints = write_archive(tmp_path / "archive")
     out = tmp_path / "motion.npz"
     assert make_motion.main([str(tmp_path / "archive"), "--out", str(out)]) == 0
@@ -36,23 +36,23 @@ def test_an_archive_becomes_a_file_that_training_reads(tmp_path, capsys):
     assert motion.names == ("002_01", "002_10", "005_02", "bd_squat1Reps_001") and motion.fps == 10
     assert motion.length.tolist() == [3, 3, 3, 3]
     with np.load(out) as stored:
-        # 25 mm: what retargeting onto the mean adult leaves
+        # 25 mm: error of retargeting to the mean adult
         np.testing.assert_allclose(stored["joints"], np.repeat(joints, 12, axis=0), atol=0.025)
     played = files.joints_of(motion.rotations, motion.translation)
     np.testing.assert_allclose(played, np.repeat(joints, 12, axis=0), atol=0.04)
 
 
-def test_subjects_are_chosen_with_or_without_zeros_and_files_of_others_are_not_opened(tmp_path):
+def test_read_clips_selects_subjects_without_opening_others(tmp_path):
     write_archive(tmp_path)
     (tmp_path / "05/05_03.amc").write_text("broken")
     assert list(make_motion.read_clips([tmp_path], ["2", "bd"])) == ["002_01", "002_10", "bd_squat1Reps_001"]
-    # a file made before can be extended
+    # an existing file can be extended
     make_motion.save_clips(tmp_path / "more/clips.npz", make_motion.read_clips([tmp_path / "02"], []))
     both = make_motion.read_clips([tmp_path / "more", tmp_path / "hdm05"], ["002", "bd"])
     assert list(both) == ["002_01", "002_10", "bd_squat1Reps_001"]
 
 
-def test_clips_are_left_out_and_cut_by_their_names(tmp_path, capsys):
+def test_make_motion_excludes_and_shortens_clips_by_name(tmp_path, capsys):
     write_archive(tmp_path / "archive")
     words = [str(tmp_path / "archive"), "--out", str(tmp_path / "motion.npz"), "--without", "005*", "002_10"]
     assert make_motion.main([*words, "--first", "0.7", "bd_*"]) == 0
@@ -63,7 +63,7 @@ def test_clips_are_left_out_and_cut_by_their_names(tmp_path, capsys):
         assert "--first: expected a share" in capsys.readouterr().err
 
 
-def test_recordings_of_another_rate_are_resampled_by_it(tmp_path):
+def test_read_clips_resamples_with_given_fps(tmp_path):
     write_archive(tmp_path)
     assert len(make_motion.read_clips([tmp_path], ["2"], fps=60)["002_01"]) == 5
 
@@ -77,7 +77,7 @@ def test_recordings_of_another_rate_are_resampled_by_it(tmp_path):
         (["02", "02"], [], "two clips 002_01"),
     ],
 )
-def test_what_is_wrong_is_said_in_a_line_and_nothing_is_written(tmp_path, capsys, folders, subjects, message):
+def test_make_motion_errors_are_one_line_and_write_nothing(tmp_path, capsys, folders, subjects, message):
     write_archive(tmp_path)
     (tmp_path / "hdm05/empty").mkdir()
     out = tmp_path / "motion.npz"

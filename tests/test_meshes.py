@@ -1,4 +1,4 @@
-"""Meshes of scenes: closed, outward, of their sizes, moved without touching their parts; beams pass where they can."""
+"""Meshes of scenes: closed surfaces, sizes, transforms with parts, and beams through openings."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ SIZED = {
 }
 
 
-# on the ground side open, as prisms are, or of single triangles
+# open at the bottom, like prisms, or made of single triangles
 OPEN = {"pole", "wheeled bin", "sign", "traffic cone", "lattice fence", "foliage", "grass", "bench without back"}
 
 
@@ -45,7 +45,7 @@ def maker():
 
 
 @pytest.mark.parametrize("name", SIZED)
-def test_things_stand_on_the_origin_and_have_their_size(name):
+def test_shapes_stand_on_origin_and_have_given_size(name):
     mesh, extent = SIZED[name]
     assert mesh.vertices.dtype == np.float32 and mesh.faces.dtype == np.int32
     assert np.isfinite(mesh.vertices).all()
@@ -56,14 +56,14 @@ def test_things_stand_on_the_origin_and_have_their_size(name):
     for axis, size in enumerate(extent):
         if size is not None:
             assert high[axis] - low[axis] == pytest.approx(size, rel=0.005, abs=1e-6)
-    # over the origin, give or take
+    # roughly above the origin
     assert (low[:2] <= 0.05).all() and (high[:2] >= -0.05).all()
     if name not in OPEN:
         assert open_edges(mesh) == [] and volume(mesh) > 0
 
 
 def open_edges(mesh):
-    """Edges that do not lie between two faces that run along it in opposite directions."""
+    """Edges that are not shared by exactly two faces in opposite directions."""
     edges = [(a, b) for f in mesh.faces.tolist() for a, b in ((f[0], f[1]), (f[1], f[2]), (f[2], f[0]))]
     return [e for e in edges if edges.count(e) != 1 or (e[1], e[0]) not in edges]
 
@@ -74,27 +74,27 @@ def volume(mesh):
 
 
 @pytest.mark.parametrize("name", sorted(set(shipped_meshes()) - {"traffic cone", "pole", "sign post"}))
-def test_shipped_meshes_are_closed_look_outwards_and_have_few_faces(name):
+def test_shipped_meshes_are_closed_outward_and_have_few_faces(name):
     mesh = shipped_meshes()[name]
     assert open_edges(mesh) == [] and mesh.faces.max() == len(mesh.vertices) - 1
     assert min(piece_volumes(mesh)) > 0
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces].astype(float), 1, 0)
     assert len(mesh.faces) <= (300 if name in ("wheelchair", "bicycle") else 160)
     assert mesh.vertices.dtype == np.float32 and mesh.faces.dtype == np.int32
-    # no doubled vertices in place, no faces without area
+    # no faces of zero area
     assert np.linalg.norm(np.cross(b - a, c - a), axis=-1).min() > 1e-7
 
 
-def test_the_shipped_meshes_are_those_of_their_script(maker):
+def test_shipped_meshes_match_make_meshes(maker):
     made, shipped = maker.meshes(), shipped_meshes()
     assert list(made) == list(shipped)
     for name, mesh in made.items():
         np.testing.assert_array_equal(mesh.faces, shipped[name].faces)
-        # sines differ by machine
+        # sines differ between machines
         np.testing.assert_allclose(mesh.vertices, shipped[name].vertices, atol=1e-6)
 
 
-def test_boxes_lofts_and_prisms_stand_on_the_origin_and_join(maker):
+def test_box_loft_and_prism_have_expected_volume(maker):
     mesh = box(np.array([2.0, 3.0, 4.0]))
     assert volume(mesh) == pytest.approx(24, rel=1e-6) and open_edges(mesh) == []
     np.testing.assert_allclose(mesh.vertices.min(0), [-1, -1.5, 0])
@@ -103,14 +103,14 @@ def test_boxes_lofts_and_prisms_stand_on_the_origin_and_join(maker):
     np.testing.assert_allclose(two.vertices.max(0), [3.5, 1, 4])
     wedge = maker.loft((0.0, 0.5, 0.5, 0.0, 1.0), (2.0, 0.5, 0.5, 0.0, 0.5))
     assert open_edges(wedge) == [] and volume(wedge) == pytest.approx(1.5)
-    # open at the bottom, which lies in the plane of the origin and adds nothing to the integral
+    # open at the bottom, which is in the plane of the origin and adds nothing to the volume
     for top, share in ((0.0, 1 / 3), (1.0, 1.0)):
         mesh = maker.prism(40, top=top).scaled((0.5, 0.5, 2.0))
         assert mesh.vertices[:, 2].min() == 0 and mesh.vertices[:, 2].max() == 2
         assert volume(mesh) == pytest.approx(share * np.pi * 0.25 * 2, rel=0.01)
 
 
-def test_meshes_move_and_join_with_their_parts_and_where_they_go():
+def test_mesh_moved_and_union_keep_part_and_later():
     a, b = quad(1.0, np.zeros(2)), box(np.ones(3))
     before = a.vertices.copy()
     moved = a.moved(np.array([1.0, 2, 3]), np.pi / 2)
@@ -127,7 +127,7 @@ def test_meshes_move_and_join_with_their_parts_and_where_they_go():
     np.testing.assert_array_equal(person.moved((1, 0, 0)).part, person.part)
 
 
-def test_what_is_built_once_is_not_changed_by_its_users():
+def test_cached_meshes_are_not_changed_by_callers():
     first = shape("car", 4.0, 1.8, 1.5)
     first.moved(np.array([1.0, 2, 3]), 0.4).vertices[:] = 0
     first.vertices[:, 2] += 1
@@ -140,7 +140,7 @@ def test_what_is_built_once_is_not_changed_by_its_users():
 
 
 def hit_share(mesh, distance=6.0):
-    """Share of the beams within the extent of a thing at `distance` m that it returns."""
+    """Share of the beams within the extent of a mesh at `distance` m that hit it."""
     there = mesh.moved(np.array([distance, 0, -0.5]))
     y, z = np.abs(mesh.vertices[:, 1]).max() * 0.95, mesh.vertices[:, 2].max()
     azimuth = np.linspace(-1, 1, 90) * np.arctan(y / distance)
@@ -149,7 +149,7 @@ def hit_share(mesh, distance=6.0):
     return np.isfinite(distances).mean()
 
 
-def test_beams_pass_fences_and_leaves_and_no_wall():
+def test_cast_rays_passes_fences_and_foliage_but_not_walls():
     assert hit_share(shapes.wall(2.0, 1.5)) > 0.97
     assert 0.1 < hit_share(shapes.lattice_fence(2.4, 1.2, 0.12, 0.03)) < 0.5
     assert 0.05 < hit_share(shapes.rail_fence(3.0, 1.0, 3)) < 0.4
@@ -164,7 +164,7 @@ def test_beams_pass_fences_and_leaves_and_no_wall():
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 120), st.floats(0.3, 2), st.floats(0.02, 0.2))
-def test_foliage_stays_about_its_ellipsoid(seed, leaves, size, leaf):
+def test_foliage_stays_near_its_ellipsoid(seed, leaves, size, leaf):
     mesh = shapes.foliage((size, size / 2, 1.5 * size), leaves, leaf, RNG(seed))
     assert len(mesh.faces) == leaves
     beyond = np.abs(mesh.vertices - [0, 0, 0.75 * size]) - np.array([size, size / 2, 1.5 * size]) / 2
@@ -173,14 +173,14 @@ def test_foliage_stays_about_its_ellipsoid(seed, leaves, size, leaf):
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 100), st.floats(0.1, 1), st.floats(0.02, 0.3))
-def test_grass_stands_on_its_disc(seed, blades, radius, height):
+def test_grass_stays_on_its_disk(seed, blades, radius, height):
     mesh = shapes.grass(radius, height, blades, RNG(seed))
     assert len(mesh.faces) == blades
     assert np.hypot(*mesh.vertices[:, :2].T).max() < radius + 0.12
     assert 0 <= mesh.vertices[:, 2].min() and mesh.vertices[:, 2].max() <= height + 1e-6
 
 
-def test_where_vertices_are_at_the_frame_s_end_moves_along():
+def test_mesh_transforms_apply_to_later_vertices():
     vertices = np.random.default_rng(0).normal(size=(3, 3)).astype(np.float32)
     faces = np.array([[0, 1, 2]], np.int32)
     mesh, later = Mesh(vertices, faces, None, vertices + 1), Mesh(vertices + 1, faces)

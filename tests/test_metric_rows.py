@@ -1,4 +1,4 @@
-"""Every metric of a few people whose errors are known, worked out by hand, and where charts draw it."""
+"""Metric rows of a few people with known errors, computed by hand, and the charts of these rows."""
 
 import numpy as np
 import pytest
@@ -9,13 +9,13 @@ from lidarpose.eval.predictions import stack
 from lidarpose.eval.scores import Result, Setting
 from lidarpose.skeleton import HUMAN15
 
-# a row of `stack` but for the poses: somebody of whom little is known
+# a row of `stack` without poses; most fields are unknown
 PERSON = {"sequence": "s", "frame": 0, "track": "0", "time": 0.0, "sensor": "", "condition": "", "poses": ""}
 PERSON |= {"plain": False, "moving": False, "points": 100, "distance": 5.0, "hidden": np.nan, "shard": 0, "row": 0}
 
 
 def four():
-    """Four people of one track, at 5 and 15 m, of 60 and 300 points, half hidden and whole."""
+    """Four people of one track, at 5 and 15 m, with 60 and 300 points, half hidden and fully visible."""
     true = np.zeros((15, 3))
     for joint in ("hip", "shoulder"):
         true[HUMAN15.index(f"left_{joint}"), 1], true[HUMAN15.index(f"right_{joint}"), 1] = 0.2, -0.2
@@ -34,19 +34,19 @@ def four():
     return stack(HUMAN15, rows), setting
 
 
-def test_rows_by_hand():
+def test_metric_rows_match_values_by_hand():
     rows = {(x.figure, x.group, x.of): x for x in metric_rows.metric_rows(*four())}
-    # steps of 0, 20 and -20 cm: second differences of 20 and 40 cm, of four joints of who is flipped 40 aside too
+    # steps of 0, 20 and -20 cm: second differences of 20 and 40 cm; four flipped joints also move 40 cm sideways
     expected = (200 + (11 * 400 + 4 * np.hypot(400, 400)) / 15) / 2
     assert rows["acceleration", "all", "frames in a row"].value == pytest.approx(expected, rel=1e-4)
-    # one of three people of 100 points and more
+    # one of three people with 100 points or more
     assert rows["turned_round", "points", "100 and more"].value == pytest.approx(100 / 3)
     assert rows["turned_round", "points", "20 to 100"].value == 0
-    # of 50, 50, 250 mm and what a mirrored person is off: the third of four and a part of the way to the fourth
+    # of 50, 50, 250 mm and the flipped person's error: interpolated between the third and the fourth
     people = np.sort(four()[0].errors().mean(1))
     worst = rows["mpjpe_p95", "all", "all"]
     assert worst.value == pytest.approx(people[2] + 0.85 * (people[3] - people[2])) and worst.people == 4
-    # 11 of 15 joints of the flipped one are 5 cm off, as all of two others are: 41 of 60 within 10 cm
+    # 11 of 15 joints of the flipped person and all of two others are 5 cm off: 41 of 60 within 10 cm
     assert rows["calibration_error", "all", "all"].value == pytest.approx(100 * (0.75 - 41 / 60), abs=1e-3)
     spans = {group: {of: x.people for (f, g, of), x in rows.items() if (f, g) == ("mpjpe", group)}
              for group in ("distance, m", "points", "hidden share")}  # fmt: skip
@@ -55,7 +55,7 @@ def test_rows_by_hand():
     assert spans["hidden share"] == {"0 to 0.1": 3, "0.3 to 0.5": 1}
 
 
-def test_a_new_metric_is_a_function_and_an_entry(monkeypatch):
+def test_metrics_entry_adds_rows_and_changes_no_others(monkeypatch):
     def largest_error(predictions):
         return predictions.errors().max(1)
 
@@ -64,13 +64,13 @@ def test_a_new_metric_is_a_function_and_an_entry(monkeypatch):
     after = metric_rows.metric_rows(*four())
     added = {(row.group, row.of): row for row in after if row.figure == "largest_error"}
     assert [row for row in after if row.figure != "largest_error"] == list(before)
-    # hips and shoulders of the flipped one are 40 cm off along y, too
+    # hips and shoulders of the flipped person are also 40 cm off along y
     wanted = [50, 50, 250, 1e3 * np.hypot(0.4, 0.05)]
     assert added["all", "all"].value == pytest.approx(np.mean(wanted), abs=1e-3)
     assert added["distance, m", "0 to 10"].value == pytest.approx(50, abs=1e-3) and len(added) == 7
 
 
-def test_charts_draw_what_the_rows_say(monkeypatch):
+def test_charts_draw_metric_rows(monkeypatch):
     predictions, setting = four()
     rows = metric_rows.metric_rows(predictions, setting)
     result = Result(setting=setting, counts={}, skipped={}, notes=(), lines=rows)

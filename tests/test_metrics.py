@@ -15,6 +15,9 @@ from lidarpose import metrics
 from lidarpose.errors import InputError
 from lidarpose.eval.metric_rows import METRICS, SUMMARIES
 from lidarpose.geometry import axis_angle_to_matrix, similarity_align
+from lidarpose.inference.results import PersonPose, Poses
+from lidarpose.sample import Pose
+from lidarpose.skeleton import SKELETONS
 
 REFERENCE = Path(__file__).parent / "parity" / "metrics.npz"
 DISTANCES = (metrics.mpjpe, metrics.pa_mpjpe, metrics.pck)
@@ -23,7 +26,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def drawn(seed, n=3, joints=14, noise=0.1):
-    """pred, true (n, joints, 3) m, visible (n, joints): at least one joint a person."""
+    """pred, true (n, joints, 3) m, visible (n, joints), with at least one visible joint per person."""
     rng = np.random.default_rng(seed)
     true = rng.normal(size=(n, joints, 3)) * 0.4
     visible = rng.random((n, joints)) < 0.7
@@ -32,7 +35,7 @@ def drawn(seed, n=3, joints=14, noise=0.1):
 
 
 def blanked(true, visible):
-    """The truth, NaN where there is no label."""
+    """The truth, with NaN for unlabeled joints."""
     return np.where(visible[..., None], true, np.nan)
 
 
@@ -41,7 +44,7 @@ def blanked(true, visible):
 
 @quick
 @given(seeds, st.integers(1, 5), st.floats(0.2, 5), st.booleans())
-def test_pa_ignores_similarities_but_not_mirrors(seed, n, scale, masked):
+def test_pa_mpjpe_ignores_similarities_but_not_mirrors(seed, n, scale, masked):
     pred, true, visible = drawn(seed, n)
     visible[:, :3] = True
     visible = visible if masked else None
@@ -55,13 +58,13 @@ def test_pa_ignores_similarities_but_not_mirrors(seed, n, scale, masked):
 
 @quick
 @given(seeds, st.integers(1, 5), st.sampled_from(metrics.AVERAGES))
-def test_exact_predictions_order_and_missing_truth(seed, n, average):
+def test_metrics_of_exact_predictions_order_and_missing_truth(seed, n, average):
     pred, true, visible = drawn(seed, n)
     rng = np.random.default_rng(seed)
     order, people = rng.permutation(14), rng.permutation(n)
     for metric in DISTANCES:
         score = metric(pred, true, visible, average=average)
-        # the order of joints and people does not matter; a joint without a label and one without truth are the same
+        # the order of joints and people does not matter; unlabeled equals missing in the truth
         permuted = (array[people][:, order] for array in (pred, true, visible))
         for same in (metric(*permuted, average=average), metric(pred, blanked(true, visible), average=average)):
             assert same == pytest.approx(score, nan_ok=True) and same.__dict__ == score.__dict__
@@ -74,10 +77,10 @@ def test_exact_predictions_order_and_missing_truth(seed, n, average):
 
 @quick
 @given(seeds, st.integers(1, 5))
-def test_tables_against_loops(seed, n):
+def test_metric_tables_match_loops(seed, n):
     pred, true, visible = drawn(seed, n, noise=0.2)
     functions = (metrics.joint_errors, metrics.aligned_errors, metrics.joint_hits)
-    # a label needs all coordinates, not one alone
+    # a joint is labeled only if all of its coordinates are
     errors, aligned, hits = (table(pred, np.where(visible[..., None], true, [0, np.nan, 0])) for table in functions)
     for i, seen in enumerate(visible):
         plain = np.linalg.norm(pred[i] - true[i], axis=1)
@@ -94,7 +97,7 @@ def test_tables_against_loops(seed, n):
 # ---- definitions
 
 
-def test_both_averages():
+def test_metrics_average_over_people_or_joints():
     true = np.zeros((2, 4, 3))
     pred = true.copy()
     pred[0, :, 0], pred[1, :, 0] = 0.1, 0.4
@@ -104,7 +107,7 @@ def test_both_averages():
         assert metric(pred, true, visible, average="joint") == pytest.approx(of_joints)
 
 
-def test_pck_is_nearer_than_the_threshold():
+def test_pck_counts_joints_closer_than_threshold():
     true = np.zeros((1, 4, 3))
     pred = true.copy()
     pred[0, :, 2] = [0.153, 0.155, 0.256, 0.257]
@@ -114,7 +117,7 @@ def test_pck_is_nearer_than_the_threshold():
     assert metrics.pck(pred, true, threshold=0.5, torso=0.5) == 0
 
 
-def test_people_with_two_labels_are_not_aligned():
+def test_pa_mpjpe_skips_people_with_two_labels():
     pred, true, visible = drawn(3, n=4)
     visible[:] = True
     visible[2, 2:] = False
@@ -125,7 +128,7 @@ def test_people_with_two_labels_are_not_aligned():
     assert metrics.pa_mpjpe(pred, true, visible).skipped == 0
 
 
-def test_scores_of_nobody_and_scores_as_numbers():
+def test_score_of_no_people_is_nan_and_score_is_float():
     pred, true, _ = drawn(0)
     for metric, average in itertools.product(DISTANCES, metrics.AVERAGES):
         score = metric(pred, true, np.zeros((3, 14)), average=average)
@@ -137,7 +140,7 @@ def test_scores_of_nobody_and_scores_as_numbers():
     assert f"{score:.1f}" == f"{float(score):.1f}" and isinstance(score, float)
 
 
-def test_lists_single_people_and_leading_shapes():
+def test_metrics_accept_lists_single_people_and_leading_axes():
     arrays = drawn(7, n=6)
     copies = [array.copy() for array in arrays]
     score = metrics.mpjpe(*arrays)
@@ -168,7 +171,7 @@ def test_lists_single_people_and_leading_shapes():
     ],
 )
 @pytest.mark.parametrize("metric", DISTANCES)
-def test_wrong_input_gets_one_line(metric, change, message):
+def test_metrics_reject_bad_input_in_one_line(metric, change, message):
     arguments = dict(zip(("pred", "true", "visible"), drawn(0), strict=True))
     with pytest.raises(InputError, match=message) as caught:
         metric(**arguments | change)
@@ -176,7 +179,7 @@ def test_wrong_input_gets_one_line(metric, change, message):
 
 
 @pytest.mark.parametrize("name, value", [("threshold", 0), ("torso", np.nan)])
-def test_wrong_radii_get_one_line(name, value):
+def test_pck_rejects_bad_threshold_and_torso(name, value):
     with pytest.raises(InputError, match=f"{name} must be a positive number"):
         metrics.pck(*drawn(0), **{name: value})
 
@@ -184,11 +187,11 @@ def test_wrong_radii_get_one_line(name, value):
 # ---- acceleration
 
 
-def test_acceleration_of_a_known_fault():
+def test_acceleration_error_of_known_motion():
     rng = np.random.default_rng(0)
     time = np.arange(8) / 20
     true = rng.normal(size=(3, 8, 5, 3))
-    # what moves evenly costs nothing, what falls costs its acceleration
+    # uniform motion has no error, free fall that of its acceleration
     even = true + (rng.normal(size=(3, 1, 5, 3)) + time[:, None, None] * [1.0, 2, 3])
     assert metrics.acceleration_error(even, true, 20) == pytest.approx(0, abs=1e-6)
     falling = true + 0.5 * 9.81 * time[:, None, None] ** 2 * [0, 0, 1.0]
@@ -199,7 +202,7 @@ def test_acceleration_of_a_known_fault():
 
 @quick
 @given(seeds, st.sampled_from(metrics.AVERAGES))
-def test_acceleration_against_a_loop(seed, average):
+def test_acceleration_error_matches_loop(seed, average):
     rng = np.random.default_rng(seed)
     pred, true = rng.normal(size=(2, 3, 6, 4, 3))
     visible = rng.random((3, 6, 4)) < 0.8
@@ -223,7 +226,7 @@ def test_acceleration_against_a_loop(seed, average):
         ((2, 4, 5, 3), 0, "rate must be"),
     ],
 )
-def test_acceleration_needs_sequences_and_a_rate(shape, rate, message):
+def test_acceleration_error_rejects_bad_shape_and_rate(shape, rate, message):
     with pytest.raises(InputError, match=message):
         metrics.acceleration_error(np.zeros(shape), np.zeros(shape), rate)
 
@@ -232,17 +235,19 @@ def test_acceleration_needs_sequences_and_a_rate(shape, rate, message):
 
 
 def test_calibration_error_by_hand():
-    # stated 0.95, right half of the time; stated 0.15, right as often as that
+    # confidence 0.95 with 50 % hits, confidence 0.15 with 15 % hits
     confidence = np.array([0.95] * 4 + [0.15] * 20)
     hit = np.array([1, 1, 0, 0] + [1] * 3 + [0] * 17)
     assert metrics.calibration_error(confidence, hit) == pytest.approx(0.45 * 4 / 24)
     assert metrics.calibration_error([1.0, 0.0], [True, False]) == 0
+    # a confidence of 1 is in the last bin, not in the first
+    assert metrics.calibration_error([1.0, 0.05], [False, True]) == pytest.approx((1 + 0.95) / 2)
     assert np.isnan(metrics.calibration_error([], []))
 
 
 @quick
 @given(seeds)
-def test_auroc_is_the_share_of_pairs_in_order(seed):
+def test_auroc_is_share_of_ordered_pairs(seed):
     rng = np.random.default_rng(seed)
     score, hit = rng.integers(0, 6, 30), rng.random(30) < 0.5
     hit[:2] = [True, False]
@@ -265,19 +270,19 @@ def test_auroc_is_the_share_of_pairs_in_order(seed):
         (metrics.calibration_error, [0.5], [1], {"bins": 0}, "bins must be a whole number"),
     ],
 )
-def test_confidence_that_is_none_is_refused(metric, stated, hit, options, message):
+def test_confidence_metrics_reject_bad_input(metric, stated, hit, options, message):
     with pytest.raises(InputError, match=message):
         metric(stated, hit, **options)
 
 
-# ---- the released code's arithmetic, and its faults by hand-made cases: dapt_compat has them, the default does not
+# ---- arithmetic of the released code: dapt_compat reproduces its faults, the default does not have them
 
 
 @pytest.mark.parametrize("dapt_compat", [True, False])
-def test_scores_of_the_released_code(dapt_compat):
+def test_metrics_match_released_code(dapt_compat):
     with np.load(REFERENCE) as file:
         reference = dict(file)
-    # everybody has a label and the batch is large, so that faults do not show and both are one
+    # everyone is labeled and the batch is large: the faults have no effect and both agree
     pred, true, visible = reference["pred"], reference["gt"], reference["vis"]
     scores = {
         "mpjpe_vis": metrics.mpjpe(pred, true, visible, dapt_compat) / 1e3,
@@ -287,11 +292,11 @@ def test_scores_of_the_released_code(dapt_compat):
         "pck50_vis": metrics.pck(pred, true, visible, dapt_compat, threshold=0.5) / 100,
     }
     assert scores == pytest.approx({name: float(reference[name]) for name in scores}, abs=1e-6)
-    # they tell labeled joints from all, and one threshold from the other
+    # labels and thresholds make a difference
     assert abs(scores["mpjpe_vis"] - scores["mpjpe_full"]) > 1e-3 < abs(scores["pck30_vis"] - scores["pck50_vis"])
 
 
-def test_dapt_compat_counts_who_has_no_label_as_free_of_error_and_makes_pck_nan():
+def test_dapt_compat_unlabeled_people_have_zero_error_and_nan_pck():
     true = np.zeros((2, 2, 3))
     pred, visible = true + [0.1, 0, 0], [[1, 1], [0, 0]]
     assert metrics.mpjpe(pred, true, visible, dapt_compat=True) == pytest.approx(50)
@@ -306,20 +311,20 @@ def test_dapt_compat_counts_who_has_no_label_as_free_of_error_and_makes_pck_nan(
     assert ours == pytest.approx(metrics.pck(pred[others], true[others])) and ours.skipped == 1
 
 
-def test_dapt_compat_halves_the_error_of_a_pair_of_joints_labeled_at_30_percent():
+def test_by_group_with_empty_zero_halves_error_of_sparse_labels():
     rng = np.random.default_rng(0)
     true = rng.normal(size=(4000, 14, 3))
     table = metrics.joint_errors(true + [0, 0.1, 0], true, rng.random((4000, 14)) < 0.3)
     theirs, ours = metrics.by_group(table, "waymo14", empty=0.0), metrics.by_group(table, "waymo14")
     for name in ("wrists", "ankles", "head"):
-        # 1 - 0.7^2 of the people have one label or two
+        # 1 - 0.7^2 of the people have at least one label
         assert theirs[name] == pytest.approx(51, abs=3) and ours[name] == pytest.approx(100)
         assert ours[name].people + ours[name].skipped == theirs[name].people == 4000
     assert theirs["all"] > 99
 
 
 def transposed_procrustes(source, target):
-    """The reference's alignment of (D, N) columns, one person: as its equations read."""
+    """The reference's alignment of one person's (D, N) columns, following its equations."""
     s, t = source - source.mean(1, keepdims=True), target - target.mean(1, keepdims=True)
     u, d, vt = np.linalg.svd(s @ t.T)
     z = np.eye(len(u))
@@ -330,7 +335,7 @@ def transposed_procrustes(source, target):
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4, 5])
-def test_dapt_compat_alignment_turns_two_and_three_people_on_their_side(n):
+def test_dapt_compat_alignment_transposes_two_and_three_people(n):
     pred, true, _ = drawn(n, n, noise=0.05)
     turned = n in (2, 3)
     pairs = [(a, b) if turned else (a.T, b.T) for a, b in zip(pred, true, strict=True)]
@@ -340,7 +345,7 @@ def test_dapt_compat_alignment_turns_two_and_three_people_on_their_side(n):
     assert theirs < 0.4 * ours if turned else theirs == pytest.approx(ours)
 
 
-def test_dapt_compat_alignment_takes_joints_without_label():
+def test_dapt_compat_alignment_uses_unlabeled_joints():
     pred, true, visible = drawn(5, n=6)
     visible[:, :4] = [True, True, True, False]
     worse = pred.copy()
@@ -352,10 +357,10 @@ def test_dapt_compat_alignment_takes_joints_without_label():
         metrics.pa_mpjpe(pred, blanked(true, visible), dapt_compat=True)
 
 
-# ---- what is public
+# ---- public interface
 
 
-def test_the_docs_name_what_is_there_and_their_example_runs():
+def test_metrics_docs_are_complete_and_example_runs():
     assert all(hasattr(metrics, name) for name in metrics.__all__) and metrics.__all__ == sorted(metrics.__all__)
     text = (Path(__file__).parents[1] / "docs" / "evaluate.md").read_text("utf-8")
     for name in (*METRICS, *SUMMARIES):
@@ -370,7 +375,7 @@ def test_the_docs_name_what_is_there_and_their_example_runs():
     assert len(named) > 12 and named <= known, named - known
 
 
-def test_what_is_masked_does_not_count():
+def test_metrics_ignore_masked_joints():
     true = np.zeros((6, 15, 3))
     pred, mask = true + 0.01, np.zeros(true.shape, bool)
     pred[:, 0] += 5
@@ -384,18 +389,29 @@ def test_what_is_masked_does_not_count():
 
 
 @pytest.mark.parametrize("options", [{"repeats": 1.5}, {"repeats": True}, {"level": "x"}, {"level": 1.0}])
-def test_intervals_of_nonsense_are_refused(options):
+def test_interval_rejects_bad_options(options):
     with pytest.raises(InputError, match=next(iter(options))):
         metrics.interval(np.ones(9), np.random.default_rng(0), **options)
 
 
-def test_labels_of_clusters_may_be_missing():
+def test_interval_accepts_missing_cluster_labels():
     table, rng = np.arange(6.0), np.random.default_rng(0)
     some = metrics.interval(table, rng, clusters=["a", None, "b", "b", "a", None])
     assert some.units == 3
-    # numbers are drawn in the order of numbers
+    # numbers are sorted as numbers, not as text
     units = np.repeat(np.arange(12), 2)
     intervals = [
         metrics.interval(np.arange(24.0) ** 2, np.random.default_rng(0), clusters=c) for c in (units, units + 100)
     ]
     assert intervals[0] == intervals[1]
+
+
+def test_metrics_take_poses_as_predicted():
+    joints = np.random.default_rng(0).normal(size=(2, 15, 3))
+    skeleton = SKELETONS["human15"]
+    people = tuple(
+        PersonPose(pose=Pose(joints=own, skeleton=skeleton), points=np.zeros((9, 3)), skeleton=skeleton)
+        for own in joints
+    )
+    poses = Poses(people=people, skeleton=skeleton)
+    assert metrics.mpjpe(poses, joints + [0, 0, 0.01]) == pytest.approx(10)

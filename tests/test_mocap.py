@@ -1,4 +1,4 @@
-"""Files of captured motion in every format: what was written comes back on our body, and what is wrong is named."""
+"""Files of captured motion in every format: round trips on our body, and errors that name the fault."""
 
 import json
 import pickle
@@ -24,12 +24,12 @@ AMC = files.amc_text(ROTATIONS, WAY, AXES)
 
 
 def errors(motion, joints=JOINTS):
-    """Distances (F, 24) m of the joints from where they went in."""
+    """Distances (F, 24) m of the joints from the written ones."""
     return np.linalg.norm(files.joints_of(motion.rotations, motion.translation) - joints, axis=-1)
 
 
 def check_same(motion, rotations, way):
-    """The joints come out where they went in, within 1 mm."""
+    """The joints equal the written ones within 1 mm."""
     assert motion.rotations.dtype == motion.translation.dtype == np.float32
     assert errors(motion, files.joints_of(rotations, way)).max() < 1e-3
 
@@ -46,18 +46,18 @@ def refused(path, message, named=None, **options):
     assert re.search(rf"{named or re.escape(path.name)}: ", str(caught.value)) and "\n" not in str(caught.value)
 
 
-# BVH, ASF and AMC: positions to less than 0.1 mm, on our body within what retargeting by positions costs
+# BVH, ASF and AMC: positions within 0.1 mm, on our body within the error of retargeting by positions
 
 
 @pytest.mark.parametrize("skeleton", files.NAMES)
-def test_a_bvh_of_any_names_comes_back(tmp_path, skeleton):
+def test_load_motion_bvh_with_any_joint_names(tmp_path, skeleton):
     motion = load_motion(written(tmp_path, files.bvh_text(ROTATIONS, WAY, names=files.NAMES[skeleton])))
     assert motion.names == ("a",) and motion.fps == pytest.approx(30) and motion.dropped == 0
     assert errors(motion)[:, MAIN].mean() < 0.010 and errors(motion).max() < 0.05
 
 
 @pytest.mark.parametrize("order", ["ZXY", "XYZ", "YXZ", "ZYX", "YZX", "XZY"])
-def test_a_bvh_has_its_joints_where_they_were(tmp_path, order):
+def test_read_bvh_positions_for_any_channel_order(tmp_path, order):
     """The tree's own positions, in centimeters and y up, without retargeting."""
     tree, values, rate = skeleton_files.read_bvh(written(tmp_path, files.bvh_text(ROTATIONS, WAY, order=order)))
     assert rate == pytest.approx(30)
@@ -66,20 +66,20 @@ def test_a_bvh_has_its_joints_where_they_were(tmp_path, order):
 
 
 @pytest.mark.parametrize("unit, up", [(1.0, "y"), (0.01, "z"), (0.0254, "y"), (0.001, "x"), (0.0254 / 0.45, "y")])
-def test_units_and_up_are_found(tmp_path, unit, up):
+def test_load_motion_detects_unit_and_up_axis(tmp_path, unit, up):
     path = written(tmp_path, files.bvh_text(ROTATIONS, WAY, names=files.CMU_NAMES, unit=unit, up=up))
     for motion in (load_motion(path), load_motion(path, up=up)):
         assert errors(motion)[:, MAIN].mean() < 0.010
 
 
-def test_children_and_tall_people_keep_their_unit():
+def test_meters_per_unit_of_children_and_tall_people():
     for size in (0.62, 0.8, 1.0, 1.2):
         for name, meters in retarget.UNITS.items():
             assert retarget.meters_per_unit("x", JOINTS[:1] * size / meters) == meters, (size, name)
 
 
-def test_skeletons_with_less(tmp_path):
-    """Without hands, feet, collars' own place and spine joints; what is estimated is plausible."""
+def test_load_motion_skeletons_with_missing_joints(tmp_path):
+    """Without hands, feet, collars and spine joints; estimated joints are plausible."""
     feet = ("left_foot", "right_foot")
     text = files.bvh_text(ROTATIONS, WAY, names=files.CMU_NAMES, drop=("left_hand", "right_hand", *feet))
     error = errors(load_motion(written(tmp_path, text)))
@@ -98,7 +98,7 @@ def test_skeletons_with_less(tmp_path):
 
 
 @pytest.mark.parametrize("length", [0.45, 1.0])
-def test_an_amc_comes_back(tmp_path, length):
+def test_load_motion_amc_round_trip(tmp_path, length):
     skeleton, axes = files.asf_text(length=length)
     written(tmp_path, skeleton, "02.asf")
     path = written(tmp_path, files.amc_text(ROTATIONS, WAY, axes, length=length), "02_05.amc")
@@ -114,7 +114,7 @@ def test_an_amc_comes_back(tmp_path, length):
     assert error[:, MAIN].mean() < 0.05 and error[:, [J["left_ankle"], J["right_ankle"]]].mean() < 0.02
 
 
-def test_where_the_skeleton_of_an_amc_is_found(tmp_path):
+def test_load_motion_amc_finds_its_asf(tmp_path):
     path = written(tmp_path, AMC, "02_05.amc")
     refused(path, "put 02.asf or 02_05.asf beside it")
     written(tmp_path, ASF, "any.ASF")
@@ -164,11 +164,11 @@ ROW = BVH.splitlines()[-1]
         (files.bvh_text(ROTATIONS, WAY * 1e9), "100 km|m/s"),
     ],
 )  # fmt: skip
-def test_a_wrong_bvh_is_named(tmp_path, text, message):
+def test_load_motion_reports_bad_bvh(tmp_path, text, message):
     refused(written(tmp_path, text), message)
 
 
-def test_mixed_units_upside_down_and_no_rate(tmp_path):
+def test_load_motion_bvh_mixed_units_upside_down_and_no_rate(tmp_path):
     lines = BVH.splitlines()
     at = next(i for i, line in enumerate(lines) if "LeftLeg" in line)
     lines[at + 2] = re.sub(r"(-?[\d.]+)", lambda m: str(float(m[0]) * 100), lines[at + 2])
@@ -181,7 +181,7 @@ def test_mixed_units_upside_down_and_no_rate(tmp_path):
     assert load_motion(written(tmp_path, re.sub("Frame Time: .*", "Frame Time: 0", BVH)), fps=25).fps == 25
 
 
-def test_bad_frames_of_a_bvh_are_left_out(tmp_path):
+def test_load_motion_drops_bad_frames_of_bvh(tmp_path):
     lines = BVH.splitlines()
     lines[-6] = "nan " + lines[-6].partition(" ")[2]
     lines[-3] = lines[-3].rpartition(" ")[0] + " 1e999"
@@ -216,12 +216,12 @@ def test_bad_frames_of_a_bvh_are_left_out(tmp_path):
         (re.sub(r"     length (\S+)", "     length 1e300", ASF), AMC, "expected finite joint positions"),
     ],
 )  # fmt: skip
-def test_a_wrong_amc_or_asf_is_named(tmp_path, asf, amc, message):
+def test_load_motion_reports_bad_amc_or_asf(tmp_path, asf, amc, message):
     written(tmp_path, asf, "s.asf")
     refused(written(tmp_path, amc, "s_1.amc"), message, named=r"s(_1\.amc|\.asf)")
 
 
-# whatever stands in a file, an InputError is all that comes
+# damaged files raise only InputError
 
 SHORT = files.bvh_text(ROTATIONS[:2], WAY[:2], names=files.CMU_NAMES)
 SHORT_AMC = files.amc_text(ROTATIONS[:2], WAY[:2], AXES)
@@ -237,7 +237,7 @@ ODD = st.sampled_from(
     odd=st.lists(st.tuples(st.floats(0, 1), ODD), max_size=4),
     cut=st.one_of(st.just(1.1), st.floats(0, 1)),
 )
-def test_a_damaged_text_file_never_crashes(tmp_path, which, odd, cut):
+def test_load_motion_of_damaged_text_raises_only_input_error(tmp_path, which, odd, cut):
     texts = {"a.bvh": SHORT, "s.asf": ASF, "s_1.amc": SHORT_AMC}
     words = re.split(r"(\s+)", texts[which])
     for place, word in odd:
@@ -255,18 +255,18 @@ def test_a_damaged_text_file_never_crashes(tmp_path, which, odd, cut):
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.binary(max_size=200), suffix=st.sampled_from([".bvh", ".amc", ".json", ".npz"]))
-def test_any_bytes_are_an_input_error(tmp_path, data, suffix):
+def test_load_motion_of_random_bytes_raises_input_error(tmp_path, data, suffix):
     for name in ("a.asf", f"a{suffix}"):
         (tmp_path / name).write_bytes(data)
     with pytest.raises(InputError):
         load_motion(tmp_path / f"a{suffix}")
 
 
-# formats of SMPL's rotations, which keep every turn
+# formats with SMPL's rotations, which are kept
 
 
 @pytest.mark.parametrize("width, rate", [(156, "mocap_framerate"), (165, "mocap_frame_rate"), (72, "fps"), (66, "fps")])
-def test_amass_comes_back(tmp_path, width, rate):
+def test_load_motion_amass_round_trip(tmp_path, width, rate):
     rotations, way = files.a_clip()
     if width != 72:
         rotations[:, [J["left_hand"], J["right_hand"]]] = np.eye(3)
@@ -276,7 +276,7 @@ def test_amass_comes_back(tmp_path, width, rate):
     assert motion.source.startswith("AMASS: ")
 
 
-def test_amass_in_parts_and_of_another_up(tmp_path):
+def test_load_motion_amass_in_parts_and_other_up_axis(tmp_path):
     rotations, way = files.a_clip(5)
     pose, path = files.to_smpl(rotations, "y"), tmp_path / "a_stageii.npz"
     rate = np.array(120.0)
@@ -285,14 +285,14 @@ def test_amass_in_parts_and_of_another_up(tmp_path):
     check_same(load_motion(path, up="y"), rotations, way)
     assert load_motion(path, up="y", fps=30).fps == 30
     assert load_motion(path, up="y", hz=60).rotations.shape[0] == 3
-    # people may lie where up is given
+    # people may lie down if up is given
     rotations[:, 0] = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], float) @ rotations[:, 0]
     path = files.write_amass(tmp_path / "lies_poses.npz", rotations, way)
     refused(path, "people stand along")
     check_same(load_motion(path, up="z"), rotations, way)
 
 
-def test_frames_that_are_not_finite_end_a_clip(tmp_path):
+def test_load_motion_splits_clips_at_nonfinite_frames(tmp_path):
     path = files.write_amass(tmp_path / "a.npz", ROTATIONS, WAY)
     content = dict(np.load(path))
     content["poses"][7, 3] = np.nan
@@ -322,12 +322,12 @@ def test_frames_that_are_not_finite_end_a_clip(tmp_path):
         ({"drop": ("poses",), "root_orient": np.zeros((4, 3)), "pose_body": np.zeros(())}, "pose_body"),
     ],
 )  # fmt: skip
-def test_a_wrong_amass_file_is_named(tmp_path, changes, message):
+def test_load_motion_reports_bad_amass(tmp_path, changes, message):
     refused(files.write_amass(tmp_path / "wrong.npz", *files.a_clip(4), **changes), message)
 
 
 @pytest.mark.parametrize("up", ["z", "y"])
-def test_lidarhuman26m_comes_back(tmp_path, up):
+def test_load_motion_lidarhuman26m_round_trip(tmp_path, up):
     rotations, way = files.a_clip(12)
     folder = files.write_pose_json(tmp_path / "labels/3d/pose/24", rotations, way, up=up, first=5)
     (folder / "notes.json").write_text("[]")
@@ -349,7 +349,7 @@ def test_lidarhuman26m_comes_back(tmp_path, up):
             ([1, 2], [1, 2, 3]), ("x", [1, 2, 3]), ([0] * 72, [1, {}, 3]), ([10**400] * 72, [0] * 3))),
     ],
 )  # fmt: skip
-def test_a_wrong_pose_file_is_named(tmp_path, content, message):
+def test_load_motion_reports_bad_pose_json(tmp_path, content, message):
     folder = files.write_pose_json(tmp_path / "7", *files.a_clip(3))
     (folder / "000002.json").write_text(content)
     for path in (folder, folder / "000002.json"):
@@ -369,7 +369,7 @@ def write_labels(folder, content):
     return path
 
 
-def test_sloper4d_comes_back(tmp_path):
+def test_load_motion_sloper4d_round_trip(tmp_path):
     rotations, way = files.a_clip()
     motion = load_motion(write_labels(tmp_path, labels(rotations, way)))
     check_same(motion, rotations, way)
@@ -385,7 +385,7 @@ def test_sloper4d_comes_back(tmp_path):
 
 
 class Counter(dict):
-    """A class that no label file needs."""
+    """A class that does not occur in label files."""
 
 
 @pytest.mark.parametrize(
@@ -401,14 +401,14 @@ class Counter(dict):
         (lambda c: c | {"extra": Counter()}, "Counter"),
     ],
 )
-def test_wrong_labels_are_named(tmp_path, change, message):
+def test_load_motion_reports_bad_sloper4d(tmp_path, change, message):
     refused(write_labels(tmp_path, change(labels(*files.a_clip(3)))), message)
 
 
-# clips of positions, folders, and what is no motion
+# clips of positions, folders, and files without motion
 
 
-def test_own_clips_are_retargeted(tmp_path):
+def test_load_motion_retargets_clips_of_positions(tmp_path):
     rotations, way = files.a_clip(40)
     joints, path = files.joints_of(rotations, way), tmp_path / "clips.npz"
     content = dict(
@@ -433,7 +433,7 @@ def test_own_clips_are_retargeted(tmp_path):
     refused(path, "10 of 25 frames")
 
 
-def test_a_folder_of_everything(tmp_path):
+def test_load_motion_reads_folder_of_all_formats(tmp_path):
     rotations, way = files.a_clip(13)
     files.write_amass(tmp_path / "b_poses.npz", rotations, way, fps=60)
     (tmp_path / "02").mkdir()
@@ -451,7 +451,7 @@ def test_a_folder_of_everything(tmp_path):
     assert tuple(load_motion(tmp_path, hz=20).length) == (3, 3, 5, 25, 13)
 
 
-def test_a_recording_is_told_from_another_by_what_it_holds(tmp_path):
+def test_digest_depends_on_content_of_motion(tmp_path):
     first, second = tmp_path / "first", tmp_path / "second"
     for folder in (first, second):
         (folder / "02").mkdir(parents=True)
@@ -467,7 +467,7 @@ def test_a_recording_is_told_from_another_by_what_it_holds(tmp_path):
         digest(tmp_path / "none.npz")
 
 
-def test_what_is_no_motion_at_all(tmp_path):
+def test_load_motion_rejects_other_files_and_bad_options(tmp_path):
     for name, content, message in (
         ("a.npz", b"", "is empty"),
         ("b.npz", b"hello", "plain arrays"),

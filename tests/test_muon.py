@@ -1,4 +1,4 @@
-"""Matrices stepped together against torch's one by one."""
+"""The Muon optimizer, which updates matrices in batches, compared with torch's."""
 
 import pytest
 import torch
@@ -9,7 +9,7 @@ SHAPES = [(6, 6), (6, 6), (12, 6), (6, 12), (6, 12), (3, 6)]
 
 
 def learned(optimizer_of, steps=6):
-    """A few matrices after steps along gradients that depend on them."""
+    """A few matrices after some steps of an optimizer."""
     torch.manual_seed(0)
     matrices = [torch.nn.Parameter(torch.randn(shape)) for shape in SHAPES]
     target = [torch.randn(shape) for shape in SHAPES]
@@ -22,23 +22,23 @@ def learned(optimizer_of, steps=6):
 
 
 @pytest.mark.parametrize("settings", [{"lr": 0.02}, {"lr": 0.1, "weight_decay": 0.3, "momentum": 0.8}])
-def test_the_steps_are_torch_s(settings):
+def test_muon_matches_torch(settings):
     ours = learned(lambda matrices: Muon(matrices, **settings))
     theirs = learned(lambda matrices: torch.optim.Muon(matrices, **settings))
-    # theirs iterates in bfloat16, which is right to three digits
+    # torch iterates in bfloat16, which is accurate to three digits
     for a, b, shape in zip(ours, theirs, SHAPES, strict=True):
         torch.testing.assert_close(a, b, atol=0.02 * settings["lr"] * 6, rtol=0, msg=str(shape))
 
 
 @pytest.mark.parametrize("shape", [(5, 8, 8), (2, 4, 9), (2, 9, 4), (1, 1, 7)])
-def test_singular_values_come_near_one(shape):
+def test_orthogonalized_singular_values_are_near_one(shape):
     torch.manual_seed(1)
     values = torch.linalg.svdvals(orthogonalized(torch.randn(shape)))
     assert (values > 0.5).all() and (values < 1.3).all()
     assert torch.isfinite(orthogonalized(torch.zeros(shape))).all()
 
 
-def test_what_has_no_gradient_stays():
+def test_muon_skips_parameters_without_gradient():
     still, moved = torch.nn.Parameter(torch.ones(3, 3)), torch.nn.Parameter(torch.ones(3, 3))
     optimizer = Muon([still, moved], lr=0.1)
     moved.grad = torch.randn(3, 3)
@@ -46,6 +46,6 @@ def test_what_has_no_gradient_stays():
     assert (still == 1).all() and (moved != 1).any()
 
 
-def test_only_matrices():
+def test_muon_rejects_vectors():
     with pytest.raises(ValueError, match="matrices, got a parameter of shape"):
         Muon([torch.nn.Parameter(torch.ones(3))], lr=0.1)

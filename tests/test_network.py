@@ -1,4 +1,4 @@
-"""The network as a function of one person, its heads, and the frames in which it is trained."""
+"""PoseNet: invariances, layers and heads, heatmaps, and its training examples."""
 
 from dataclasses import replace
 from functools import cache
@@ -16,8 +16,11 @@ from lidarpose.models.decode import HALF_WIDTH
 from lidarpose.models.decode import window as window_mean
 from lidarpose.models.layers import (
     REACH,
+    WAVELENGTHS,
     Convolution,
     CrossAttention,
+    JointHead,
+    PersonHead,
     RotaryEmbedding,
     VoteHead,
     attend,
@@ -61,7 +64,7 @@ def batch_of(clouds, max_voxels=TINY.max_voxels, known=True, neighbors=True):
 
 
 def random_network(config):
-    """Random weights everywhere: fresh layers of zeros would hide what they read."""
+    """Random weights everywhere: layers initialized to zero would hide their inputs."""
     torch.manual_seed(0)
     made = PoseNet(config)
     with torch.no_grad():
@@ -92,8 +95,8 @@ def assert_close(a, b, atol=1e-5):
 
 
 @pytest.mark.parametrize("n", [1, 2, 17, 300])
-def test_neither_batch_mates_nor_padding_nor_the_order_of_points_matter(n):
-    # the view of person k depends on k: the one under test stays number 0
+def test_posenet_is_invariant_to_batch_padding_and_point_order(n):
+    # the view of person k depends on k: the person under test stays number 0
     cloud = person(n, 1)
     alone = run([cloud])
     among = run([np.random.default_rng(0).permutation(cloud), person(3000, 2), person(5, 3), person(0)])
@@ -102,7 +105,7 @@ def test_neither_batch_mates_nor_padding_nor_the_order_of_points_matter(n):
     torch.testing.assert_close(alone.part[0], among.part[0, :width], atol=1e-5, rtol=1e-5)
 
 
-def test_the_result_depends_on_points_density_and_view():
+def test_posenet_depends_on_points_density_and_view():
     cloud = person(300, 5)
     base = of_person(run([cloud]), 0)[1]
     moved = cloud + np.float32(0.2) * (np.arange(300) < 30)[:, None]
@@ -111,14 +114,14 @@ def test_the_result_depends_on_points_density_and_view():
 
 
 @pytest.mark.parametrize("clouds", [[0], [0, 0], [0, 40, 0]])
-def test_people_without_points_give_finite_numbers(clouds):
+def test_posenet_is_finite_for_people_without_points(clouds):
     out = run([person(n) for n in clouds])
     for value in (out.joints(), out.heatmap, out.part, *of_person(out, 0)):
         assert torch.isfinite(value).all()
 
 
 @pytest.mark.parametrize("n", [1, 2, 5000])
-def test_gradients_are_finite(n):
+def test_posenet_gradients_are_finite(n):
     model = PoseNet(TINY)
     batch = batch_of([person(n)])
     part = torch.where(batch.fine.valid, torch.tensor(3), torch.tensor(-1))
@@ -129,7 +132,7 @@ def test_gradients_are_finite(n):
         assert parameter.grad is not None and torch.isfinite(parameter.grad).all(), name
 
 
-def test_size_and_shapes():
+def test_posenet_tiny_parameters_and_shapes():
     assert sum(p.numel() for p in network().parameters()) == TINY_PARAMETERS
     # a full cube of 8 x 8 x 8 fine voxels: 512, thinned to 384, in 64 and in 8
     axis = (np.arange(8) + 0.5) * TINY.grid
@@ -165,33 +168,33 @@ SMALL_ONE = {"size": "x", "channels": [4, 8, 8], "head_channels": 8, "blocks": [
         ({"person": 1}, "person must be true or false, got 1"),
     ],
 )
-def test_configurations_that_cannot_be(change, message):
+def test_network_config_rejects_invalid_values(change, message):
     with pytest.raises(InputError, match=message):
         NetworkConfig(**SMALL_ONE | change)
     assert NetworkConfig(**SMALL_ONE).blocks == (1, 0, 1)
-    # false in files of before it was a number
+    # older files have false instead of a number
     assert NetworkConfig(**SMALL_ONE | {"convolution": False}).convolution == 0
     with pytest.raises(InputError, match="unknown network size 'huge'.*tiny"):
         preset("huge")
 
 
 @pytest.mark.parametrize("size, parameters", [("tiny", TINY_PARAMETERS), ("small", 1_452_054), ("base", 5_509_087)])
-def test_sizes(size, parameters):
+def test_posenet_sizes(size, parameters):
     config = preset(size)
     assert NetworkConfig(**config.to_dict()) == config
     network = PoseNet(config)
     assert sum(p.numel() for p in network.parameters()) == parameters
     out = network(batch_of([person(50)]))
     assert out.joints().shape == (1, 26, 3) and torch.isfinite(out.joints()).all()
-    # an untrained network puts joints among the points
+    # an untrained network predicts joints among the points
     cloud = person(500, 6) + np.array([0.4, -0.3, 0.2], np.float32)
     vote = network(batch_of([cloud])).vote[0].detach().numpy()
     assert (vote > cloud.min(0)).all() and (vote < cloud.max(0)).all()
 
 
 @pytest.mark.parametrize("change", [{"heatmap": "full"}, {"heatmap": "none"}, {"convolution": 0}])
-def test_variants(change):
-    """The paper's full-range heatmaps, votes alone, no convolutions: each learns, whoever is in the batch."""
+def test_posenet_variants_train_all_parameters(change):
+    """The paper's full-range heatmaps, votes alone, no convolutions: all have gradients and ignore the batch."""
     config = replace(TINY, **change)
     made, clouds = random_network(config), [person(80, 1), person(700, 2)]
     out, alone = (made(batch_of(chosen, neighbors=config.convolution > 0)) for chosen in (clouds, clouds[:1]))
@@ -210,7 +213,7 @@ def test_variants(change):
         assert parameter.grad.abs().max() > 0, name
 
 
-def test_a_convolution_is_a_dense_one_on_a_full_grid():
+def test_convolution_matches_dense_conv3d_on_full_grid():
     torch.manual_seed(0)
     layer = Convolution(5, 3)
     axis = np.arange(8) * 0.06 + 0.03
@@ -224,8 +227,8 @@ def test_a_convolution_is_a_dense_one_on_a_full_grid():
 
 
 @pytest.mark.parametrize("mask", [None, "bool", "bias"])
-def test_attention_in_half_precision_is_that_in_single(mask):
-    """On a CPU it is the very same, gradients too, of inputs that bfloat16 can hold."""
+def test_attend_in_bfloat16_matches_float32(mask):
+    """On a CPU it is equal for inputs that bfloat16 represents, gradients within rounding."""
     torch.manual_seed(0)
     inputs = [torch.randn(2, 3, 5, 8).bfloat16().float().requires_grad_() for _ in range(3)]
     valid = torch.arange(5)[None] < torch.tensor([[3], [5]])
@@ -239,12 +242,12 @@ def test_attention_in_half_precision_is_that_in_single(mask):
         assert mixed.dtype == torch.float32
         torch.testing.assert_close(mixed, weight @ inputs[2])
         found[half] = torch.autograd.grad(mixed.square().sum(), inputs)
-    # the gradients come back through a cast
+    # the gradients pass a cast
     torch.testing.assert_close(found[True], found[False], atol=2e-2, rtol=1e-2)
 
 
-def test_attention_sees_distances_not_places():
-    """Two vectors turned by their places have a product that only their difference in meters decides."""
+def test_rotary_embedding_depends_on_relative_position():
+    """The product of two rotated vectors depends only on the difference of their positions in meters."""
     torch.manual_seed(0)
     here, there = torch.randn(1, 1, 3), torch.randn(1, 1, 3)
     query, key = torch.randn(2, 1, 1, 3, 20)
@@ -258,8 +261,14 @@ def test_attention_sees_distances_not_places():
     torch.testing.assert_close(product(here, here), (query * key).sum(-1), atol=1e-5, rtol=1e-5)
 
 
-def test_an_anchor_reads_the_mean_of_the_voxels_values():
-    """The twin: one query, one head and one voxel at a time."""
+def test_head_frequencies_cycle_through_wavelengths():
+    waves = 2 * np.pi / head_frequencies(5, 24).numpy()
+    assert waves.shape == (5, 1, 4)
+    np.testing.assert_allclose(waves.ravel(), [WAVELENGTHS[k % len(WAVELENGTHS)] for k in range(20)], rtol=1e-6)
+
+
+def test_cross_attention_matches_loop():
+    """The loop takes one query, one head and one voxel at a time."""
     torch.manual_seed(0)
     layer = CrossAttention(14, 2, 5)
     anchors, believed = torch.randn(1, 3, 14), torch.randn(1, 3, 3)
@@ -284,8 +293,8 @@ def test_an_anchor_reads_the_mean_of_the_voxels_values():
         torch.testing.assert_close(read[0, j], layer.out(torch.cat(mixed)), atol=1e-5, rtol=1e-4)
 
 
-def test_a_vote_is_what_each_voxel_says():
-    """The twin: every voxel's own position and offset, then their weighted mean."""
+def test_vote_head_matches_loop():
+    """The loop takes the weighted mean of every voxel's position and offset."""
     torch.manual_seed(0)
     head = VoteHead(6, 5, 4)
     with torch.no_grad():
@@ -304,24 +313,44 @@ def test_a_vote_is_what_each_voxel_says():
             torch.testing.assert_close(felt[b, j], weight @ voxels[b, :n], atol=1e-5, rtol=1e-4)
 
 
+def test_joint_head_uses_vote_without_gradient():
+    torch.manual_seed(0)
+    head, anchors, voxels = JointHead(32, 20, 24), torch.randn(2, 5, 32), torch.randn(2, 5, 20)
+    vote = torch.randn(2, 5, 3, requires_grad=True)
+    for value, other in zip(head(anchors, voxels, vote), head(anchors, voxels, vote + 1), strict=True):
+        assert torch.autograd.grad(value.sum(), vote, retain_graph=True, allow_unused=True) == (None,)
+        assert (value - other).abs().max() > 1e-3
+
+
+def test_person_head_ignores_padding_and_has_no_input_gradient():
+    torch.manual_seed(0)
+    head, anchors, voxels = PersonHead(32, 20, 5), torch.randn(2, 5, 32, requires_grad=True), torch.randn(2, 7, 20)
+    certainty, valid = [torch.randn(2, 5) for _ in range(3)], torch.arange(7) < torch.tensor([[4], [7]])
+    logits = head(anchors, voxels, valid, certainty)
+    torch.testing.assert_close(head(anchors, voxels[:, :4], valid[:, :4], certainty)[0], logits[0])
+    assert torch.autograd.grad(logits.sum(), anchors, allow_unused=True) == (None,)
+
+
 # --- heatmaps
 
-# the target is 1.2 bins wide: so far inside the window its flank is not cut
+# the target is 1.2 bins wide and not cut at this distance from the window's edge
 CLEAR = WINDOW - (HALF_WIDTH + 1) * BIN
 
 
 @settings(max_examples=80, deadline=None)
 @given(st.lists(st.floats(-CLEAR, CLEAR), min_size=1, max_size=9))
-def test_a_clean_heatmap_decodes_to_a_tenth_of_a_bin_and_mirrors(offsets):
+def test_decode_is_within_tenth_of_bin_and_symmetric(offsets):
     offset = torch.tensor(offsets)
     heatmap = encode(offset, SIGMA, BINS)
     torch.testing.assert_close(heatmap.sum(-1), torch.ones(len(offsets)))
     assert (decode(heatmap.log()) - offset).abs().max() < 0.1 * BIN
     torch.testing.assert_close(heatmap, encode(-offset, SIGMA, BINS).flip(-1), atol=1e-6, rtol=1e-5)
+    variance = (heatmap * (bin_centers(BINS) - offset[:, None]) ** 2).sum(-1)
+    torch.testing.assert_close(variance.sqrt(), torch.full_like(variance, SIGMA), atol=0, rtol=0.02)
     torch.testing.assert_close(bin_centers(BINS), -bin_centers(BINS).flip(-1), atol=1e-6, rtol=0)
 
 
-def test_at_the_window_s_edge_the_decoded_offset_stays_inside_and_in_order():
+def test_decode_at_window_edge_stays_inside():
     offset = torch.linspace(-WINDOW, WINDOW, 200)
     decoded = decode(encode(offset, SIGMA, BINS).log())
     assert (decoded.abs() < WINDOW).all() and (decoded - offset).abs().max() < 1.2 * BIN
@@ -329,7 +358,7 @@ def test_at_the_window_s_edge_the_decoded_offset_stays_inside_and_in_order():
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0.1, 8), st.integers(1, BINS))
-def test_decoding_against_its_twin_in_numpy(seed, sharp, bins):
+def test_decode_matches_numpy_window(seed, sharp, bins):
     logits = np.random.default_rng(seed).normal(0, sharp, (2, 3, bins))
     twin = window_mean(logits, low=(0.5 - bins / 2) * BIN, step=BIN)
     torch.testing.assert_close(decode(torch.tensor(logits)), torch.tensor(twin), atol=1e-5, rtol=0, check_dtype=False)
@@ -344,18 +373,21 @@ def people(count=12):
     return tuple(maker.person(3, index) for index in range(count))
 
 
-def test_points_and_joints_move_together():
+def test_example_moves_points_and_joints_together():
     kinds = set()
     for k, known in enumerate(people()):
         shown, sample = example(known.sample, np.random.default_rng(k)), known.sample
-        # between a joint and a point lies what lies between them in the sensor's frame
+        # offsets between joints and points are those in the sensor's frame
         offsets = sample.points[0] - sample.pose.joints
         np.testing.assert_allclose(shown.points[0] - shown.joints, offsets, atol=1e-5)
         np.testing.assert_array_equal(shown.part, sample.part)
+        # clutter near a joint does not make it visible
+        body = sample.points[sample.part > 0]
+        np.testing.assert_array_equal(shown.visible, visible_joints(sample.pose.joints, body))
         assert np.abs(np.median(shown.points, axis=0)).max() < 1.0
         kinds.add(bool(shown.view[4]))
         if shown.view[4]:
-            # the person's frame has the sensor's axes, and the view leads back to the sensor
+            # the person's frame has the sensor's axes, and the view gives the sensor's position
             sensor = shown.view[:3] * np.exp(shown.view[3])
             np.testing.assert_allclose(shown.joints - sensor, sample.pose.joints, atol=1e-3)
         else:
@@ -364,8 +396,8 @@ def test_points_and_joints_move_together():
 
 
 @pytest.mark.parametrize("yaw", [0.3, np.pi / 2, -2.5])
-def test_a_turned_person_is_the_turned_example(yaw):
-    """Targets turn with the points and with the view: only the error of the pelvis' guess stays as it was drawn."""
+def test_example_of_rotated_person_is_rotated(yaw):
+    """Targets rotate with points and view; only the drawn error of the pelvis estimate does not."""
     for k, known in enumerate(people()):
         sample, rotation = known.sample, rotation_about("z", yaw)
         other = replace(
@@ -384,7 +416,7 @@ def test_a_turned_person_is_the_turned_example(yaw):
         np.testing.assert_allclose(sensor_b, sensor_a @ rotation.T + shift * a.view[4], atol=1e-4)
 
 
-def test_a_joint_is_seen_where_points_lie_near_it():
+def test_visible_joints_have_points_within_radius():
     joints = np.array([[0.0, 0, 0], [1.0, 0, 0], [0.0, 0, 2.0]])
     points = np.array([[0.1, 0.1, 0.0], [1.0, 0.17, 0.0], [0.0, 0.0, 1.8]])
     np.testing.assert_array_equal(visible_joints(joints, points), [True, True, False])
@@ -396,7 +428,7 @@ def test_a_joint_is_seen_where_points_lie_near_it():
         np.testing.assert_array_equal(visible_joints(sample.pose.joints, body.astype(float)), nearest < VISIBLE_RADIUS)
 
 
-def test_collated_targets_are_the_examples_and_the_majority_of_parts():
+def test_collate_keeps_targets_and_takes_majority_of_parts():
     shown = [example(known.sample, np.random.default_rng(k)) for k, known in enumerate(people())]
     arrays = PoseNetObjective(config=TINY).collate(shown)
     assert arrays["fine.valid"].shape[1] <= MAX_VOXELS and "point_voxel" not in arrays
@@ -415,7 +447,7 @@ def test_collated_targets_are_the_examples_and_the_majority_of_parts():
 
 
 @pytest.mark.slow
-def test_eight_people_can_be_learned_by_heart():
+def test_posenet_overfits_eight_people():
     torch.manual_seed(0)
     maker = Generator(scene=SCENES["wild"], measure=False)
     rng = np.random.default_rng(0)
@@ -435,8 +467,8 @@ def test_eight_people_can_be_learned_by_heart():
     assert terms["mpjpe"] < 0.01
 
 
-def test_whether_somebody_is_there_is_learned_and_costs_the_joints_nothing():
-    """The head's own loss reaches nothing but the head, and what is not known teaches nothing."""
+def test_person_loss_trains_only_person_head():
+    """The loss has gradients only in the person head, and unknown labels have no loss."""
     model = random_network(replace(TINY, person=True))
     batch = batch_of([person(40), person(90, seed=1)])
     part = torch.where(batch.fine.valid, torch.tensor(3), torch.tensor(-1))

@@ -1,4 +1,4 @@
-"""What goes wrong with points, laser grids and boxes: pure functions with known statistics."""
+"""Noise of points, laser grids and boxes: determinism and statistics."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ def calls(n):
 
 
 @pytest.mark.parametrize("name", calls(1)[1])
-def test_inputs_stay_as_they_are_and_the_generator_decides(name):
+def test_noise_functions_keep_input_and_are_deterministic(name):
     arrays, functions = calls(200)
     before = [array.copy() for array in arrays]
     first, again, other = (functions[name](RNG(seed)) for seed in (1, 1, 2))
@@ -48,7 +48,7 @@ def test_inputs_stay_as_they_are_and_the_generator_decides(name):
         np.testing.assert_array_equal(array, copy)
     np.testing.assert_array_equal(first, again)
     assert first.shape != other.shape or (first != other).any()
-    # no points are legal
+    # empty input is allowed
     if "clusters" not in name:
         assert len(calls(0)[1][name](RNG(0))) == 0
 
@@ -61,7 +61,7 @@ def test_noise_clusters_are_one_or_two_small_blobs(most):
         sizes.append(len(clutter))
         assert clutter.shape[1:] == (3,) and len(clutter) <= 2 * most
         assert (np.abs(clutter - center) <= np.array([0.4, 0.4, 0.8]) + 0.3).all()
-        # the first point's blob is within its diameter, whatever is left is the other blob
+        # the blob of the first point is within its diameter; all other points belong to the second blob
         left = clutter
         for _ in range(2):
             left = left[np.linalg.norm(left - left[:1], axis=1) > 0.6]
@@ -72,7 +72,7 @@ def test_noise_clusters_are_one_or_two_small_blobs(most):
 
 @settings(max_examples=60, deadline=None)
 @given(seeds, st.lists(st.integers(0, 24), max_size=60))
-def test_part_removal_takes_exactly_one_part_that_is_there(seed, part):
+def test_part_removal_removes_exactly_one_present_part(seed, part):
     part = np.array(part, np.uint8)
     keep = noise.part_removal(part, rng=RNG(seed))
     assert keep.dtype == bool and keep.shape == part.shape
@@ -80,13 +80,13 @@ def test_part_removal_takes_exactly_one_part_that_is_there(seed, part):
     assert len(gone) == part.any() and 0 not in gone and not set(part[keep]) & gone
 
 
-def test_parts_go_alike_not_points_alike():
+def test_part_removal_draws_uniformly_over_parts():
     part, rng = np.array([0, 3, 3, 3, 7, 24], np.uint8), RNG(7)
     first = [int(part[~noise.part_removal(part, rng=rng)][0]) for _ in range(300)]
     assert sorted(set(first)) == [3, 7, 24] and first.count(3) / 300 == pytest.approx(1 / 3, abs=0.1)
 
 
-def test_jitter_is_normal_and_cut():
+def test_jitter_is_normal_and_clipped():
     points = np.zeros((20000, 3))
     step = noise.jitter(points, sigma=0.005, clip=0.02, rng=RNG(8))
     np.testing.assert_allclose(step.std(0), 0.005, rtol=0.03)
@@ -96,36 +96,36 @@ def test_jitter_is_normal_and_cut():
     assert (np.abs(cut) == 0.02).mean() == pytest.approx(0.689, abs=0.02)
 
 
-# --- what is lost
+# --- lost returns
 
 
 def facing(points, degrees):
-    """Normals that the beams of points (n, 3) meet at `degrees` off the perpendicular."""
+    """Normals at an angle of `degrees` to the beams of points (n, 3)."""
     beam = unit(points)
     angle = np.radians(degrees)
     return np.cos(angle) * beam + np.sin(angle) * unit(np.cross(beam, [0, 0, 1]))
 
 
-def test_weak_returns_follow_the_range_equation():
+def test_intensity_loss_follows_range_equation():
     near, far = np.array([[5.0, 0, 0]]), np.array([[60.0, 0, 0]])
     assert intensity_loss(far, facing(far, 0), range_max=120)[0] == pytest.approx(0.5)
     assert intensity_loss(near, facing(near, 60), range_max=120)[0] < 1e-3
-    # the same power: four times as far is a sixteenth, as is a cosine of a sixteenth
-    # farther and more grazing is weaker
+    # power decreases with range and with angle of incidence
     ranges, angles = np.linspace(1, 80, 20)[:, None] * [1.0, 0, 0], np.linspace(0, 90, 20)
     by_range = intensity_loss(ranges, facing(ranges, 30), range_max=100)
     by_angle = [intensity_loss(far, facing(far, angle), range_max=100)[0] for angle in angles]
     assert (np.diff(by_range) > 0).all() and (np.diff(by_angle) > 0).all() and by_angle[-1] <= 1
+    # equal power: a quarter of the range at an angle with cosine 1/16
     slanted = intensity_loss(near * 4, facing(near, np.degrees(np.arccos(1 / 16))), range_max=100)
     assert slanted[0] == pytest.approx(intensity_loss(near * 16, facing(near, 0), range_max=100)[0])
 
 
-def test_random_keep_loses_its_share():
+def test_random_keep_removes_given_share():
     assert noise.random_keep(20000, share=0.3, rng=RNG(11)).mean() == pytest.approx(0.7, abs=0.015)
     assert noise.random_keep(50, share=0.0, rng=RNG(11)).all()
 
 
-# --- the compiled twin
+# --- sensor noise and its compiled routine
 
 
 def surface(seed, n=300):
@@ -143,7 +143,7 @@ def surface(seed, n=300):
 @pytest.mark.long
 @settings(max_examples=60, deadline=None)
 @given(seeds, st.floats(0, 0.9), st.floats(0, 1), st.floats(1, 300))
-def test_the_compiled_twin_agrees_draw_by_draw(seed, dropout, weak, range_max):
+def test_lose_returns_matches_reference(seed, dropout, weak, range_max):
     mesh, hits = surface(seed)
     rng = RNG(seed)
     keep, chance = rng.random(len(hits.face)) < 0.8, rng.random(len(hits.face))
@@ -157,7 +157,7 @@ def test_the_compiled_twin_agrees_draw_by_draw(seed, dropout, weak, range_max):
     )
     np.testing.assert_array_equal(fast_kept, slow_kept)
     np.testing.assert_allclose(fast, slow, atol=2e-6)
-    # a surface without area returns nothing where weak returns are lost
+    # a surface of zero area returns nothing if weak returns are lost
     flat = np.full_like(mesh.vertices, 5.0), mesh.faces, np.ones_like(keep), error, np.full_like(chance, 0.99)
     assert len(lose_returns(hits.points, hits.face, *flat, 0.0, 1.0, 50.0)[0]) == 0
 
@@ -165,7 +165,7 @@ def test_the_compiled_twin_agrees_draw_by_draw(seed, dropout, weak, range_max):
 PERFECT = replace(sensor("os1-64"), dropout=0.0, range_max=100.0)
 
 
-def test_a_perfect_sensor_changes_nothing():
+def test_add_sensor_noise_of_perfect_sensor_is_identity():
     mesh, hits = surface(1)
     copy = hits.points.copy()
     moved, kept = add_sensor_noise(hits, mesh, PERFECT, ScanConditions(), RNG(0))
@@ -178,7 +178,7 @@ def test_a_perfect_sensor_changes_nothing():
     assert points.shape == (0, 3) and kept.shape == (0,)
 
 
-def test_ranges_have_the_law_of_the_sensor():
+def test_add_sensor_noise_has_configured_range_errors():
     mesh, hits = surface(2, n=20000)
 
     def error(**noise):
@@ -190,21 +190,33 @@ def test_ranges_have_the_law_of_the_sensor():
     shared = error(bias=0.01)
     of_ring = np.array([shared[hits.ring == r].mean() for r in range(64)])
     np.testing.assert_allclose(shared, of_ring[hits.ring], atol=2e-6)
+    assert of_ring.std() == pytest.approx(0.01, rel=0.3)
     outwards = error(one_sided=0.02)
     assert outwards.min() > -2e-6 and outwards.max() < 0.0201
     assert outwards.mean() == pytest.approx(0.01, rel=0.03)
 
 
+def test_intensity_dropout_is_half_at_half_range_max():
+    """Of surfaces that face the sensor; see `REACH`."""
+    vertices = np.array([[50, -1, -1], [50, 1, -1], [50, 0, 2]], np.float32)
+    mesh, count = Mesh(vertices, np.array([[0, 1, 2]], np.int32)), 4000
+    zeros = np.zeros(count, np.int32)
+    points = np.tile(np.float32([50, 0, 0]), (count, 1))
+    wall = Hits(points=points, face=zeros, column=zeros, ring=zeros, columns=0, rows=0, column0=0, row0=0)
+    points, _ = add_sensor_noise(wall, mesh, PERFECT, ScanConditions(intensity_dropout=1.0), RNG(0))
+    assert len(points) / count == pytest.approx(0.5, abs=0.03)
+
+
 # --- clutter points, cuts, masks without a grid
 
 
-def test_dapt_clusters_have_the_released_code_s_law():
+def test_dapt_clusters_match_released_distribution():
     center = np.array([3.0, -7, 0.5])
     draws = [noise.dapt_clusters(center, rng=RNG(seed)) for seed in range(300)]
     sizes = np.array([len(d) for d in draws])
     assert sizes.mean() == pytest.approx(149, rel=0.06) and sizes.max() > 200
     assert all((np.abs(d - center) <= np.array([0.7, 0.7, 1.1])).all() for d in draws)
-    # uniform in radius and polar angle: half of a cluster lies within half its radius, far more than of a ball
+    # uniform in radius and polar angle: half of the points are within half the radius, more than in a uniform ball
     lone = [d for d in draws if 40 < len(d)]
     spread = np.concatenate([np.linalg.norm(d[:20] - np.median(d[:20], 0), axis=1) for d in lone])
     assert np.median(spread) < 0.19 and spread.max() > 0.25
@@ -212,20 +224,20 @@ def test_dapt_clusters_have_the_released_code_s_law():
 
 @settings(max_examples=60, deadline=None)
 @given(seeds, st.floats(0, 0.9), st.integers(1, 200))
-def test_a_half_space_leaves_some_points(seed, most, n):
+def test_half_space_keep_leaves_some_points(seed, most, n):
     rng = RNG(seed)
     keep = noise.half_space_keep(rng.normal(size=(n, 3)), most=most, rng=rng)
     assert keep.shape == (n,) and keep.any() and (most > 0 or keep.all())
 
 
-def test_a_half_space_cuts_a_straight_edge_and_up_to_its_share():
-    # a ball: the centers of both sides of a plane lie on its normal
+def test_half_space_keep_cuts_straight_edge_up_to_share():
+    # for a sphere, the centers of both sides of a plane are on its normal
     points = unit(RNG(0).normal(size=(4000, 3)))
     keep = noise.half_space_keep(points, most=0.9, rng=RNG(12))
     assert 0.05 < (~keep).mean() < 0.95
     along = points @ unit(points[keep].mean(0) - points[~keep].mean(0))
     assert along[~keep].max() - along[keep].min() < 0.12
-    # of a sphere a plane takes as large a share of the surface as of the extent
+    # a plane cuts the same share of a sphere's surface as of its extent
     rng = RNG(1)
     lost = np.array([1 - noise.half_space_keep(points, most=0.4, rng=rng).mean() for _ in range(300)])
     assert lost.max() < 0.43 and lost.mean() == pytest.approx(0.2, abs=0.03) and lost.min() < 0.03
@@ -233,7 +245,7 @@ def test_a_half_space_cuts_a_straight_edge_and_up_to_its_share():
 
 @settings(max_examples=80, deadline=None)
 @given(seeds, st.floats(0, 0.9), st.floats(-3, 3))
-def test_a_cut_box_lies_inside_the_box_and_loses_one_side(seed, most, yaw):
+def test_cut_box_is_inside_box_and_loses_one_side(seed, most, yaw):
     whole = Box(center=[4.0, 1, 0.2], size=[0.7, 0.9, 1.8], yaw=yaw, id="x")
     cut = noise.cut_box(whole, most=most, rng=RNG(seed))
     lost = 1 - cut.size / whole.size
@@ -243,11 +255,11 @@ def test_a_cut_box_lies_inside_the_box_and_loses_one_side(seed, most, yaw):
     c, s = np.cos(yaw), np.sin(yaw)
     corners = cut.center + (signs * cut.size / 2) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
     assert whole.contains(corners, margin=1e-9).all()
-    # all other sides stay where they are
+    # the other sides do not move
     assert not all(whole.contains(corner[None], margin=-1e-6)[0] for corner in corners)
 
 
-def test_cuts_of_boxes_take_feet_heads_and_sides():
+def test_cut_box_cuts_feet_heads_and_sides():
     whole = Box(center=[4.0, 1, 0.2], size=[0.7, 0.9, 1.8], yaw=0.3)
     rng = RNG(5)
     cuts = [noise.cut_box(whole, rng=rng) for _ in range(600)]
@@ -258,22 +270,22 @@ def test_cuts_of_boxes_take_feet_heads_and_sides():
 
 @settings(max_examples=60, deadline=None)
 @given(seeds, st.floats(0, 1), st.floats(-np.pi, np.pi))
-def test_the_mask_without_a_grid_keeps_its_share_in_patches(seed, keep, azimuth):
+def test_direction_mask_keeps_share_in_patches(seed, keep, azimuth):
     rng = RNG(seed)
     angle = azimuth + rng.uniform(-0.1, 0.1, 4000)
     up = rng.uniform(-0.3, 0.3, 4000)
     beams = np.stack([np.cos(angle) * np.cos(up), np.sin(angle) * np.cos(up), np.sin(up)], 1) * 7
     kept = noise.direction_mask(beams, keep=keep, rng=rng)
-    # 8 x 24 patches of equal numbers of beams, but for the rim
+    # 8 x 24 patches of equal numbers of beams, except at the rim
     assert kept.mean() == pytest.approx(keep, abs=0.06)
     if 0.2 < keep < 0.8:
-        # neighbors share their fate far more often than strangers
+        # neighboring beams are kept or removed together far more often than independent ones
         order = np.lexsort((up, (angle / 0.012).astype(int)))
         same = (kept[order][1:] == kept[order][:-1]).mean()
         assert same > keep**2 + (1 - keep) ** 2 + 0.15
 
 
-def test_the_mask_without_a_grid_takes_single_beams_and_lines():
+def test_direction_mask_accepts_single_beams_and_lines():
     rng = RNG(0)
     assert noise.direction_mask(np.array([[1.0, 0, 0]]), keep=1.0, rng=rng).all()
     line = np.column_stack([np.ones(500), np.linspace(-0.2, 0.2, 500), np.zeros(500)])
@@ -285,7 +297,7 @@ def test_the_mask_without_a_grid_takes_single_beams_and_lines():
 
 @settings(max_examples=80, deadline=None)
 @given(seeds, st.integers(1, 90), st.integers(1, 70), st.floats(0, 1))
-def test_the_mask_is_made_of_square_patches_of_the_paper_s_size(seed, columns, rows, keep):
+def test_laser_mask_has_square_patches_of_paper_size(seed, columns, rows, keep):
     mask = laser_mask(columns, rows, keep=keep, rng=RNG(seed))
     assert mask.shape == (columns, rows) and mask.dtype == bool
     patch = max(min(columns, rows) // 8, 1)
@@ -294,7 +306,7 @@ def test_the_mask_is_made_of_square_patches_of_the_paper_s_size(seed, columns, r
     assert sum(cell.any() for cell in cells) == int(len(cells) * keep)
 
 
-def test_the_mask_keeps_about_its_share_of_the_beams():
+def test_laser_mask_keeps_share_of_beams():
     rng = RNG(5)
     for columns, rows in ((77, 61), (39, 27), (20, 9), (5, 30)):
         share = np.mean([laser_mask(columns, rows, keep=0.6, rng=rng).mean() for _ in range(300)])
@@ -303,7 +315,7 @@ def test_the_mask_keeps_about_its_share_of_the_beams():
     assert laser_mask(0, 0, keep=0.6, rng=RNG(0)).shape == (0, 0)
 
 
-# --- boxes as detectors draw them
+# --- boxes with the errors of detectors
 
 BODY = np.array([[x, y, z] for x in (-0.2, 0.3) for y in (-0.35, 0.35) for z in (0.0, 1.7)], np.float32)
 EXTENT = (BODY.min(0).tolist(), BODY.max(0).tolist())
@@ -320,23 +332,23 @@ def boxes(errors, rng, n, difficulty=1.0):
 
 @settings(max_examples=50, deadline=None)
 @given(seeds, st.floats(-3, 3), st.floats(-3, 3))
-def test_without_cuts_and_jitter_a_box_holds_the_body_along_its_heading(seed, yaw, heading):
+def test_draw_box_without_errors_contains_body(seed, yaw, heading):
     where = replace(PLACE, yaw=yaw)
     body = BODY @ rotation_about("z", heading).T
     box = draw_box(EXACT, 1.0, EXTENT, where, RNG(seed), heading=heading)
     local = (where.of_body(body) - box.center) @ rotation_about("z", box.yaw)
-    # aside from the bottom edge, which may lie above the soles
+    # except the bottom edge, which may be above the soles
     assert (np.abs(local[:, :2]) <= box.size[:2] / 2 + 1e-5).all() and local[:, 2].max() <= box.size[2] / 2 + 1e-5
     assert (box.size[:2] < [0.5 + 0.26, 0.7 + 0.26]).all()
 
 
-def test_the_bottom_edge_is_now_above_the_soles_now_in_the_ground():
+def test_draw_box_bottom_is_above_soles_or_below_ground():
     bottom = np.array([box.center[2] - box.size[2] / 2 + 1.5 for box in boxes(EXACT, RNG(0), 600)])
     assert 0.05 < (bottom > 0).mean() < 0.3 and 0.15 < (bottom < -0.15).mean() < 0.5
     assert bottom.min() > -0.5 and bottom.max() < 0.2
 
 
-def test_errors_are_as_large_as_configured():
+def test_draw_box_has_configured_errors():
     rng = RNG(1)
     yaw = np.array([box.yaw for box in boxes(replace(WILD, loose=0.0, cut=0.0), rng, 800)]) - PLACE.yaw
     assert abs(yaw.std() - WILD.jitter) < 0.01 and abs(yaw.mean()) < 0.01
@@ -344,16 +356,29 @@ def test_errors_are_as_large_as_configured():
     assert abs(np.mean([box.size[0] > 0.5 + 0.3 for box in loose]) - WILD.loose) < 0.04
 
 
-def test_cuts_come_with_difficulty():
+def test_draw_box_jitter_is_halved_in_z():
+    found = boxes(replace(EXACT, jitter=1.0), RNG(1), 800)
+    center, top = np.array([box.center for box in found]), [box.center[2] + box.size[2] / 2 for box in found]
+    np.testing.assert_allclose(center[:, :2].std(0), 1.0, atol=0.08)
+    assert np.std(top) == pytest.approx(0.5, abs=0.05)
+
+
+def test_draw_box_has_minimum_size():
+    flat = ([-0.02, -0.01, 0.0], [0.02, 0.01, 0.1])
+    sizes = [draw_box(EXACT, 1.0, flat, PLACE, RNG(seed)).size for seed in range(50)]
+    assert np.min(sizes) == 0.4
+
+
+def test_draw_box_cuts_increase_with_difficulty():
     rng, always = RNG(2), replace(EXACT, cut=1.0)
     easy, hard = (np.array([box.size for box in boxes(always, rng, 400, difficulty)]) for difficulty in (0.0, 1.0))
     assert easy[:, 2].min() > 1.5
-    # a cut takes 15 percent of a height or a side on average, heights in half of the cases
+    # a cut removes 15 % of the height or of a side on average, of the height in half of the cases
     lost = 1 - hard.mean(0) / easy.mean(0)
     assert 0.04 < lost[2] < 0.12 and 0.02 < lost[1] < 0.09 and 0.005 < lost[0] < 0.06
 
 
-def test_boxes_may_be_cut_or_too_large_without_jitter():
+def test_draw_box_can_be_cut_or_loose_without_jitter():
     exact = replace(WILD, jitter=0.0, loose=0.0, cut=0.0)
     errors = {"none": exact, "cut": replace(exact, cut=1.0), "loose": replace(exact, loose=1.0)}
     sizes = {name: np.array([box.size for box in boxes(value, RNG(2), 200)]) for name, value in errors.items()}
@@ -361,6 +386,6 @@ def test_boxes_may_be_cut_or_too_large_without_jitter():
     assert sizes["cut"].mean() < sizes["loose"].mean() - 0.2 and (sizes["loose"] < 4).all()
 
 
-def test_the_paper_cuts_nothing():
+def test_draw_box_of_paper_scene_cuts_nothing():
     (box,) = boxes(SCENES["paper"].crop, RNG(3), 1)
     assert box.contains(PLACE.of_body(BODY.astype(float))).all() and (box.size > 4).all()

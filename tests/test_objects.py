@@ -1,4 +1,4 @@
-"""Crops in which nobody is, and networks that say so."""
+"""Crops of objects without a person, and networks that predict whether a person is present."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ from lidarpose.synth.scene import NoiseConfig, scene_config
 from lidarpose.synth.simulate import ScanConditions, Scene, simulate_still
 from lidarpose.synth.views import with_views
 from lidarpose.train import data_loader
-from lidarpose.train.augment import people_in
+from lidarpose.train.augment import people_in, second_person_label
 from lidarpose.train.data_loader import SyntheticSource
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.setup import make_setup
@@ -27,7 +27,7 @@ from lidarpose.train.setup import make_setup
 WILD = scene_config("wild")
 
 
-def test_an_object_is_a_function_of_its_number():
+def test_draw_object_depends_only_on_seed_and_index():
     later = [draw_object(WILD, 5, index) for index in (2, 1, 0)]
     first = [draw_object(WILD, 5, index) for index in range(3)]
     for (a, kind), (b, same) in zip(first, reversed(later), strict=True):
@@ -37,7 +37,7 @@ def test_an_object_is_a_function_of_its_number():
 
 
 @pytest.mark.parametrize("left_out", [False, True])
-def test_objects_are_crops_of_things_without_a_person(left_out):
+def test_draw_object_has_no_person(left_out):
     kinds = set()
     for index in range(40):
         sample, kind = draw_object(WILD, 1, index, left_out=left_out)
@@ -50,21 +50,21 @@ def test_objects_are_crops_of_things_without_a_person(left_out):
 
 
 @pytest.mark.parametrize("name", ["merged", "accumulated", "inverted", "sparse"])
-def test_objects_are_seen_by_as_many_sensors_and_frames_as_people(name):
+def test_draw_object_uses_scan_conditions_of_people(name):
     config = WILD.changed((f"{name}=1",))
     for index in range(4):
         sample, _ = draw_object(config, 1, index)
         assert sample.conditions == (name,)
         assert np.linalg.norm(sample.box.center[:2]) < config.distance[1]
-    # nobody is beside a thing, and what is drawn for it is drawn apart
+    # `crowded` does not apply to objects and does not change their random draws
     sample, kind = draw_object(WILD.changed(("crowded=1",)), 1, 0)
     same, other = draw_object(WILD, 1, 0)
     assert not sample.conditions and kind == other
     np.testing.assert_array_equal(sample.points, same.points)
 
 
-def test_in_training_things_are_seen_in_several_scans_as_often_as_people(monkeypatch):
-    """Not always, while people are still easy: several scans would tell that nobody is there."""
+def test_synthetic_source_objects_get_difficulty_of_people(monkeypatch):
+    """While people are still easy, several scans of objects would reveal that no person is present."""
     merged = WILD.changed(("merged=1",))
     easy, _ = draw_object(merged, 1, 0, hard=0.0)
     np.testing.assert_array_equal(easy.points, draw_object(WILD, 1, 0)[0].points)
@@ -76,13 +76,13 @@ def test_in_training_things_are_seen_in_several_scans_as_often_as_people(monkeyp
     for index in (0, 10, 40):
         SyntheticSource(scene="wild", seed=3, objects=1.0, easy=20.0, set=("sparse=0.5",)).example(index)
     assert drawn[0] == 0 and 0 < drawn[1] < 0.5 and 0 < drawn[2] < 1
-    # where nothing varies, what is drawn for a thing is as before
+    # without scan conditions, objects get no difficulty
     SyntheticSource(scene="wild", seed=3, objects=1.0, easy=20.0).example(10)
     assert drawn[3] is None
 
 
 @pytest.mark.parametrize(("frames", "sensors"), [(5, ("os1-64",)), (1, ("os1-64", "hdl-32e", "os0-128"))])
-def test_a_thing_that_stands_still_is_in_one_place_for_all_scans(frames, sensors):
+def test_simulate_still_has_object_in_one_place_for_all_scans(frames, sensors):
     config = replace(scene_config("paper"), sensors=sensors[:1], slope=0.0, noise=NoiseConfig())
     acquisition = Acquisition(sensors=sensors, frames=frames, speed=10.0, distance=(6.0, 8.0))
     rng = np.random.default_rng(2)
@@ -95,7 +95,7 @@ def test_a_thing_that_stands_still_is_in_one_place_for_all_scans(frames, sensors
     scene = with_views(scene, acquisition.placing(config), 2.0, 0.5, 1.0, rng)
     views = (replace(view, scene=replace(view.scene, conditions=ScanConditions())) for view in scene.views)
     scene = replace(scene, views=tuple(views))
-    # an upright disk, its middle 1 m above the feet
+    # an upright disk, its center 1 m above the feet
     angle = np.linspace(0, 2 * np.pi, 25)[:-1]
     upright = place.feet + np.column_stack([0.8 * np.cos(angle), np.zeros(24), 1.0 + 0.8 * np.sin(angle)])
     faces = np.array([(0, k, k + 1) for k in range(1, 23)], np.int32)
@@ -107,13 +107,13 @@ def test_a_thing_that_stands_still_is_in_one_place_for_all_scans(frames, sensors
     assert (np.linalg.norm(every.points - place.feet - [0, 0, 1.0], axis=1) < 0.83).all()
 
 
-def test_sensors_that_reach_nothing_are_an_error():
+def test_draw_object_rejects_scene_out_of_range():
     far = replace(WILD, sensors=("vlp-16",), distance=(300.0, 400.0), median_points=0)
     with pytest.raises(InputError, match="scene wild: none of 16 draws left 15 points on an object"):
         draw_object(far, 0, 0)
 
 
-def test_a_share_of_the_examples_shows_nobody():
+def test_synthetic_source_has_share_of_objects():
     source = SyntheticSource(scene="wild", seed=3, objects=0.3)
     examples = [source.example(index) for index in range(60)]
     nobody = [example for example in examples if example.person[0] == 0]
@@ -122,12 +122,12 @@ def test_a_share_of_the_examples_shows_nobody():
         assert np.isnan(example.joints).all() and (example.part == -1).all() and example.person[1] == 0
         assert example.joints.shape == (len(BODY26), 3)
     assert all(example.person[0] == 1 for example in examples if not np.isnan(example.joints).any())
-    # without them every person is what they were, and nothing is said of who is there
+    # without objects the number of people is unknown
     plain = SyntheticSource(scene="wild", seed=3)
     assert np.isnan(plain.example(0).person).all()
 
 
-def test_networks_that_say_whether_somebody_is_there():
+def test_pretrain_with_objects_adds_person_head():
     setup = make_setup(Pretrain(objects=0.1, people=64))
     assert setup.objective.config.person and setup.network().person is not None
     assert not make_setup(Pretrain(people=64)).objective.config.person
@@ -138,7 +138,7 @@ def test_networks_that_say_whether_somebody_is_there():
     assert "objects" not in {name for name in Finetune.__dataclass_fields__}
 
 
-def test_a_second_person_is_known_where_they_are_seen():
+def test_synthetic_source_labels_visible_second_person():
     crowded = replace(scene_config("wide"), crowded=1.0, company=0.0)
     source = SyntheticSource(scene="wild", seed=3, objects=0.01, set=("crowded=1",))
     two = [source.example(index).person[1] for index in range(40)]
@@ -149,8 +149,11 @@ def test_a_second_person_is_known_where_they_are_seen():
     assert 0 < sample.second_person_points <= (sample.part == 0).sum()
 
 
-def test_few_points_of_a_second_person_say_nothing():
+def test_people_in_is_unknown_for_few_points_of_second_person():
     points = np.zeros((100, 3), np.float32)
     for others, due in ((0, 0.0), (9, np.nan), (14, np.nan), (15, 1.0), (60, 1.0)):
         sample = Sample(points=points, center=np.zeros(3), second_person_points=others)
         np.testing.assert_array_equal(people_in(sample), np.float32([1, due]))
+    # at least a tenth of the points
+    for others, due in ((29, np.nan), (30, 1.0)):
+        assert second_person_label(others, 300) == pytest.approx(due, nan_ok=True)

@@ -1,4 +1,4 @@
-"""What is installed is all that predicting needs."""
+"""The installed wheel contains everything that prediction needs."""
 
 import json
 import os
@@ -19,8 +19,8 @@ ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.slow
-def test_the_wheel_installs_into_an_empty_environment_and_predicts(tmp_path):
-    """Needs a package index. No path of this tree may be seen by the new environment."""
+def test_wheel_installs_into_empty_environment_and_predicts(tmp_path):
+    """Needs a package index. The new environment must not see any path of this repository."""
     source = tmp_path / "source"
     source.mkdir()
     for name in ("src", "README.md", "LICENSE", "NOTICE", "pyproject.toml", "setup.py"):

@@ -1,6 +1,6 @@
-"""Captures of fabricated packets: every profile of Ouster, every way of capturing, every loss.
+"""Captures of synthetic packets: all profiles of Ouster, all capture formats, lost packets.
 
-The encoder here writes bits and points one by one from the published formats; it shares nothing with the decoder.
+The encoder here follows the published formats bit by bit and shares no code with the decoder.
 """
 
 import json
@@ -61,7 +61,7 @@ def ranges_of(frame, profile="RNG19_RFL8_SIG16_NIR16"):
 
 
 def packet(frame_id, first, ranges, profile="RNG19_RFL8_SIG16_NIR16", time=10**12, serial=123456789, invalid=()):
-    """The packet of columns first, first + 1, ..."""
+    """The packet of `PER_PACKET` columns from `first` on."""
     size, bits, unit = PROFILES[profile]
     body = b""
     for column in range(first, first + PER_PACKET):
@@ -95,7 +95,7 @@ def packets_of(frame_ids, profile="RNG19_RFL8_SIG16_NIR16", **options):
 
 
 def expected_points(ranges, along=15.806, up=0.0):
-    """Sorted points m in the sensor's frame, one by one as the manual computes them."""
+    """Sorted points m in the sensor's frame, computed one by one with the manual's formulas."""
     points = []
     for column in range(COLUMNS):
         for beam in range(BEAMS):
@@ -120,7 +120,7 @@ def decoded(frame):
 
 
 def ip4(payload, port=7502, source=b"\x0a\0\0\x01", mtu=None, number=9):
-    """IPv4 packets of a UDP datagram, in fragments where it is longer than `mtu`."""
+    """IPv4 packets of a UDP datagram, in fragments if it is longer than `mtu`."""
     data = struct.pack(">HHHH", 7502, port, 8 + len(payload), 0) + payload
     step = len(data) if mtu is None else mtu // 8 * 8
     parts = []
@@ -170,8 +170,11 @@ def write(path, ips, *, link="ethernet", order="<", nano=False, period=10**6):
     return path
 
 
-def write_ng(path, ips, order="<"):
-    """pcapng with two interfaces, the second in nanoseconds, and a block that nobody knows."""
+def write_ng(path, ips, order="<", resolution=9, frequency=10**9):
+    """pcapng with two interfaces and a block of unknown type.
+
+    resolution: of the second interface's times, as its option states it; frequency: 1/s.
+    """
 
     def block(kind, body):
         body += bytes(-len(body) % 4)
@@ -179,11 +182,11 @@ def write_ng(path, ips, order="<"):
 
     data = block(0x0A0D0D0A, struct.pack(order + "IHHq", 0x1A2B3C4D, 1, 0, -1))
     data += block(1, struct.pack(order + "HHI", 1, 0, 0)) + block(0xBAD, b"what is this")
-    options = struct.pack(order + "HH4sHHB3sHH", 1, 3, b"abc\0", 9, 1, 9, b"", 0, 0)
+    options = struct.pack(order + "HH4sHHB3sHH", 1, 3, b"abc\0", 9, 1, resolution, b"", 0, 0)
     data += block(1, struct.pack(order + "HHI", 101, 0, 0) + options)
     for k, ip in enumerate(ips):
         frame = LINKS["ethernet"][1](ip) if k % 2 == 0 else ip
-        ticks = (1000 + k) * (10**6 if k % 2 == 0 else 10**9)
+        ticks = (1000 + k) * (10**6 if k % 2 == 0 else frequency)
         head = struct.pack(order + "5I", k % 2, ticks >> 32, ticks & 0xFFFFFFFF, len(frame), len(frame))
         data += block(6, head + frame)
     path.write_bytes(data)
@@ -197,7 +200,7 @@ def ouster(path, ips, profile="RNG19_RFL8_SIG16_NIR16", **options):
 
 @pytest.mark.parametrize("order", "<>")
 @pytest.mark.parametrize("link", LINKS)
-def test_datagrams_come_out_of_any_capture(tmp_path, link, order):
+def test_capture_reads_all_link_types(tmp_path, link, order):
     payloads = [bytes([k]) * (10 + 700 * k) for k in range(6)]
     ips = [part for k, payload in enumerate(payloads) for part in ip4(payload, mtu=1000, number=k)]
     other = [ip4(b"tcp")[0][:9] + b"\x06" + ip4(b"tcp")[0][10:], b"", b"\x45", bytes(60)]
@@ -209,7 +212,7 @@ def test_datagrams_come_out_of_any_capture(tmp_path, link, order):
 
 
 @pytest.mark.parametrize("order", "<>")
-def test_pcapng_and_ipv6_are_read(tmp_path, order):
+def test_capture_reads_pcapng_and_ipv6(tmp_path, order):
     payloads = [bytes([k]) * (10 + 700 * k) for k in range(4)]
     ips = [part for payload in payloads for part in ip6(payload, mtu=1000 if len(payload) > 1000 else None)]
     for path in (write_ng(tmp_path / "a.pcapng", ips, order), write(tmp_path / "a.pcap", ips)):
@@ -217,7 +220,20 @@ def test_pcapng_and_ipv6_are_read(tmp_path, order):
         assert [datagram.payload for datagram in datagrams] == payloads and datagrams[0].time < datagrams[1].time < 1010
 
 
-def test_fragments_in_any_order_make_a_datagram_and_missing_ones_are_counted(tmp_path):
+@pytest.mark.parametrize(("resolution", "frequency"), [(9, 10**9), (3, 1000), (0x80 | 20, 2**20)])
+def test_pcapng_time_resolution(tmp_path, resolution, frequency):
+    ips = [ip4(bytes([k]))[0] for k in range(4)]
+    path = write_ng(tmp_path / "a.pcapng", ips, resolution=resolution, frequency=frequency)
+    assert [datagram.time for datagram in Capture(path)] == [1000, 1001, 1002, 1003]
+
+
+def test_capture_reads_packets_with_zero_length_field(tmp_path):
+    (packet,) = ip4(b"payload")
+    path = write(tmp_path / "a.pcap", [packet[:2] + b"\0\0" + packet[4:]], link="raw")
+    assert [datagram.payload for datagram in Capture(path)] == [b"payload"]
+
+
+def test_capture_joins_fragments_and_counts_incomplete_ones(tmp_path):
     payload = bytes(range(256)) * 20
     parts = ip4(payload, mtu=1000)
     capture = Capture(write(tmp_path / "a.pcap", parts[::-1]))
@@ -231,7 +247,7 @@ def test_fragments_in_any_order_make_a_datagram_and_missing_ones_are_counted(tmp
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_every_profile_decodes_as_the_manual_computes(tmp_path, profile):
+def test_ouster_profiles_match_manual(tmp_path, profile):
     packets = packets_of(range(3), profile, invalid=(5,) if profile != "RNG15_RFL8_NIR8" else ())
     source = ouster(tmp_path / "a.pcap", [ip for payload in packets for ip in ip4(payload, mtu=1400)], profile)
     frames = list(source)
@@ -245,7 +261,7 @@ def test_every_profile_decodes_as_the_manual_computes(tmp_path, profile):
         assert abs(frame.time - 1000 - k / 10) < 1e-9 and np.allclose(frame.origin, [0.01, 0.02, 0.03])
 
 
-def test_metadata_of_newer_sensors_is_in_sections(tmp_path):
+def test_ouster_reads_metadata_in_sections(tmp_path):
     plain = metadata()
     form = plain.pop("data_format")
     beams = {key: plain.pop(key) for key in ("beam_altitude_angles", "beam_azimuth_angles")}
@@ -257,10 +273,10 @@ def test_metadata_of_newer_sensors_is_in_sections(tmp_path):
     assert np.allclose(decoded(frame), expected_points(ranges_of(0), 12.0, 5.0), rtol=0, atol=1e-9)
 
 
-def test_lost_late_and_doubled_packets_are_counted(tmp_path):
+def test_ouster_handles_lost_late_and_duplicate_packets(tmp_path):
     packets = packets_of([65534, 65535, 65536, 65537])
     lost = packets.pop(6)
-    packets.insert(9, lost)  # of the second turn, after the third began
+    packets.insert(9, lost)  # of the second frame, after the third began
     packets.insert(2, packets[1])
     packets = [payload for k, payload in enumerate(packets) if k != 13]
     source = ouster(tmp_path / "a.pcap", [ip4(payload)[0] for payload in packets])
@@ -272,7 +288,7 @@ def test_lost_late_and_doubled_packets_are_counted(tmp_path):
     assert source.warnings == ("1 of 8 lidar packets were lost",)
 
 
-def test_packets_of_other_sensors_are_left_out(tmp_path):
+def test_ouster_skips_packets_of_other_sensors(tmp_path):
     mine, other = packets_of([0, 1]), packets_of([5, 6])
     ips = [ip for a, b in zip(mine, other, strict=True) for ip in (*ip4(b, port=7512), *ip4(a), *ip4(b"imu" * 16))]
     source = ouster(tmp_path / "a.pcap", ips)
@@ -283,7 +299,7 @@ def test_packets_of_other_sensors_are_left_out(tmp_path):
     assert "from the sensor 5" in source.warnings[0] and "123456789" in source.warnings[0]
 
 
-def test_a_column_window_expects_only_its_columns(tmp_path):
+def test_ouster_column_window_expects_only_its_columns(tmp_path):
     for window, firsts in (((8, 20), (8, 16)), ((26, 9), (24, 0, 8))):
         data = metadata()
         data["data_format"]["column_window"] = window
@@ -295,7 +311,7 @@ def test_a_column_window_expects_only_its_columns(tmp_path):
         assert [frame.warnings for frame in source] == [()] * 3 and not source.warnings
 
 
-def test_metadata_of_another_name_is_named(tmp_path):
+def test_open_source_accepts_path_of_metadata(tmp_path):
     path = tmp_path / "walk.pcap"
     beside = [frame.points for frame in ouster(path, [ip for payload in packets_of([0]) for ip in ip4(payload)])]
     path.with_suffix(".json").rename(tmp_path / "sensor.json")
@@ -308,7 +324,7 @@ def test_metadata_of_another_name_is_named(tmp_path):
         open_source(path, meta=tmp_path / "other.json")
 
 
-def test_what_is_missing_or_wrong_is_one_line(tmp_path):
+def test_open_source_reports_bad_captures_and_metadata(tmp_path):
     ips = [ip4(payload)[0] for payload in packets_of([0])]
     path = write(tmp_path / "walk.pcap", ips)
     with pytest.raises(InputError, match="needs its metadata walk.json beside it"):
@@ -345,7 +361,7 @@ def test_what_is_missing_or_wrong_is_one_line(tmp_path):
         assert "\n" not in str(error.value)
 
 
-def test_a_capture_that_is_cut_off_or_damaged_keeps_what_is_whole(tmp_path):
+def test_ouster_keeps_whole_frames_of_damaged_capture(tmp_path):
     source = ouster(tmp_path / "a.pcap", [ip for k in packets_of(range(6)) for ip in ip4(k, mtu=200)])
     path, data = tmp_path / "a.pcap", (tmp_path / "a.pcap").read_bytes()
     assert len(list(source)) == 6
@@ -367,7 +383,7 @@ def test_a_capture_that_is_cut_off_or_damaged_keeps_what_is_whole(tmp_path):
 
 @pytest.mark.skipif(not RECORDINGS, reason="no Ouster recordings on this machine")
 @pytest.mark.parametrize("path", RECORDINGS, ids=lambda path: path.stem)
-def test_recordings_of_sensors_are_whole_rooms(path):
+def test_ouster_recordings_have_complete_frames(path):
     (frame,) = open_source(path)
     assert len(frame.points) > 20_000 and not frame.warnings
     assert frame.ring.max() + 1 == OusterFormat(path.with_suffix(".json")).beams
@@ -377,14 +393,14 @@ def test_recordings_of_sensors_are_whole_rooms(path):
 
 
 def vlp16(first, stamp, distance=5000, model=0x22):
-    """A packet of 12 blocks of a VLP-16 at 0.4 degrees a block; distances in 2 mm."""
+    """A packet of a VLP-16: 12 blocks of 0.4 degrees each, distances in units of 2 mm."""
     blocks = b"".join(
         struct.pack("<HH", 0xEEFF, (first + 40 * k) % 36000) + struct.pack("<HB", distance, 7) * 32 for k in range(12)
     )
     return blocks + struct.pack("<IBB", stamp, 0x37, model)
 
 
-def test_velodyne_packets_are_turns(tmp_path):
+def test_velodyne_packets_become_frames(tmp_path):
     pytest.importorskip("velodyne_decoder", reason="the extra recordings is not installed")
     ips = [ip4(vlp16(k * 480 % 36000, k * 1330))[0] for k in range(200)]
     source = open_source(write(tmp_path / "a.pcap", [*ips, *ip4(bytes(512), port=8308)], period=1330))

@@ -1,4 +1,4 @@
-"""`lidarpose paper`: tables as data, sub-runs that are done once and taken up, what a table says, its figures."""
+"""`lidarpose paper`: tables and their cells, steps that run once and can be resumed, pages, figures."""
 
 import json
 import sys
@@ -43,12 +43,12 @@ def _content(out, name="table4"):
     return json.loads((out / f"{name}.json").read_text())
 
 
-# --- a table from its command to its page
+# --- a table from command to page
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """Table 4's first and last row on 64 people each, killed while the second row's fine-tuning saves."""
+    """Table 4's first and last row on 64 people each, killed while the second row's fine-tuning saves, then resumed."""
     out = tmp_path_factory.mktemp("paper") / "paper"
     with pytest.MonkeyPatch.context() as patch:
         save, saved = run_dir.save_state, []
@@ -68,12 +68,12 @@ def finished(tmp_path_factory):
     return out, killed, before
 
 
-def test_a_table_that_was_killed_goes_on(finished):
+def test_paper_resumes_killed_table(finished):
     out, killed, before = finished
     assert [cell["state"] for cell in killed["cells"]] == ["done", "not run"]
     done = _content(out)["cells"]
     assert [cell["state"] for cell in done] == ["done", "done"]
-    # the first row, both target sets' parts that were there and the pre-training are not made again
+    # the first row, the finished parts of both targets and the pre-training are not repeated
     assert len(before) >= 4 and all(path.stat().st_mtime_ns == at for path, at in before.items())
     assert done[0].items() >= killed["cells"][0].items()
     (tuned,) = [log for log in (out / "runs").glob("finetune-*/log.jsonl") if "--resume" in _command(log.parent)]
@@ -84,7 +84,7 @@ def _command(run):
     return read_header(run / "model.safetensors").card["command"]
 
 
-def test_a_cell_states_what_it_cost_and_the_mean_pose(finished):
+def test_paper_cell_has_cost_and_mean_pose(finished):
     out, _, _ = finished
     scratch, masked = _content(out)["cells"]
     assert (scratch["people_seen"], masked["people_seen"]) == (64, 128)
@@ -103,7 +103,7 @@ def test_a_cell_states_what_it_cost_and_the_mean_pose(finished):
     assert all(command in page for command in masked["commands"])
 
 
-def test_rows_are_compared_person_by_person(finished):
+def test_paper_rows_are_compared_person_by_person(finished):
     out, _, _ = finished
     scratch, reference = _content(out)["cells"]
     assert "difference" not in reference
@@ -113,7 +113,7 @@ def test_rows_are_compared_person_by_person(finished):
     )
     assert scratch["difference"] == pytest.approx((first - second).mean(), abs=1e-3)
     assert scratch["difference_low"] < scratch["difference"] < scratch["difference_high"]
-    # people who are hard are hard for both
+    # errors of both rows are correlated
     assert scratch["difference_high"] - scratch["difference_low"] < scratch["high"] - scratch["low"]
     cells_page = (out / "table4.md").read_text().split("## Cells")[1].split("## Commands")[0]
     heads, line = (
@@ -123,7 +123,7 @@ def test_rows_are_compared_person_by_person(finished):
     assert line.split(" | ")[4].startswith(f"{scratch['difference']:+.1f} [")
 
 
-def test_the_mean_pose_is_the_mean_about_the_points_center(finished):
+def test_mean_pose_is_relative_to_center_of_points(finished):
     out, _, _ = finished
     wanted = _content(out)["cells"][0]["mean_pose"]
     learned, scored = [], []
@@ -136,7 +136,7 @@ def test_the_mean_pose_is_the_mean_about_the_points_center(finished):
     assert wanted == pytest.approx(1e3 * error, abs=0.1)
 
 
-def test_a_table_of_what_is_there(finished, capsys):
+def test_paper_table_only_lists_finished_cells(finished, capsys):
     out, _, _ = finished
     assert main([*_TABLE, str(out), "--table-only", "--seeds", "2"]) == 0
     assert [cell["state"] for cell in _content(out)["cells"]] == ["done", "not run"] * 2
@@ -144,7 +144,7 @@ def test_a_table_of_what_is_there(finished, capsys):
     assert main([*_TABLE, str(out), "--table-only"]) == 0
 
 
-def test_the_hardest_people_side_by_side(finished, monkeypatch):
+def test_fig5_draws_hardest_people_of_all_methods(finished, monkeypatch):
     out, _, _ = finished
     selected = cells(TABLES["table4"], Options(people=64, size="paper-tiny"), _ROWS)
     (path,) = figures.draw("fig5", selected, out)
@@ -153,12 +153,12 @@ def test_the_hardest_people_side_by_side(finished, monkeypatch):
     monkeypatch.setattr(figures, "draw_people", lambda panels, **_: drawn.extend(panels) or b"x")
     figures.draw("fig5", selected, out)
     assert len(drawn) == 2 * figures.HARDEST
-    # methods of one row are seen from one side, which is the true person's
+    # all methods of a person are drawn from the same side, given by the true pose
     for one, other in zip(drawn[::2], drawn[1::2], strict=True):
         np.testing.assert_array_equal(facing_of(one), facing_of(other))
         np.testing.assert_array_equal(facing_of(one), facing(one.truth))
     assert figures.draw("fig5", cells(TABLES["fig5"], Options(people=96)), out) == []
-    # a picture a column
+    # one picture per column
     clips = [replace(cell, column="clips") for cell in selected]
     assert [path.name for path in figures.draw("fig5", [*selected, *clips], out)] == [
         "fig5-people.png",
@@ -166,11 +166,11 @@ def test_the_hardest_people_side_by_side(finished, monkeypatch):
     ]
 
 
-# --- the tables as data
+# --- tables and cells
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_rows_have_names_of_their_own_and_every_cell_a_command_or_a_reason(name):
+def test_cells_have_unique_keys_and_command_or_reason(name):
     for options in (Options(), Options(motion=("a.npz", "b.npz"), subjects="1", held_out="2", seeds=2, hours=2.0)):
         table = cells(TABLES[name], options)
         keys = [(row_key(cell.row), cell.column, cell.seed) for cell in table]
@@ -182,7 +182,7 @@ def test_rows_have_names_of_their_own_and_every_cell_a_command_or_a_reason(name)
 
 @pytest.fixture
 def data(tmp_path):
-    """Real sets and a corpus by name, as far as options look at them."""
+    """Name -> folder of a real dataset or corpus, with as much content as options check."""
     folders = {name: tmp_path / name for name in (*REAL, "lipd", "freemotion", "noisemotion")}
     for name, folder in folders.items():
         folder.mkdir()
@@ -192,19 +192,19 @@ def data(tmp_path):
     return {name: str(folder) for name, folder in folders.items()} | poses
 
 
-def test_a_set_of_another_name_is_not_taken_for_a_real_one(data):
+def test_options_reject_data_of_another_dataset(data):
     with pytest.raises(InputError, match=r"--data waymo=.*: expected waymo as prepared, got humanm3"):
         Options(data=data | {"waymo": data["humanm3"]})
 
 
-def test_the_published_figures_are_those_of_the_published_table(data):
+def test_table1_cells_have_published_figures(data):
     printed = {method["method"]: method["figures"] for method in published()["methods"]}
     for cell in cells(TABLES["table1"], Options(data=data)):
         wanted = printed.get(next((name for name in printed if name.startswith(cell.row)), ""), {}).get(cell.column)
         assert cell.published == (wanted and wanted["mpjpe"])
 
 
-def test_tables_share_what_they_have_in_common():
+def test_tables_share_common_steps():
     def runs(name, row):
         (cell,) = cells(TABLES[name], Options(), [row])[:1]
         return [step.name for step in cell.evaluation.all()]
@@ -216,16 +216,16 @@ def test_tables_share_what_they_have_in_common():
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_the_parser_knows_the_commands(name, tmp_path, data):
+def test_step_commands_are_accepted_by_parser(name, tmp_path, data):
     for options in (Options(motion=("a.npz",)), Options(data=data, size="paper")):
         steps_of = [list(cell.evaluation.all()) for cell in cells(TABLES[name], options) if cell.evaluation]
         assert steps_of
         for step in {step.name: step for steps_ in steps_of for step in steps_}.values():
-            # ends the test with what it says against a command
+            # raises SystemExit for a wrong command
             make_parser().parse_args(step.command(tmp_path))
 
 
-def test_the_paper_s_protocol_on_real_sets(data):
+def test_table_commands_follow_paper_protocol(data):
     options = Options(data=data, size="paper")
     lines = {}
     for cell in cells(TABLES["table1"], options):
@@ -233,18 +233,18 @@ def test_the_paper_s_protocol_on_real_sets(data):
         lines[cell.row, cell.column] = [" ".join(step.command(Path("o"))) for step in own]
     assert not lines["NE", "waymo"] and lines["NE", "sloper4d"] and lines["LiDARCap", "lidarhuman26m"]
     for (row, column), (*_, tuned, scored) in ((key, own) for key, own in lines.items() if own):
-        # clips are of all frames
+        # clips have all frames
         thinned = column in ("humanm3", "lidarhuman26m") and row not in ("LiDARCap", "NE")
         assert ("--interval 5" in tuned) == thinned
         assert "--protocol dapt" in scored and ("--decode dark" in scored) == (row == "DAPT")
         assert "--rate" not in tuned and "--epochs" not in tuned
-        # crops and centers to learn from are those that are scored by
+        # training uses the crops and centers of the evaluation
         wanted = "--options trans_center=true" if row in ("LiDARCap", "NE") else "--augment paper"
         assert ("--recipe paper" in tuned) == (row in ("PRN", "DAPT"))
         assert wanted in tuned or "--recipe paper" in tuned
     assert "--recipe paper --size paper" in lines["DAPT", "waymo"][0] and "--motion raw" in lines["DAPT", "waymo"][0]
     assert all(cell.evaluation for cell in cells(TABLES["table2"], options))
-    # people of a corpus's poses are of the user's SMPL file where there is one, others of the shipped body
+    # people with a corpus's poses have the body of the user's SMPL file if given, others the shipped body
     assert "--body" not in lines["DAPT", "waymo"][0]
     with_smpl = Options(data=data | {"smpl": "SMPL.npz"}, size="paper")
     bodies = {
@@ -259,7 +259,7 @@ def test_the_paper_s_protocol_on_real_sets(data):
     assert reasons["LIPD"] == "" and "--data freemotion=DIR" in reasons["FreeMotion"]
 
 
-def test_poses_of_lidarhuman26m_s_test_sequences_are_not_learned_from(tmp_path, data, smpl):
+def test_tables_do_not_train_on_lidarhuman26m_test_poses(tmp_path, data, smpl):
     raw = tmp_path / "raw"
     write_lidarhuman26m(raw, smpl, sequences=("5", "7", "24", "8"))
     options = Options(data=data | {"lidarhuman26m-poses": str(raw)}, size="paper")
@@ -271,7 +271,7 @@ def test_poses_of_lidarhuman26m_s_test_sequences_are_not_learned_from(tmp_path, 
         assert set(PoseBank.from_clips(raw, tuple(subjects)).clips.names) == {"labels/3d/pose/5", "labels/3d/pose/8"}
 
 
-def test_the_mean_pose_is_about_the_center_that_the_protocol_gives(tmp_path, smpl):
+def test_mean_pose_is_relative_to_center_of_protocol(tmp_path, smpl):
     write_sloper4d(tmp_path / "raw", smpl, frames=40)
     prepare("sloper4d", tmp_path / "raw", tmp_path / "set", smpl=smpl, split_by="dapt")
     (target,) = _targets(TABLES["fig5"], Options(data={"sloper4d": str(tmp_path / "set")}))
@@ -286,7 +286,7 @@ def test_the_mean_pose_is_about_the_center_that_the_protocol_gives(tmp_path, smp
     assert found == pytest.approx(wanted, abs=0.1)
 
 
-def test_the_mean_pose_is_of_what_is_learned_from_and_of_people_who_have_a_pose(tmp_path, monkeypatch):
+def test_mean_pose_uses_training_set_and_skips_few_points(tmp_path, monkeypatch):
     def person(height, points):
         joints = np.full((15, 3), (0.0, 0.0, height))
         sample = SimpleNamespace(skeleton=HUMAN15, joint_labels=np.ones(15), joints=joints)
@@ -302,13 +302,13 @@ def test_the_mean_pose_is_of_what_is_learned_from_and_of_people_who_have_a_pose(
         assert mean_pose_error(replace(target, train=train), SimpleNamespace(setting=setting), tmp_path) == error
 
 
-def test_a_set_that_the_protocol_refuses_is_refused_before_anything_is_trained(tmp_path, smpl, monkeypatch, capsys):
+def test_run_table_rejects_unsuitable_dataset_before_training(tmp_path, smpl, monkeypatch, capsys):
     write_sloper4d(tmp_path / "raw", smpl)
     prepare("sloper4d", tmp_path / "raw", tmp_path / "set", smpl=smpl)
     options = Options(data={"sloper4d": str(tmp_path / "set")}, people=64)
     with pytest.raises(InputError, match="run lidarpose prepare sloper4d RAW OUT --split-by dapt into another folder"):
         run_table(TABLES["table1"], options, tmp_path / "out", [], lambda words: pytest.fail(str(words)), print)
-    # which has no column of it
+    # table 3 has no column of this dataset
     with pytest.raises(InputError, match="table3 is scored on waymo: give one by --data"):
         run_table(TABLES["table3"], options, tmp_path / "out", [], pytest.fail, print)
     monkeypatch.chdir(tmp_path)
@@ -317,7 +317,7 @@ def test_a_set_that_the_protocol_refuses_is_refused_before_anything_is_trained(t
 
 
 @pytest.mark.parametrize("size, suffix", [("paper", ""), ("paper-small", "-small"), ("paper-tiny", "-tiny")])
-def test_all_rows_are_at_the_width_that_is_asked_for(size, suffix):
+def test_table1_rows_have_requested_size(size, suffix):
     sizes = {cell.row: cell.size for cell in cells(TABLES["table1"], Options(size=size)) if cell.evaluation}
     assert sizes == {
         "LiDARCap": f"lidarcap{suffix}", "NE": f"ne{suffix}", "LPFormer": f"lpformer{suffix}",
@@ -325,12 +325,12 @@ def test_all_rows_are_at_the_width_that_is_asked_for(size, suffix):
     }  # fmt: skip
 
 
-def test_other_processes_do_not_make_another_run():
+def test_step_name_does_not_depend_on_workers():
     one, two = (cells(TABLES["table1"], Options(workers=n), ["dapt"])[0].evaluation.name for n in (1, 2))
     assert one == two != cells(TABLES["table1"], Options(hours=1.0), ["dapt"])[0].evaluation.name
 
 
-def test_a_plan_runs_nothing(tmp_path, monkeypatch, capsys):
+def test_paper_dry_run_runs_nothing(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["paper", "table4", "--dry-run"]) == 0
     text = capsys.readouterr().out
@@ -356,7 +356,7 @@ def test_a_plan_runs_nothing(tmp_path, monkeypatch, capsys):
         (["table1", "--out", "file"], "give another by --out"),
     ],
 )
-def test_wrong_words_are_one_line(tmp_path, monkeypatch, capsys, words, told):
+def test_cli_paper_errors_are_one_line(tmp_path, monkeypatch, capsys, words, told):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("x")
     assert main(["paper", *words]) == 2
@@ -367,7 +367,7 @@ def test_wrong_words_are_one_line(tmp_path, monkeypatch, capsys, words, told):
 
 @pytest.mark.long
 @pytest.mark.parametrize("words", [["fig6"], ["table1", "--table-only"]])
-def test_a_folder_that_the_command_made_is_its_own(tmp_path, monkeypatch, words):
+def test_paper_accepts_its_own_output_folder(tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("lidarpose.paper.figures.draw_people", lambda panels, path, **_: path.write_bytes(b"x"))
     for _ in range(2):
@@ -378,7 +378,7 @@ def test_a_folder_that_the_command_made_is_its_own(tmp_path, monkeypatch, words)
 # --- steps
 
 
-def test_a_step_that_fails_is_a_cell_that_says_so_and_the_others_go_on(tmp_path):
+def test_run_table_marks_failed_cells_and_continues(tmp_path):
     asked = []
 
     def execute(words):
@@ -398,7 +398,7 @@ def test_a_step_that_fails_is_a_cell_that_says_so_and_the_others_go_on(tmp_path)
     assert "failed: unrecognized arguments" in (tmp_path / "out" / "table4.md").read_text()
 
 
-def test_cells_that_were_copied_are_done_but_a_figure_needs_what_it_is_drawn_of(tmp_path):
+def test_copied_cells_are_done_for_tables_but_not_for_figures(tmp_path):
     asked = []
     for name in ("table1", "fig5"):
         cell = cells(TABLES[name], Options(people=64), ["dapt"])[0]
@@ -410,7 +410,7 @@ def test_cells_that_were_copied_are_done_but_a_figure_needs_what_it_is_drawn_of(
         assert asked == ([] if name == "table1" else ["synth", "pretrain", "finetune", "synth", "evaluate"])
 
 
-def test_a_stopped_step_stops_the_table(tmp_path):
+def test_run_steps_raises_if_step_is_stopped_or_fails(tmp_path):
     step = Step(("synth", "-n", "3"))
     with pytest.raises(KeyboardInterrupt):
         run_steps(step, tmp_path, lambda words: 143, print)
@@ -422,7 +422,7 @@ def test_a_stopped_step_stops_the_table(tmp_path):
     assert asked == [["synth", "-n", "3", "--out", str(step.folder(tmp_path))]]
 
 
-def test_two_tables_in_one_folder_share_a_step(tmp_path):
+def test_run_steps_waits_for_step_of_another_process(tmp_path):
     step, began, go_on = Step(("synth", "-n", "3")), threading.Event(), threading.Event()
     asked, told = [], []
 
@@ -439,13 +439,13 @@ def test_two_tables_in_one_folder_share_a_step(tmp_path):
     with ThreadPoolExecutor(2) as pool:
         first = pool.submit(run_steps, step, tmp_path, execute, tell)
         assert began.wait(60)
-        # waits, and finds it done
+        # waits until the step is done
         pool.submit(run_steps, step, tmp_path, execute, tell).result(60)
         first.result(60)
     assert len(asked) == 1 and told[1] == f"{step.name}: another process is running it, waiting for its end"
 
 
-def test_an_evaluation_that_was_killed_while_its_files_were_put_in_place_is_done_again(tmp_path):
+def test_run_steps_repeats_killed_evaluation(tmp_path):
     step, asked = Step(("evaluate", "weights", "set")), []
     folder = step.folder(tmp_path)
     folder.mkdir(parents=True)
@@ -459,7 +459,7 @@ def test_an_evaluation_that_was_killed_while_its_files_were_put_in_place_is_done
 
     run_steps(step, tmp_path, execute, print)
     assert len(asked) == 1
-    # all files are there, and the process was killed before it noted so
+    # all files exist, but the process was killed before it recorded that
     (tmp_path / "runs" / f"{step.name}.json").unlink()
     folder.mkdir()
     (folder / "poses.parquet").write_text("")
@@ -468,7 +468,7 @@ def test_an_evaluation_that_was_killed_while_its_files_were_put_in_place_is_done
 
 
 @pytest.mark.long
-def test_a_training_that_takes_longer_than_its_hours_is_made_shorter(tmp_path):
+def test_run_steps_shortens_training_to_its_hours(tmp_path):
     words = ("pretrain", "--size", "tiny", "--people", "200000", "--batch", "4", "--workers", "0", "--pictures", "0")
     step = Step(words, hours=0.0005)
     run_steps(step, tmp_path, main, print)
@@ -476,11 +476,11 @@ def test_a_training_that_takes_longer_than_its_hours_is_made_shorter(tmp_path):
     assert option == "--people" and 8 <= int(people) < 20_000
     seen = steps.last_entry(step.folder(tmp_path))["people"]
     assert seen == -(-int(people) // 4) * 4
-    # batches that end between the look at the log and the stop cannot be taken back
+    # includes batches that end between reading the log and stopping
     assert int(steps._shortened(step, step.folder(tmp_path), fit=1.0)[1]) >= seen
 
 
-# --- what a table says
+# --- pages
 
 
 def _entry(**changes):
@@ -497,7 +497,7 @@ def _entry(**changes):
     return entry | {"undertrained": False} | changes
 
 
-def test_cells_in_words():
+def test_markdown_of_cells():
     entries = [
         _entry(published=51.6),
         _entry(row="b"), _entry(row="b", seed=1, mpjpe=120.0, undertrained=True),
@@ -534,7 +534,7 @@ def _study(scale):
 
 
 @pytest.mark.parametrize("name", ["fig7", "fig8"])
-def test_curves_and_ends_of_several_networks(tmp_path, name, monkeypatch):
+def test_fig7_and_fig8_draw_several_networks(tmp_path, name, monkeypatch):
     drawn, png_of = [], charts.png_of
     monkeypatch.setattr(charts, "png_of", lambda figure, path: drawn.append(figure) or png_of(figure, path))
     selected = cells(TABLES[name], Options(), ["dapt", "ours"])
@@ -545,13 +545,13 @@ def test_curves_and_ends_of_several_networks(tmp_path, name, monkeypatch):
         steps._note(cell.evaluation, tmp_path, done=True)
     (path,) = figures.draw(name, selected, tmp_path)
     assert path == tmp_path / f"{name}.png" and path.read_bytes().startswith(b"\x89PNG")
-    # who was scored, not what their folder is called
+    # the dataset's description, not the name of its folder
     words = " ".join(text.get_text() for text in drawn[0].findobj(Text))
     assert "the stand-in" in words and "synth-9-abc" not in words
     assert path.read_bytes() != _drawn_alone(name, selected[:1], tmp_path)
 
 
-def test_amounts_keep_their_places_where_a_network_has_no_pose(monkeypatch):
+def test_compare_stability_aligns_amounts_without_poses(monkeypatch):
     monkeypatch.setattr(charts, "png_of", lambda figure, _: figure)
     whole, gap = _study(1), _study(2)
     for curve in gap["curves"]:
@@ -562,7 +562,7 @@ def test_amounts_keep_their_places_where_a_network_has_no_pose(monkeypatch):
         assert labels == ["0", "1", "2", "3", "9"]
         np.testing.assert_array_equal(one.get_xdata(), other.get_xdata())
         np.testing.assert_array_equal(other.get_ydata(), [200, np.nan, 240, 260, np.nan])
-        # which names are of which lines stands below, where no line runs
+        # the legend is below the axes and hides no line
         assert axes.get_legend() is None
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["whole", "gap"]
 
@@ -571,18 +571,18 @@ def _drawn_alone(name, selected, out):
     return figures.draw(name, selected, out)[0].read_bytes()
 
 
-def test_one_body_at_many_places(tmp_path, monkeypatch, capsys):
+def test_fig6_draws_one_body_at_all_distances(tmp_path, monkeypatch, capsys):
     drawn = []
     monkeypatch.setattr(figures, "draw_people", lambda panels, *_, **__: drawn.extend(panels))
     assert main(["paper", "fig6", "--out", str(tmp_path / "out")]) == 0
     bodies = np.array([panel.truth.joints - panel.truth.joints[0] for panel in drawn])
-    # one body, turned alike: masks and distances change the points alone
+    # the same body and rotation: masks and distances change only the points
     np.testing.assert_allclose(bodies, np.broadcast_to(bodies[0], bodies.shape), atol=1e-4)
     counts = np.array([len(panel.points) for panel in drawn]).reshape(len(figures._DISTANCES), -1)
     assert (np.diff(counts[:, 0]) < 0).all() and (counts[:, -1] < counts[:, 0]).all()
 
 
-def test_an_out_folder_of_something_else_is_refused(tmp_path):
+def test_check_out_rejects_folder_with_other_files(tmp_path):
     (tmp_path / "x").write_text("")
     with pytest.raises(InputError, match="expected a new or empty folder"):
         steps.check_out(tmp_path)
@@ -590,8 +590,8 @@ def test_an_out_folder_of_something_else_is_refused(tmp_path):
 
 
 @pytest.mark.long
-def test_raw_files_of_lidarhuman26m_become_a_row_of_table_1(tmp_path, smpl, monkeypatch):
-    """Every step as a user types it; so few frames teach nothing."""
+def test_paper_table1_from_raw_lidarhuman26m(tmp_path, smpl, monkeypatch):
+    """All commands as typed by a user; accuracy is not checked with so few frames."""
     monkeypatch.setitem(RECIPES[Finetune]["lidarcap"], "epochs", 8.0)
     raw, prepared, out = tmp_path / "raw", tmp_path / "set", tmp_path / "paper"
     write_lidarhuman26m(raw, smpl, sequences=("5", "7"), frames=16)

@@ -1,4 +1,4 @@
-"""Rosettes and depth cameras: what they send, and what of it comes back from a body that moves."""
+"""Ray patterns of rosettes and depth cameras, and their scans of moving bodies."""
 
 import pickle
 
@@ -18,7 +18,7 @@ BY_NAME = {p.name: p for p in PATTERNS}
 
 
 @pytest.mark.parametrize("name", BY_NAME)
-def test_rays_are_sorted_unit_and_inside_the_field_of_view(name):
+def test_pattern_rays_are_sorted_unit_and_in_field_of_view(name):
     pattern = BY_NAME[name]
     for number in (0, pattern.frames - 1):
         rays = pattern.frame(number)
@@ -29,7 +29,7 @@ def test_rays_are_sorted_unit_and_inside_the_field_of_view(name):
         assert rays.azimuth.min() >= pattern.azimuths[0] - slack and rays.azimuth.max() <= pattern.azimuths[1] + slack
         assert rays.elevation.min() >= pattern.elevations[0] - slack
         assert rays.elevation.max() <= pattern.elevations[1] + slack
-        # the field of view is filled to its edges
+        # rays reach the edges of the field of view
         assert np.ptp(rays.elevation) > 0.95 * (pattern.elevations[1] - pattern.elevations[0])
         assert np.ptp(rays.azimuth) > 0.95 * (pattern.azimuths[1] - pattern.azimuths[0])
         np.testing.assert_allclose(np.arctan2(rays.directions[:, 1], rays.directions[:, 0]), rays.azimuth, atol=1e-12)
@@ -37,7 +37,7 @@ def test_rays_are_sorted_unit_and_inside_the_field_of_view(name):
         with pytest.raises(ValueError, match="read-only"):
             rays.directions[0] = 0
     assert pattern.frame(-1) is pattern.frame(pattern.frames - 1) is rays
-    # frames are made again in another process
+    # frames are computed again after unpickling
     stored = pickle.dumps(pattern)
     assert len(stored) < 10_000
     again = pickle.loads(stored).frame(-1)
@@ -49,7 +49,7 @@ def test_rays_are_sorted_unit_and_inside_the_field_of_view(name):
     ("name", "rate"),
     [("livox-mid40", 100e3), ("livox-mid100", 300e3), ("livox-avia", 240e3), ("livox-mid360", 200e3)],
 )
-def test_rosettes_send_what_their_makers_say_and_never_twice_alike(name, rate):
+def test_rosettes_have_published_rate_and_different_frames(name, rate):
     pattern = BY_NAME[name]
     first, second = pattern.frame(0), pattern.frame(1)
     assert len(first.azimuth) == rate * pattern.duration
@@ -58,7 +58,7 @@ def test_rosettes_send_what_their_makers_say_and_never_twice_alike(name, rate):
     sample = second.directions[:: len(second.directions) // 300]
     nearest = np.arccos(np.clip(sample @ first.directions.T, -1, 1).max(1))
     assert np.mean(nearest > np.radians(0.1)) > 0.3
-    # and the frames together fill what one leaves open
+    # all frames together cover more than one frame
     edges = [np.linspace(*pattern.azimuths, 25), np.linspace(*pattern.elevations, 25)]
     filled = []
     for frames in (1, pattern.frames):
@@ -83,7 +83,7 @@ PUBLISHED = {
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_patterns_run_as_their_makers_tables_do(name):
+def test_patterns_match_published_tables(name):
     first, rows = PUBLISHED[name]
     azimuth, elevation, _, line = BY_NAME[name].rays(0)
     part = slice(first, first + len(rows))
@@ -93,17 +93,17 @@ def test_patterns_run_as_their_makers_tables_do(name):
     assert line[part].tolist() == ([0, 0, 0] if name == "livox-mid40" else list(range(len(rows))))
 
 
-def test_a_mid360_runs_round_while_it_sinks_and_rises():
+def test_mid360_turns_clockwise_while_it_sinks_and_rises():
     azimuth, elevation, time, line = BY_NAME["livox-mid360"].rays(3)
     one = line == 1
     turns = np.diff(np.unwrap(azimuth[one]))
-    # clockwise, 182 times a second: each ring is a fiftieth of the frame
+    # clockwise, 182 turns per second
     assert (turns < 0).all() and turns.sum() / (2 * np.pi) == pytest.approx(-18.24, abs=0.3)
     lowest = time[one][np.argmin(elevation[one])]
     assert 0.4 < lowest < 0.6 and np.degrees(elevation[one][[0, -1]]).min() > 40
 
 
-def test_the_mid100_is_three_mid40_out_of_step():
+def test_mid100_consists_of_three_mid40():
     rays = BY_NAME["livox-mid100"].frame(5)
     for unit, center in enumerate((-30, 0, 30)):
         mine = rays.line == unit
@@ -114,7 +114,7 @@ def test_the_mid100_is_three_mid40_out_of_step():
     np.testing.assert_allclose(np.sort(middle.azimuth), np.sort(rays.azimuth[rays.line == 0] + np.pi / 6), atol=1e-9)
 
 
-def test_a_depth_camera_sees_a_grid_on_a_plane_and_all_at_once():
+def test_depth_camera_rays_are_planar_grid_at_one_time():
     rays = BY_NAME["depth-camera"].frame(0)
     on_plane = (rays.directions[:, 1:] / rays.directions[:, :1]).round(9)
     across, up = np.unique(on_plane[:, 0]), np.unique(on_plane[:, 1])
@@ -125,19 +125,19 @@ def test_a_depth_camera_sees_a_grid_on_a_plane_and_all_at_once():
 
 
 def brute(vertices, faces, pattern, frame, moved):
-    """All rays of the frame against the triangles as each ray finds them."""
+    """Distances of all rays of the frame, each to the triangles at the ray's time."""
     rays = pattern.frame(frame)
     return cast_ray_list_reference(vertices, faces, rays.directions, moved=moved, time=rays.time)[0]
 
 
 def small(name, count):
-    """A pattern with every so manyth ray: brute force is slow."""
+    """A pattern with about `count` of the rays, because brute force is slow."""
     whole = BY_NAME[name]
 
     def rays(number):
         azimuth, elevation, time, line = whole.rays(number)
         keep = slice(None, None, max(1, len(azimuth) // count))
-        # few times, so that the twin casts few scenes
+        # few different times, so that brute force casts few scenes
         return azimuth[keep], elevation[keep], np.round(time[keep] * 8) / 8, line[keep]
 
     return RayPattern(
@@ -147,7 +147,7 @@ def small(name, count):
 
 @settings(max_examples=25, deadline=None)
 @given(st.sampled_from(["livox-mid360", "livox-avia"]), st.floats(-np.pi, np.pi), st.integers(0, 2**32 - 1))
-def test_nothing_is_lost_at_the_window_s_edge_or_the_seam(name, azimuth, seed):
+def test_scan_pattern_matches_brute_force(name, azimuth, seed):
     rng = np.random.default_rng(seed)
     pattern = small(name, 6000)
     place = rng.uniform(1.5, 6) * np.array([np.cos(azimuth), np.sin(azimuth), 0]) + [0, 0, rng.uniform(-0.8, 1)]
@@ -157,7 +157,7 @@ def test_nothing_is_lost_at_the_window_s_edge_or_the_seam(name, azimuth, seed):
     expected = brute(mesh.vertices, mesh.faces, pattern, 1, moved)
     expected[~((expected >= pattern.range_min) & (expected <= pattern.range_max))] = np.inf
     seen = np.flatnonzero(np.isfinite(expected))
-    # rays that touch an edge may fall on either side of it
+    # rays that touch an edge may hit or miss
     assert len(np.setxor1d(hits.column, seen)) <= 0.01 * len(seen) + 1
     both = np.isin(hits.column, seen)
     np.testing.assert_allclose(
@@ -166,7 +166,7 @@ def test_nothing_is_lost_at_the_window_s_edge_or_the_seam(name, azimuth, seed):
     np.testing.assert_array_equal(hits.ring, pattern.frame(1).line[hits.column])
 
 
-def test_a_body_that_moves_is_smeared():
+def test_scan_pattern_smears_moving_body():
     pattern = sensor("livox-avia")
     mesh = box(np.array([0.4, 0.4, 1.7])).moved(np.array([5.0, 0, -0.8]))
     still = scan_pattern(mesh.vertices, mesh.faces, pattern, 0)
@@ -175,7 +175,7 @@ def test_a_body_that_moves_is_smeared():
     assert np.ptp(still.points[:, 1]) < 0.41 and 0.5 < np.ptp(walked.points[:, 1]) < 0.56
 
 
-def test_what_stands_before_a_body_hides_it_and_what_stands_aside_is_not_looked_at():
+def test_scan_pattern_occludes_body_and_omits_objects_beside_it():
     pattern = sensor("livox-avia")
     person = box(np.array([0.4, 0.6, 1.7])).moved(np.array([6.0, 0, -0.8]))
     wall = box(np.array([0.1, 4.0, 0.8])).moved(np.array([3.0, 2.0, -0.8]))
@@ -183,7 +183,7 @@ def test_what_stands_before_a_body_hides_it_and_what_stands_aside_is_not_looked_
     faces = np.concatenate([person.faces, wall.faces + len(person.vertices)])
     free = scan_pattern(person.vertices, person.faces, pattern, 2)
     both = scan_pattern(vertices, faces, pattern, 2, body_vertices=len(person.vertices))
-    # the same rays, some of which stop at the wall, of which nothing beside the person is seen
+    # the same rays, some of which hit the wall; hits on the wall beside the person are omitted
     assert np.isin(free.column, both.column).all()
     is_wall = both.face >= len(person.faces)
     assert 0 < is_wall.sum() < len(is_wall) and np.abs(both.points[is_wall, 1]).max() < 0.35
@@ -194,7 +194,7 @@ def test_what_stands_before_a_body_hides_it_and_what_stands_aside_is_not_looked_
     assert (wider.face >= len(person.faces)).sum() > is_wall.sum()
 
 
-def test_range_limits_hold_and_nothing_behind_is_seen():
+def test_scan_pattern_respects_range_and_field_of_view():
     for distance, seen in ((-2.0, False), (0.2, False), (2.0, True), (9.0, False)):
         mesh = box(np.array([0.01, 0.4, 0.4])).moved(np.array([distance, 0, -0.2]))
         hits = scan_pattern(mesh.vertices, mesh.faces, sensor("depth-camera"), 0)
@@ -215,7 +215,7 @@ def test_range_limits_hold_and_nothing_behind_is_seen():
         {"duration": -0.1},
     ],
 )
-def test_impossible_patterns_are_refused(wrong):
+def test_ray_pattern_rejects_invalid_values(wrong):
     given = {"name": "x", "rays": BY_NAME["livox-mid40"].rays, "frames": 1, "duration": 0.1}
     with pytest.raises(InputError, match="RayPattern"):
         RayPattern(**{**given, "azimuths": (-1.0, 1.0), "elevations": (-1.0, 1.0), **wrong})

@@ -1,4 +1,4 @@
-"""One person's result: what its JSON says and where its picture draws."""
+"""Results of people: JSON, tables, pictures, ids."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import SMPL24
 
 
-def test_json_says_what_the_pose_says():
+def test_person_pose_to_dict_matches_pose():
     rng = np.random.default_rng(0)
     told = {name: rng.random(24) for name in ("confidence", "spread", "visible")}
     pose = Pose(joints=rng.normal(size=(24, 3)), skeleton=SMPL24, in_range=rng.random(24) < 0.5, **told)
@@ -23,7 +23,7 @@ def test_json_says_what_the_pose_says():
     assert entry["score"] is entry["mounted"] is None
 
 
-def test_the_score_of_a_box_is_that_of_its_person():
+def test_person_pose_has_score_of_its_box():
     box = Box(center=[1, 2, 3], size=[0.6, 0.7, 1.8], score=0.87654, mounted=False)
     pose = Pose(joints=np.zeros((24, 3)), skeleton=SMPL24)
     person = PersonPose(pose=pose, skeleton=SMPL24, points=np.zeros((7, 3)), box=box)
@@ -35,7 +35,7 @@ def test_the_score_of_a_box_is_that_of_its_person():
     assert table["person_probability"].isna().all() and table["second_person"].isna().all()
 
 
-def test_tables_hold_whether_it_is_a_person_beside_the_person_s_number():
+def test_poses_to_dataframe_has_person_probability():
     pose = Pose(joints=np.zeros((24, 3)), skeleton=SMPL24, person=0.25, second_person=0.75)
     person = PersonPose(pose=pose, skeleton=SMPL24, points=np.zeros((7, 3)))
     table = Poses(people=(person, person), skeleton=SMPL24).to_dataframe()
@@ -43,7 +43,7 @@ def test_tables_hold_whether_it_is_a_person_beside_the_person_s_number():
     assert table["person"].tolist() == [0] * 24 + [1] * 24
 
 
-def test_pictures_stand_upright_whatever_the_axes(monkeypatch):
+def test_picture_is_upright_for_any_up_axis(monkeypatch):
     drawn = []
     monkeypatch.setattr(picture, "draw_people", lambda panels, path=None, *, title="": drawn.extend(panels) or b"")
     rng = np.random.default_rng(0)
@@ -58,13 +58,13 @@ def test_pictures_stand_upright_whatever_the_axes(monkeypatch):
         if up in UP_AXES:
             np.testing.assert_allclose(drawn[-1].box.center, center)
         else:
-            # a box of a frame that leans is not upright
+            # a box in a tilted frame is not upright
             assert drawn[-1].box is None
 
 
 @pytest.mark.long
-def test_a_searched_scan_is_drawn_from_above(monkeypatch, tmp_path):
-    """With z up whatever the axes, with the sensor where its place is known; above the people's cards."""
+def test_picture_of_scan_has_view_from_above(monkeypatch, tmp_path):
+    """With z up for any up axis, with the sensor if its origin is known, and above the people's panels."""
     panels = []
     draw = bird_eye.draw_scans
     monkeypatch.setattr(bird_eye, "draw_scans", lambda given, **more: panels.extend(given) or draw(given, **more))
@@ -88,12 +88,12 @@ def test_a_searched_scan_is_drawn_from_above(monkeypatch, tmp_path):
     assert len(alone) < len(sheet) and panels[-1].sensor is None and panels[-1].label == "no people found"
 
 
-def test_one_person_s_page_is_that_of_a_call(tmp_path):
+def test_person_pose_html_matches_poses_html(tmp_path):
     person = PersonPose(pose=None, skeleton=SMPL24, points=np.zeros((9, 3)))
     assert person.html(tmp_path / "a.html", title="one") == person.alone().html(title="one")
 
 
-def test_who_has_no_id_is_not_called_none():
+def test_poses_without_ids_cannot_be_indexed_by_id():
     people = PersonPose(pose=None, skeleton=SMPL24, points=np.zeros((9, 3))).alone()
     with pytest.raises(KeyError, match="ids are not set"):
         people["None"]

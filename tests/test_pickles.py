@@ -1,4 +1,4 @@
-"""Pickles: data comes out as pickle itself would give it, nothing else is named, called or imported."""
+"""Pickles: data is read as by pickle itself; all other names are refused, not imported and not called."""
 
 import collections
 import io
@@ -35,7 +35,7 @@ def refused(load):
 
 
 def same(a, b):
-    """Of one type and one content, parts included."""
+    """Asserts equal types and contents, also of parts."""
     assert type(a) is type(b)
     if isinstance(a, np.ndarray):
         assert a.dtype == b.dtype and a.shape == b.shape
@@ -50,7 +50,7 @@ def same(a, b):
 
 
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
-def test_data_comes_out_as_it_went_in(load, protocol):
+def test_load_pickle_round_trip(load, protocol):
     same(load(pickle.dumps(DATA, protocol)), DATA)
     same(
         load(pickle.dumps(collections.OrderedDict(b=[1], a=collections.defaultdict(list, c=2)), protocol)),
@@ -60,7 +60,7 @@ def test_data_comes_out_as_it_went_in(load, protocol):
     assert load(pickle.dumps([np.dtype("<f4"), np.dtype(">i2")], protocol)) == [np.dtype("<f4"), np.dtype(">i2")]
 
 
-def test_what_is_shared_stays_shared(load):
+def test_load_pickle_keeps_shared_objects(load):
     array, items = np.arange(3), [1]
     a, b, c, d = load(pickle.dumps([array, array, items, items]))
     assert a is b and c is d
@@ -68,7 +68,7 @@ def test_what_is_shared_stays_shared(load):
     assert b[0] == 7, "arrays can be written to"
 
 
-def test_python_2_pickles(load):
+def test_load_pickle_reads_python_2_pickles(load):
     values = np.array([1.5, -2.0, 1e300])
     same(load(b"\x80\x02" + old_array(values, b"f8") + b"."), values)
     # as dumped by protocol 0 and 1: quoted text, numbers in text, dict and list from marks
@@ -87,7 +87,7 @@ def foreign(name: str, **state):
 
 
 class ForeignPickler(pickle._Pickler):
-    """Names classes that no module has."""
+    """Pickles classes that do not exist in their modules."""
 
     dispatch = {
         **pickle._Pickler.dispatch,
@@ -110,7 +110,7 @@ CSR = dict(indptr=int32(0, 2, 3), indices=int32(1, 3, 0), data=np.array([2.0, 1,
 
 
 @pytest.mark.parametrize("protocol", [0, 1, 2, 4])
-def test_smpl_like_pickles_need_neither_chumpy_nor_scipy(load, monkeypatch, protocol):
+def test_load_pickle_reads_smpl_without_chumpy_and_scipy(load, monkeypatch, protocol):
     x = np.arange(6.0).reshape(2, 3)
     ch = foreign("chumpy.ch.Ch", x=x, _dirty_vars={"x"}, _itr=None)
     content = {
@@ -122,7 +122,7 @@ def test_smpl_like_pickles_need_neither_chumpy_nor_scipy(load, monkeypatch, prot
         "style": "lbs",
     }
     for module in ("chumpy", "scipy"):
-        # importing them would be an error
+        # an import of them raises an error
         monkeypatch.setitem(sys.modules, module, None)
     body = load(dumped(content, protocol))
     np.testing.assert_array_equal(body["v"], x)
@@ -142,12 +142,12 @@ def test_smpl_like_pickles_need_neither_chumpy_nor_scipy(load, monkeypatch, prot
         dict(indices=int32(1, 0, 0)[:, None]), dict(indptr=None),
     ],
 )  # fmt: skip
-def test_wrong_sparse_matrices(refused, wrong):
+def test_load_pickle_rejects_bad_sparse_matrices(refused, wrong):
     line = refused(dumped(foreign("scipy.sparse.csc.csc_matrix", **CSC | wrong)))
     assert "has a scipy.sparse.csc.csc_matrix" in line
 
 
-def test_sparse_matrices_are_counted_together(load, refused, monkeypatch):
+def test_load_pickle_limits_total_of_sparse_matrices(load, refused, monkeypatch):
     empty = dict(indptr=int32(0, 0, 0, 0, 0), indices=int32(), data=np.zeros(0), _shape=(2, 4))
     two, three = (dumped([foreign("scipy.sparse.csc.csc_matrix", **empty) for _ in range(n)]) for n in (2, 3))
     monkeypatch.setattr(pickles, "MAX_DENSE", 16)
@@ -163,7 +163,7 @@ class Evil:
         return self.call, self.args
 
 
-def test_whatever_else_is_named_is_refused_by_name_and_not_run(refused, tmp_path, monkeypatch):
+def test_load_pickle_refuses_other_names_without_calling_them(refused, tmp_path, monkeypatch):
     mark = tmp_path / "ran"
     command = f"touch {mark}"
     for call, args, name in (
@@ -182,7 +182,7 @@ def test_whatever_else_is_named_is_refused_by_name_and_not_run(refused, tmp_path
             b"\x80\x04\x8c%c%s\x8c%c%s\x93." % (len(module), module.encode(), len(name), name.encode())
         )
     assert not mark.exists()
-    # modules of names that are allowed are not imported either
+    # modules of allowed names are not imported either
     monkeypatch.setitem(sys.modules, "chumpy", None)
     refused(b"cos\nsystem\n(S'x'\ntR.")
 
@@ -195,7 +195,7 @@ HOSTILE = {
     "unsupported persistent id": [b"Pabc\n.", b"K\x01Q."],
     "registered number": [b"\x80\x02" + code + b"." for code in (b"\x82\x01", b"\x83\x01\0", b"\x84\x01\0\0\0")],
     "out-of-band data": [b"\x80\x05\x97."],
-    # the state of a class, of a function, of plain values; calls of what is no function
+    # a state of a class, of a function, of plain values; calls of objects that are not functions
     "a state of a": [
         b"\x80\x02" + target + b"}b."
         for target in (b"cnumpy\nndarray\n", b"cnumpy.core.multiarray\n_reconstruct\n", b"]", b"}", b"K\x01")
@@ -204,9 +204,9 @@ HOSTILE = {
     "a call of numpy.ndarray": [b"cnumpy\nndarray\n)R."],
     "without content": [b"cscipy.sparse.csc\ncsc_matrix\n)R."],
     "damaged": [b"\x80\x02j\x05\0\0\0.", b"]}K\x01K\x02s0(K\x01\x90.", b"cnumpy\ndtype\n)\x81N\x92."],
-    # memory: announced sizes
+    # announced sizes that exceed the memory
     "cut off": [_announced(b"\x8e", 2**62), _announced(b"\x96", 2**40)],
-    # a nested tuple as a key would end the interpreter
+    # a deeply nested tuple as a key would crash the interpreter
     "as a key": [b"})" + b"\x85" * 300_000 + b"Ns.", b"}]Ns.", pickle.dumps({k * (2**61 - 1): 0 for k in range(9)}, 2)],
     "nested more than": [b"]" * 200_000 + b"a" * 199_999 + b"."],
     "contains itself": [b"]q\x00h\x00a."],
@@ -215,16 +215,16 @@ HOSTILE = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("words", HOSTILE)
-def test_hostile_instructions(refused, words):
+def test_load_pickle_rejects_hostile_opcodes(refused, words):
     for data in HOSTILE[words]:
         assert words in refused(data)
 
 
-def test_odd_instructions_that_do_no_harm(load):
-    # the last of 2**32 places in the memo
+def test_load_pickle_accepts_odd_harmless_opcodes(load):
+    # the last of 2**32 memo indices
     assert load(b"K\x07r\xff\xff\xff\xff0j\xff\xff\xff\xff.") == 7
     assert load(pickle.dumps({2**62: 1, -1: 2}, protocol=2)) == {2**62: 1, -1: 2}
-    # sharing is no copy: 2**60 references to one list
+    # references are not copied: 2**60 references to one list
     shared = load(b"]q\x00" + b"0(h\x00h\x00tq\x00" * 60 + b".")
     assert shared[0] is shared[1]
 
@@ -244,15 +244,15 @@ def test_odd_instructions_that_do_no_harm(load):
         (b"R(K\x01", b"R.", "without content"),
     ],
 )
-def test_hostile_arrays(refused, old, new, hint):
+def test_load_pickle_rejects_hostile_arrays(refused, old, new, hint):
     array = old_array(np.arange(3.0), b"f8")
     assert old in array
     assert hint in refused(b"\x80\x02" + array.replace(old, new, 1) + b".")
 
 
 @pytest.mark.long
-def test_memory_and_time_stay_in_proportion_to_the_file(load, refused):
-    """A few bytes each refer to what was read before, have one hash with all others, or make an object."""
+def test_load_pickle_bounds_memory_and_time(load, refused):
+    """In these files a few bytes refer to large earlier objects, have equal hashes, or create an object."""
 
     def list_of(shared: bytes, part: bytes, count: int) -> bytes:
         return b"\x80\x02(" + shared + b"q\x01" + part * count + b"l."
@@ -268,7 +268,7 @@ def test_memory_and_time_stay_in_proportion_to_the_file(load, refused):
         list_of(b"(" + b"N" * 9_000 + b"t", b"c__builtin__\nlist\nh\x01\x85R", 60),
     ):
         assert "arrays larger than 8 times the file" in refused(data)
-    # -1 and -2 have one hash, and so have all tuples of them
+    # -1 and -2 have equal hashes, and so have all tuples of them
     tuples = [tuple(-1 - (i >> k & 1) for k in range(11)) for i in range(1_500)]
     assert len({hash(key) for key in tuples}) == 1
     with_text = [("a", *numbers) for numbers in tuples]
@@ -277,21 +277,21 @@ def test_memory_and_time_stay_in_proportion_to_the_file(load, refused):
         for data in (dict.fromkeys(keys), set(keys), frozenset(keys)):
             for protocol in (0, 2, 4):
                 assert "as keys" in refused(pickle.dumps(data, protocol))
-    # text is hashed with a secret, alone and within a tuple
+    # hashes of text are randomized, also within a tuple
     many = {key: None for i in range(30_000) for key in (str(i), ("a", i))}
     assert load(pickle.dumps(many)) == many
-    # one key in many dicts is no clash
+    # equal keys in many dicts are not collisions
     again = [{("a", k): None} for k in (1, 2) for _ in range(1_500)]
     assert load(pickle.dumps(again)) == again
-    # what is done anew at each mention of one long part
+    # work that is repeated for each reference to one long object
     numbers = b"(" + b"K\x01" * 10_000 + b"t"
     assert "a tuple of 10000 as a key" in refused(list_of(numbers, b"}h\x01Ns", 10))
     assert "can't multiply" in refused(list_of(text, b"c__builtin__\ncomplex\nh\x01K\x01\x86R", 10))
-    # numbers that share one hash, as names of what is remembered
+    # numbers with equal hashes as memo indices
     assert "more than 32 bits" in refused(b"Np%d\n." % (2**61 - 1))
 
 
-def test_files(load, refused, tmp_path):
+def test_load_pickle_reports_bad_files(load, refused, tmp_path):
     refusal(load_pickle, tmp_path / "none.pkl", words=["no such file; expected a pickle"])
     refusal(load_pickle, tmp_path, words=["got a folder"])
     assert "is empty" in refused(b"")

@@ -1,4 +1,4 @@
-"""Where people stand before sensors: inside the field of view, at distances that give real point counts."""
+"""Placement of people and sensors: within the field of view, at distances with realistic point counts."""
 
 from dataclasses import replace
 
@@ -16,10 +16,10 @@ WILD = SCENES["wild"]
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_distances_keep_their_range(name):
+def test_draw_distance_stays_in_range(name):
     config, rng = SCENES[name], np.random.default_rng(0)
     for device in map(sensor, config.sensors):
-        # another try comes nearer
+        # a retry is nearer
         far, near = (
             draw_place(config, device, 1.7, 0.3, nearer, np.random.default_rng(5)).distance for nearer in (1.0, 0.5)
         )
@@ -30,8 +30,8 @@ def test_distances_keep_their_range(name):
             assert drawn.mean() == pytest.approx(np.mean(config.distance), abs=1) and np.ptp(drawn) > 14
 
 
-def test_lasers_of_one_elevation_share_its_beams():
-    """As many points are wanted of whatever sensor: twice the beams, the root of two farther."""
+def test_draw_distance_counts_lasers_of_equal_elevation():
+    """All sensors get the same number of points: with twice the beams, sqrt(2) farther."""
     elevations, step = np.radians(np.linspace(-15, 15, 16)), np.radians(0.2)
     once = Sensor(name="once", elevations=elevations, azimuth_step=step)
     twice = Sensor(
@@ -47,12 +47,12 @@ def test_lasers_of_one_elevation_share_its_beams():
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(2, 40), st.floats(0.4, 2.1), st.floats(-0.3, 0.3), st.floats(-3, 3))
-def test_a_sensor_is_mounted_so_that_the_person_fits(seed, distance, tall, pitch, ahead):
+def test_draw_height_fits_person_into_field_of_view(seed, distance, tall, pitch, ahead):
     device = sensor("os1-128")
     height = draw_height(device, distance, tall, 0.3, pitch, ahead, np.random.default_rng(seed), cut=0.0)
     low, high = distance * np.tan(device.elevations[[0, -1]] - pitch * np.cos(ahead))
     if high - low > tall:
-        # the head may be cut only where the feet would be
+        # the head may be cut only if otherwise the feet were
         assert -height >= low - 1e-9
         assert tall - height <= max(high, low + tall) + 1e-9
     else:
@@ -61,14 +61,14 @@ def test_a_sensor_is_mounted_so_that_the_person_fits(seed, distance, tall, pitch
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(1, 7.9), st.floats(0.4, 2.1), st.sampled_from(sorted(SENSORS)))
-def test_a_sensor_near_people_is_above_their_ground(seed, distance, tall, name):
+def test_draw_height_near_people_is_above_ground(seed, distance, tall, name):
     for cut in (0.0, 1.0):
         assert draw_height(sensor(name), distance, tall, 0.5, 0.0, 0.0, np.random.default_rng(seed), cut=cut) >= 0.1
 
 
 @pytest.mark.parametrize("name", sorted(SENSORS))
-def test_hardly_anybody_is_cut_by_the_field_of_view(name):
-    """At most about 5 percent stick out where there is room for them."""
+def test_draw_place_rarely_cuts_people_by_field_of_view(name):
+    """Counts people for whom the field of view is large enough."""
     device, rng = sensor(name), np.random.default_rng(3)
     body = np.array([[x, y, z] for x in (-0.2, 0.2) for y in (-0.3, 0.3) for z in (0.0, 0.9, 1.7)], np.float32)
     cut = total = 0
@@ -88,7 +88,16 @@ def test_hardly_anybody_is_cut_by_the_field_of_view(name):
     assert total > 100 and cut / total < 0.09
 
 
-def test_the_paper_s_sensor_keeps_its_height_and_level():
+def test_narrow_field_of_view_holds_whole_person():
+    device, rng, sides = sensor("livox-avia"), np.random.default_rng(4), []
+    for _ in range(400):
+        place = draw_place(replace(WILD, distance=(5.0, 6.0)), device, 1.7, 1.2, 1.0, rng)
+        sides.append(abs(np.arctan2(place.feet[1], place.feet[0])) + np.arctan2(1.2, place.distance))
+    # about 5 percent may be cut
+    assert np.mean(np.array(sides) > device.azimuths[1] + 1e-9) < 0.06
+
+
+def test_draw_place_paper_sensor_is_level_at_fixed_height():
     rng = np.random.default_rng(1)
     azimuths = []
     for _ in range(200):
@@ -99,9 +108,22 @@ def test_the_paper_s_sensor_keeps_its_height_and_level():
     assert {int(a) for a in np.floor(np.array(azimuths) / (np.pi / 4))} == set(range(-4, 4))
 
 
+@pytest.mark.parametrize("tilt", [0.0, 40.0])
+def test_inverted_sensor_ignores_tilt_of_upright_mount(tilt):
+    device, rng = replace(sensor("vlp-16"), tilt=np.radians(tilt)), np.random.default_rng(2)
+    for _ in range(50):
+        place = draw_place(replace(WILD, mount=0.0), device, 1.7, 0.3, 1.0, rng, inverted=True)
+        assert 2 <= -place.feet[2] <= 5
+        ends = place.to_sensor(place.feet + np.array([[0, 0, 0], [0, 0, 1.7]]))
+        feet, head = np.arctan2(ends[:, 2], np.hypot(ends[:, 0], ends[:, 1]))
+        # upside down, with the person inside the fan or centered in it
+        low, high = device.elevations[[0, -1]]
+        assert feet > head and ((low - 1e-9 <= head and feet <= high + 1e-9) or abs(feet + head - low - high) < 1e-6)
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_frames_go_there_and_back(seed):
+def test_place_to_sensor_and_to_level_are_inverse(seed):
     rng = np.random.default_rng(seed)
     place = draw_place(WILD, sensor("os1-128"), 1.7, 0.3, 1.0, rng)
     points = rng.normal(0, 3, (20, 3))
@@ -109,12 +131,12 @@ def test_frames_go_there_and_back(seed):
     np.testing.assert_allclose(
         np.linalg.norm(place.to_sensor(points), axis=1), np.linalg.norm(points, axis=1), atol=1e-12
     )
-    # a step along a body's x is a step along its yaw
+    # the body's x axis points along its yaw
     step = place.of_body(np.array([[1.0, 0, 0]])) - place.of_body(np.zeros((1, 3)))
     np.testing.assert_allclose(step[0], [np.cos(place.yaw), np.sin(place.yaw), 0], atol=1e-12)
 
 
-def test_a_tilted_sensor_looks_down_ahead():
+def test_draw_place_puts_people_ahead_of_tilted_sensor():
     device = replace(sensor("os1-128"), tilt=np.radians(45.0))
     rng = np.random.default_rng(2)
     elevations = []

@@ -1,4 +1,4 @@
-"""The pose prior: single poses, clips of people who go on, balance, contact with the ground and with themselves."""
+"""The pose prior: single poses, clips, balance, contact with the ground, self-collision."""
 
 from dataclasses import replace
 from functools import cache
@@ -32,7 +32,7 @@ def drawn(n=1500, seed=0, **mix):
 
 
 def latents_of(n, seed, **mix):
-    """The mix's latents, as they are drawn before anybody is replaced."""
+    """The mix's latents as drawn, before any are replaced."""
     rng = np.random.default_rng(seed)
     return latents.draw_latents(rng, rng.choice(len(KINDS), n, p=sampling._kind_shares(mix or None)))
 
@@ -47,7 +47,7 @@ def clips(kind, n=12, frames=80, hz=HZ, seed=0):
 
 
 def placed(drawn):
-    """Joints (n, F, 24, 3) and soles (n, F, 8, 3) of the mean adult where the clip puts them, the ground at 0."""
+    """Joints (n, F, 24, 3) and soles (n, F, 8, 3) of the mean adult, placed by the clip, with the ground at 0."""
     n, frames = drawn.rotations.shape[:2]
     flat = drawn.rotations.reshape(-1, 24, 3, 3)
     soles = sole_points(flat).reshape(n, frames, 8, 3)
@@ -63,7 +63,7 @@ def placed(drawn):
 
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(0, 60), frames=st.integers(0, 7))
-def test_shapes_and_rotations(seed, n, frames):
+def test_sample_rotations_and_clips_shapes(seed, n, frames):
     prior = drawn(n, seed)
     assert prior.rotations.shape == (n, 24, 3, 3) and prior.kind.shape == (n,)
     check_rotations(prior.rotations)
@@ -78,7 +78,7 @@ def test_shapes_and_rotations(seed, n, frames):
         np.testing.assert_array_equal(clip.translation[:, 0], 0)
 
 
-def test_the_same_seed_gives_the_same_poses():
+def test_sample_poses_is_deterministic():
     poses, other = sampling.sample_poses(40, 3), sampling.sample_poses(40, 4)
     assert poses.shape == (40, 24, 3) and poses.dtype == np.float32 and np.abs(poses - other).max() > 0.1
     np.testing.assert_array_equal(poses, sampling.sample_poses(40, 3))
@@ -87,7 +87,7 @@ def test_the_same_seed_gives_the_same_poses():
     assert (np.linalg.norm(poses, axis=-1) < 1.6).all()
 
 
-def test_the_mix_is_obeyed():
+def test_sample_rotations_follows_mix():
     assert set(drawn(300, 0, sit=1, walk=3).kind) == {KINDS.index("sit"), KINDS.index("walk")}
     counts = np.bincount(drawn(20000, 0).kind, minlength=len(KINDS)) / 20000
     np.testing.assert_allclose(counts, activities.SHARES, atol=0.015)
@@ -110,12 +110,12 @@ def test_the_mix_is_obeyed():
         (lambda rng: sampling.sample_clips(rng, 1, frames=2, mix={"wakl": 1}), "did you mean walk"),
     ],
 )
-def test_wrong_arguments_are_named(call, message):
+def test_sampling_rejects_bad_arguments(call, message):
     with pytest.raises(InputError, match=message):
         call(np.random.default_rng(0))
 
 
-def test_latents_are_taken_together():
+def test_latents_take_selects_people():
     people, rows = latents_of(300, 0), np.random.default_rng(0).permutation(300)[:80]
     np.testing.assert_array_equal(sampling._angles(people.take(rows)).angles, sampling._angles(people).angles[rows])
 
@@ -123,7 +123,7 @@ def test_latents_are_taken_together():
 # angles and rotations
 
 
-def test_euler_angles_against_the_product_of_three_rotations():
+def test_from_euler_matches_product_of_rotations():
     euler = np.random.default_rng(0).uniform(-3, 3, (40, 3))
     reference = rotation_about("y", euler[:, 0]) @ rotation_about("x", euler[:, 1]) @ rotation_about("z", euler[:, 2])
     np.testing.assert_allclose(activities._from_euler(euler), reference, atol=1e-12)
@@ -132,13 +132,13 @@ def test_euler_angles_against_the_product_of_three_rotations():
 @pytest.mark.parametrize(
     "back", [fit.angles_from_rotations, lambda rotations: latents.from_features(fit.to_features(rotations))]
 )
-def test_angles_come_back_from_rotations(back):
+def test_angles_from_rotations_round_trip(back):
     rotations = rotations_from_angles(raw_angles(1000, 3))
-    # where an arm points straight out, raise and inward turn are not told apart, but the pose is the same
+    # if an arm points straight out, raise and inward turn are ambiguous, but the pose is the same
     np.testing.assert_allclose(rotations_from_angles(back(rotations)), rotations, atol=0.02)
 
 
-def test_a_mirrored_pose_is_the_mirror_image():
+def test_mirror_angles_gives_mirror_image():
     angles = raw_angles(200, 6)
     mirrored = mirror_angles(angles)
     assert (mirrored >= activities.LIMITS[0]).all() and (mirrored <= activities.LIMITS[1]).all()
@@ -149,7 +149,7 @@ def test_a_mirrored_pose_is_the_mirror_image():
     np.testing.assert_allclose(mean, mean[list(SMPL24.flip)] * [1, -1, 1], atol=0.03)
 
 
-def test_hinges_bend_one_way_and_not_too_far():
+def test_prior_bends_knees_and_elbows_within_limits():
     prior = drawn(4000, 1)
     for side, sign in SIDES:
         knee = prior.rotations[:, J[f"{side}_knee"]]
@@ -164,8 +164,8 @@ def test_hinges_bend_one_way_and_not_too_far():
         assert flexion.min() > -31
 
 
-def test_knees_point_forward_and_hands_reach_in_front():
-    """Signs, seen in space: a bent knee leads its ankle, a bent elbow lifts the hand forward."""
+def test_rotations_from_angles_has_expected_signs():
+    """A bent knee is ahead of its ankle, and a bent elbow moves the hand forward."""
     bent = np.zeros((1, 27))
     for name, angle in (("knee", 80), ("elbow", 80), ("abd", 15), ("out", 15)):
         bent[:, [A[f"{side}_{name}"] for side, _ in SIDES]] = angle
@@ -182,11 +182,11 @@ def test_knees_point_forward_and_hands_reach_in_front():
         assert moved > still + 0.1, angle
 
 
-# what people do
+# activities
 
 
 @pytest.mark.parametrize("kind", ["idle", "walk"])
-def test_standing_people_stand(kind):
+def test_prior_idle_and_walk_stand_upright(kind):
     p = joints_of(drawn(800, 2, **{kind: 1}).rotations)
     pelvis, feet = p[:, J["pelvis"], 2], p[:, [J["left_ankle"], J["right_ankle"]], 2]
     assert (p[:, J["head"], 2] > pelvis + 0.4).all()
@@ -200,7 +200,7 @@ def test_standing_people_stand(kind):
         assert np.median((thigh * shank).sum(-1)) > np.cos(np.radians(40))
 
 
-def test_arms_swing_against_the_legs():
+def test_prior_walk_swings_arms_opposite_to_legs():
     walkers = latents_of(24, 4, walk=1)
     walkers = replace(walkers, arm=np.full((24, 2), activities.OWN_ARMS), captured=np.zeros((24, 2, 27)))
     for walk in sampling._motion(walkers, np.arange(60) / 40).rotations:
@@ -215,8 +215,8 @@ def test_arms_swing_against_the_legs():
     assert np.corrcoef(arms, legs)[0, 1] < -0.3
 
 
-def test_a_stride_comes_round():
-    """Hips and knees of a stride are periodic, and the knee bends most in the swing."""
+def test_add_stride_is_periodic():
+    """Angles of a stride are periodic, and the knee bends most in the swing phase."""
     phase = np.linspace(0, 1, 40, endpoint=False)
     base, style, walk = np.zeros((40, 27)), np.full((40, 8), 0.5), np.full(40, gait.GAITS.index("walk"))
     stride, later = (gait.add_stride(walk, phase + k, style, base) for k in (0, 3))
@@ -226,7 +226,7 @@ def test_a_stride_comes_round():
     assert np.ptp(stride.pace) < 1e-9 and 0.7 < stride.pace[0] < 1.8
 
 
-def test_captured_poses_are_people_upright():
+def test_prior_captured_poses_are_upright():
     rng = np.random.default_rng(0)
     assert [latents.captured_angles(rng, n).shape for n in (500, 0)] == [(500, 2, 27), (0, 2, 27)]
     p = joints_of(drawn(500, 15, captured=1).rotations)
@@ -234,7 +234,7 @@ def test_captured_poses_are_people_upright():
     assert Path(rig.__file__).with_name("assets").joinpath("motion_prior.npz").stat().st_size < 60_000
 
 
-def test_the_fit_finds_a_known_mixture(tmp_path):
+def test_fit_mixture_recovers_known_mixture(tmp_path):
     rng = np.random.default_rng(0)
     far = rng.normal(size=(2, 27)) * 40
     which = rng.random(1500) < 0.3
@@ -253,12 +253,12 @@ def test_the_fit_finds_a_known_mixture(tmp_path):
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
-def test_people_move_as_fast_as_people(kind):
+def test_clips_have_human_speed_and_acceleration(kind):
     joints, _ = placed(clips(kind))
     speed = np.linalg.norm(np.diff(joints, axis=1), axis=-1) * HZ
-    assert 0.01 < speed.max() < 10  # nobody is a statue
+    assert 0.01 < speed.max() < 10  # there is motion
     acceleration = np.linalg.norm(np.diff(joints[:, ::2], n=2, axis=1), axis=-1) * (HZ / 2) ** 2
-    # a runner's foot is stopped in a few hundredths of a second; heads and hips are carried softly
+    # a runner's foot stops within a few hundredths of a second; heads and hips accelerate less
     assert np.percentile(acceleration, 99) < 130
     assert np.percentile(acceleration[:, :, [J["pelvis"], J["head"]]], 99) < (40 if kind != "fall" else 80)
 
@@ -268,8 +268,8 @@ def test_people_move_as_fast_as_people(kind):
     [("idle", 0.01), ("crouch", 0.02), ("bend", 0.02), ("step", 0.03), ("kneel", 0.02), ("sport", 0.05)]
     + [("captured", 0.04), ("walk", 0.03), ("push", 0.03), ("run", 0.04)],
 )
-def test_feet_that_stand_do_not_slide(kind, most):
-    """The lowest sole point of a frame that is low in the next one, too, went hardly anywhere."""
+def test_clips_standing_feet_do_not_slide(kind, most):
+    """The lowest sole point of a frame hardly moves if it is low in the next frame, too."""
     _, soles = placed(clips(kind, n=20, hz=10.0, frames=24))
     low = soles[..., 2].argmin(2)[:, :-1, None, None]
     here, there = (np.take_along_axis(part, low, 2)[:, :, 0] for part in (soles[:, :-1], soles[:, 1:]))
@@ -278,23 +278,23 @@ def test_feet_that_stand_do_not_slide(kind, most):
     assert len(slid) > 20 and np.percentile(slid, 95) < most
 
 
-def test_no_foot_goes_through_the_ground_and_hips_do_not_bob():
-    # hips of walkers rise and fall by a few centimeters, those of cyclists not at all
+def test_clips_feet_stay_above_ground_and_hips_steady():
+    # hips rise and fall by a few centimeters in walking, not at all in cycling
     for kind, most in (("walk", 0.09), ("idle", 0.03), ("cycle", 0.005)):
         assert np.ptp(clips(kind).translation[..., 2], axis=1).max() < most, kind
     low = {kind: placed(clips(kind))[1][..., 2].min(2) for kind in ("walk", "idle", "bend", "step", "run")}
     run = low.pop("run")
     assert all(np.abs(heights).max() < 0.02 for heights in low.values())
     assert run.min() > -0.02 and 0.02 < run.max() < 0.15
-    assert 0.05 < (run > 0.01).mean() < 0.5  # in flight
+    assert 0.05 < (run > 0.01).mean() < 0.5  # flight phases
 
 
-def test_walkers_go_ahead_at_the_speed_of_their_strides():
+def test_clips_walk_and_run_with_plausible_speed_and_heading():
     walk, run = (clips(kind, n=40).translation[..., :2] for kind in ("walk", "run"))
     speed, run_speed = (np.linalg.norm(np.diff(way, axis=1), axis=-1) * HZ for way in (walk, run))
     assert 0.8 < np.median(speed) < 1.5 and speed.min() > 0.1 and speed.max() < 2.5
     assert 2.0 < np.median(run_speed) < 4.0 and (walk[:, -1, 0] > 0.3).all()
-    # the way and the hips turn together
+    # path and hips turn together
     x, y = np.moveaxis(np.diff(walk, axis=1), -1, 0)
     course = np.unwrap(np.arctan2(y, x), axis=1)
     assert np.abs(course[:, -1] - course[:, 0]).max() > 0.15
@@ -302,12 +302,12 @@ def test_walkers_go_ahead_at_the_speed_of_their_strides():
     assert np.abs((facing - course) - (facing - course).mean(1, keepdims=True)).max() < 0.3
 
 
-def test_a_fall_ends_on_the_ground():
+def test_clips_fall_ends_on_ground():
     head = placed(clips("fall", n=20, frames=80))[0][:, :, J["head"], 2]
     assert (head[:, 0] > 1.0).all() and np.median(head[:, -1]) < 0.6
 
 
-def test_faster_clips_show_the_same_motion():
+def test_sample_clips_motion_does_not_depend_on_rate():
     slow, fast = (
         sampling.sample_clips(np.random.default_rng(3), 20, frames=f, hz=h) for f, h in ((6, 5.0), (11, 10.0))
     )
@@ -317,7 +317,7 @@ def test_faster_clips_show_the_same_motion():
     np.testing.assert_allclose(fast.translation[travels, ::2, :2], slow.translation[travels, :, :2], atol=1e-2)
 
 
-def test_moved_poses_are_those_of_the_pose_itself_later():
+def test_sample_rotations_moved_is_pose_after_dt():
     still, moved = (sampling.sample_rotations(np.random.default_rng(5), 200, dt=dt) for dt in (0.0, 0.1))
     np.testing.assert_allclose(moved.rotations, still.rotations, atol=1e-6)
     np.testing.assert_array_equal(moved.kind, still.kind)
@@ -326,7 +326,7 @@ def test_moved_poses_are_those_of_the_pose_itself_later():
     before, after = (body_frames(r)[1] for r in (moved.rotations, moved.moved))
     far = np.linalg.norm(after - before, axis=-1).max(1)
     assert 0.001 < np.median(far) < 0.2 and far.max() < 1.0
-    # moved and step are the second moment of a clip, whose feet stay where they stand
+    # moved and step are the second frame of a clip, whose standing feet do not slide
     walk = sampling.sample_rotations(np.random.default_rng(5), 200, mix={"walk": 1}, dt=0.1)
     assert 0.07 < np.median(walk.step[:, 0]) < 0.15
     here, there = sole_points(walk.rotations), sole_points(walk.moved) + walk.step[:, None, None]
@@ -336,15 +336,15 @@ def test_moved_poses_are_those_of_the_pose_itself_later():
 # balance and the ground
 
 
-def test_frames_are_forward_kinematics():
+def test_body_frames_match_forward_kinematics():
     rotations, rest = drawn(200).rotations, rig.mean_adult_joints()[None]
     slow = rig.forward_kinematics(SMPL24.parents, rest, rotations, np.zeros((200, 3)))
     for a, b in zip(body_frames(rotations), slow, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
 
 
-def test_soles_are_the_meshs():
-    """The lowest of a foot's points is where the shipped body's lowest vertex is."""
+def test_sole_points_match_mesh():
+    """The lowest sole point has the height of the shipped body's lowest vertex."""
     body, rotations = rig.load_rig(), drawn(60, walk=1).rotations
     rest = body.rest(np.repeat(body.coefficients[body.age >= 18].mean(0, keepdims=True), 60, 0))
     vertices = rig.pose_bodies(body, rest, rotations, np.zeros((60, 3)))[0]
@@ -353,18 +353,18 @@ def test_soles_are_the_meshs():
 
 
 def out_of_balance(rotations):
-    """How far (n,) m the center of mass is outside of what the body stands on."""
+    """Distance (n,) m of the center of mass from the area that supports the body."""
     joints = body_frames(rotations)[1]
     points = constraints._ground_points(rotations, joints)
     return np.linalg.norm(constraints.overhang(constraints.mass_center(joints), points, 0.0), axis=1)
 
 
 @pytest.mark.parametrize("kind", constraints.STATIC)
-def test_standing_and_kneeling_people_are_in_balance_on_both_feet(kind):
+def test_prior_static_poses_are_balanced_on_both_feet(kind):
     rotations = drawn(600, **{kind: 1}).rotations
     off = out_of_balance(rotations)
     if kind in UNUSUAL:
-        # joints at their limits keep a few from it
+        # a few are not balanced because of joint limits
         low = sole_points(rotations)[..., 2].min(2)
         assert (off > 0.02).mean() < 0.05 and (np.abs(low[:, 0] - low[:, 1]) > 0.03).mean() < 0.05
         return
@@ -381,8 +381,8 @@ def test_standing_and_kneeling_people_are_in_balance_on_both_feet(kind):
         assert np.percentile(apart, 95) < usual and np.percentile(apart, 99) < most
 
 
-def test_what_balance_changes():
-    """Without it bending people topple; others keep their angles."""
+def test_balanced_changes_only_static_poses():
+    """Bending people are not balanced without it; angles of other activities are kept."""
     kind = np.repeat([KINDS.index("bend"), KINDS.index("sport")], 200)
     angles = sampling._angles(latents.draw_latents(np.random.default_rng(1), kind)).angles
     before = angles.copy()
@@ -393,18 +393,18 @@ def test_what_balance_changes():
     assert off[0] > 0.4 and off[1] < 0.02
 
 
-def test_overhang_of_a_square():
+def test_overhang_of_square():
     square = np.array([[[x, y, 0.0] for x in (-0.1, 0.1) for y in (-0.1, 0.1)]])
     for at, margin, want in (((0.05, 0.0), 0.0, 0.0), ((0.15, 0.0), 0.0, -0.05), ((0.15, 0.0), 0.02, -0.07)):
         center = np.array([[*at, 1.0]])
         np.testing.assert_allclose(constraints.overhang(center, square, margin), [[want, 0]], atol=1e-6)
-        # what hangs in the air above bears nothing
+        # points in the air above do not support the body
         both = np.concatenate([square, square + [1.0, 0, 1]], 1)
         np.testing.assert_allclose(constraints.overhang(center, both, margin)[0], [want, 0], atol=2e-3)
 
 
-def test_the_center_of_mass_of_the_rest_pose():
-    """Of a standing adult 55 to 58 % of the height, arms up a little more; the shares sum to one."""
+def test_mass_center_of_rest_pose():
+    """At 55 to 58 % of a standing adult's height, slightly more with raised arms; the shares sum to one."""
     joints = rig.mean_adult_joints()[None]
     assert 0.55 < (constraints.mass_center(joints)[0, 2] + 0.97) / 1.70 < 0.61
     np.testing.assert_allclose(
@@ -416,7 +416,7 @@ def test_the_center_of_mass_of_the_rest_pose():
 
 
 def segment_distance_reference(a, b, steps=400):
-    """Least distance of two segments, on a grid of points of them."""
+    """Smallest distance of two segments, from a grid of points on each."""
     t = np.linspace(0, 1, steps)[:, None]
     p, q = (s[0] + t * (s[1] - s[0]) for s in (a, b))
     return np.linalg.norm(p[:, None] - q, axis=-1).min()
@@ -424,7 +424,7 @@ def segment_distance_reference(a, b, steps=400):
 
 @settings(max_examples=40, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
-def test_distances_of_segments(seed):
+def test_segment_distance_matches_reference(seed):
     a, b = np.random.default_rng(seed).normal(size=(2, 2, 3))
     fast = constraints._segment_distance(a[None].astype(np.float32), b[None].astype(np.float32))[0]
     assert abs(fast - segment_distance_reference(a, b)) < 0.02
@@ -434,7 +434,7 @@ def depth(rotations):
     return self_collision(capsule_ends(*body_frames(rotations))).max(1)
 
 
-def test_a_hand_in_the_belly_is_deep_and_the_rest_pose_is_free():
+def test_self_collision_of_hand_in_belly_and_rest_pose():
     pose = np.repeat(np.eye(3, dtype=np.float32)[None, None], 24, 1)
     assert depth(pose) < 0
     pose[0, J["left_shoulder"]] = axis_angle_to_matrix(np.array([-1.4, 0, 0]))
@@ -442,15 +442,15 @@ def test_a_hand_in_the_belly_is_deep_and_the_rest_pose_is_free():
     assert depth(pose) > 0.05
 
 
-def test_few_bodies_pass_through_themselves():
+def test_prior_rarely_has_self_collisions():
     assert (depth(drawn(5000, 3).rotations) > 0.02).mean() < 0.01
-    assert (depth(rotations_from_angles(raw_angles(5000, 3))) > 0.02).mean() > 0.05  # so there is something to do
+    assert (depth(rotations_from_angles(raw_angles(5000, 3))) > 0.02).mean() > 0.05  # raw draws do have collisions
     clip = sampling.sample_clips(np.random.default_rng(1), 800, frames=6)
     assert (depth(clip.rotations.reshape(-1, 24, 3, 3)) > 0.02).mean() < 0.02
     np.testing.assert_allclose(np.bincount(clip.kind, minlength=len(KINDS)) / 800, activities.SHARES, atol=0.045)
 
 
-def test_hands_stay_out_of_the_trunk():
+def test_prior_keeps_hands_out_of_trunk():
     rotations, p = body_frames(drawn(3000, 10).rotations)
     shoulders = p[:, [J["left_shoulder"], J["right_shoulder"]]].mean(1)
     # the chest's frame is that of spine3
@@ -462,7 +462,7 @@ def test_hands_stay_out_of_the_trunk():
 
 
 @pytest.mark.long
-def test_unusual_people_enter_by_their_share_alone():
+def test_unusual_mix_has_given_share():
     assert activities.unusual_mix(0.0) is None and set(UNUSUAL) == set(BY_HAND)
     assert not activities.SHARES[[KINDS.index(name) for name in UNUSUAL]].any()
     share = np.bincount(drawn(20000, 0, **activities.unusual_mix(0.3)).kind, minlength=len(KINDS)) / 20000
@@ -473,7 +473,7 @@ def test_unusual_people_enter_by_their_share_alone():
 
 @pytest.mark.long
 @pytest.mark.parametrize("kind", UNUSUAL)
-def test_unusual_poses_are_possible(kind):
+def test_unusual_poses_satisfy_constraints(kind):
     rotations = drawn(1500, 4, **{kind: 1}).rotations
     angles = fit.angles_from_rotations(rotations)
     legs = [A[f"{side}_{name}"] for side, _ in SIDES for name in ("hip", "abd", "rot", "knee", "ankle")]
@@ -489,7 +489,7 @@ def test_unusual_poses_are_possible(kind):
         assert np.percentile(height[1], 95) < 0.3 and (kind == "lie_down" or np.percentile(height[0], 95) < 0.45)
     elif kind not in (*ON_FLOOR, "get_down"):
         assert height[1].min() > 0.25
-    # so there is something to do
+    # the constraint changes raw draws of activities on the floor only
     people = latents_of(300, 4, **{kind: 1})
     raw = constraints.balanced(sampling._free_arms(sampling._angles(people).angles, 1), people.kind)
     changed = np.abs(constraints.fitted_to_floor(raw, people.kind) - raw).max(1)
@@ -497,15 +497,15 @@ def test_unusual_poses_are_possible(kind):
 
 
 @pytest.mark.parametrize("kind", constraints.ON_ONE_FOOT)
-def test_who_lifts_a_leg_stands_on_the_other(kind):
+def test_prior_balances_on_one_foot(kind):
     rotations = drawn(600, 2, **{kind: 1}).rotations
     assert (out_of_balance(rotations) > 0.02).mean() < 0.02
     low = np.sort(sole_points(rotations)[..., 2].min(2), axis=1)
     assert np.median(low[:, 1] - low[:, 0]) > 0.12
 
 
-# a pose of each activity by hand, degrees, and how far (mm, mean of the joints) the nearest of 6,000 draws may be: none
-# of another activity is so near
+# a pose of each activity set by hand, degrees, and a distance (mm, mean of the joints): the nearest of 6,000 draws of
+# the activity is closer, all draws of other activities are farther
 BY_HAND = {
     "squat": ({"hip": 92, "knee": 142, "ankle": 25, "abd": 24, "rot": 12, "raise": 85, "out": 8, "elbow": 10}, 105),
     "kick": ({"tilt": -14, "left_hip": 84, "left_knee": 14, "right_knee": 30, "right_hip": 6, "raise": 30, "elbow": 115,
@@ -543,7 +543,7 @@ def unusual_draws():
 
 
 @pytest.mark.parametrize("kind", BY_HAND)
-def test_a_pose_by_hand_is_near_a_draw_of_its_activity_only(kind):
+def test_unusual_draws_cover_poses_by_hand(kind):
     by_hand, most = BY_HAND[kind]
     angles = np.zeros((1, 27))
     for name, angle in by_hand.items():

@@ -1,4 +1,4 @@
-"""`predict` from Python: arrays, files, boxes, and what is told about odd inputs."""
+"""`predict` from Python: arrays, files, boxes, and warnings and errors for odd inputs."""
 
 import json
 import re
@@ -17,15 +17,16 @@ from lidarpose.cli import main
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
 from lidarpose.inference import inputs as people_module
+from lidarpose.inference import predictor
 from lidarpose.inference.backend import Raw
-from lidarpose.inference.checks import flat_axis, is_lying, rows_inside, unit_warning
+from lidarpose.inference.checks import flat_axis, is_lying, rows_inside, scan_unit_warning, unit_warning
 from lidarpose.inference.inputs import MAX_POINTS, as_origin, candidates, clean
 from lidarpose.inference.predict_scan import predictor_of
-from lidarpose.inference.predictor import Predictor
+from lidarpose.inference.predictor import Predictor, _select_pose
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.point_cloud import Cloud
 from lidarpose.models import bundled_path
-from lidarpose.sample import Box
+from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import BODY26, SKELETONS, WAYMO14
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
@@ -40,7 +41,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def standing():
-    """A synthetic person who stands, whole and uncluttered, in the sensor's frame."""
+    """A synthetic standing person, fully visible and without clutter, in the sensor's frame."""
     scene = replace(scene_config("wild").eased(0.0), sensors=("os1-128",), distance=(4.0, 8.0))
     generator = Generator(scene=scene)
     people = (generator.person(11, i) for i in range(64))
@@ -58,7 +59,7 @@ def box_around(cloud, margin=0.05, **more):
 
 
 def records(points):
-    """The points as records that begin with something else."""
+    """The points as records with another field first."""
     return np.rec.fromarrays([np.arange(len(points)), *points.T], names="ring,x,y,z")
 
 
@@ -69,13 +70,13 @@ def height(pose, joint):
 # ---- one array
 
 
-def test_an_easy_person_stands_on_their_feet(model, standing):
+def test_predict_easy_person_is_upright_and_accurate(model, standing):
     pose = model.predict(standing.sample.points)
     assert pose.joints.shape == (24, 3) and pose.confidence.shape == pose.spread.shape == (24,)
     assert height(pose, "head") > height(pose, "pelvis") > max(height(pose, "left_ankle"), height(pose, "right_ankle"))
     assert (pose.confidence >= 0).all() and (pose.confidence <= 1).all() and (pose.spread > 0).all()
     truth = standing.sample.pose.to(pose.skeleton)
-    # the bundled weights are 25 mm off
+    # the bundled weights have an error of 25 mm
     assert np.linalg.norm(pose.joints - truth.joints, axis=1).mean() < 0.05
     assert pose.warnings == () and pose.num_points == len(standing.sample.points)
 
@@ -101,18 +102,18 @@ def test_an_easy_person_stands_on_their_feet(model, standing):
     ids="float64 big-endian rows tuples row-arrays fortran strided four-columns torch torch-grad table plain-table "
     "records read-from-file".split(),
 )
-def test_every_kind_of_array_is_the_same_person(model, points, kind):
+def test_predict_accepts_all_kinds_of_arrays(model, points, kind):
     np.testing.assert_allclose(model.predict(kind(points)).joints, model.predict(points).joints, atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", [np.float16, np.int16, np.int64, np.uint8, torch.bfloat16])
-def test_coarse_numbers_are_taken(model, points, kind):
+def test_predict_accepts_low_precision_numbers(model, points, kind):
     near = 1 + 3 * (points - points.min(0))
     cloud = torch.from_numpy(near).to(kind) if kind is torch.bfloat16 else near.astype(kind)
     assert np.isfinite(model.predict(cloud).joints).all()
 
 
-def test_the_input_is_left_alone(model, points):
+def test_predict_keeps_input(model, points):
     cloud = np.column_stack([points, np.full(len(points), np.nan)])
     cloud[3, 0] = np.nan
     before = cloud.copy()
@@ -145,13 +146,13 @@ def test_the_input_is_left_alone(model, points):
         (Path("sweep.pcd"), "lidarpose.predict('sweep.pcd')"),
     ],
 )
-def test_a_wrong_array_is_told_in_one_line(model, bad, words):
+def test_predict_rejects_bad_arrays_in_one_line(model, bad, words):
     with pytest.raises(InputError) as raised:
         model.predict(bad)
     assert words in str(raised.value) and "\n" not in str(raised.value) and "points" in str(raised.value)
 
 
-def test_nan_and_absurd_points_are_dropped_and_counted(model, points):
+def test_predict_drops_and_counts_nonfinite_and_huge_points(model, points):
     cloud = np.concatenate([points, np.array([[np.nan, 0, 0], [0, np.inf, 0], [0, 0, 1e300]])])
     pose = model.predict(cloud)
     assert pose.warnings == (f"dropped 3 of {len(cloud)} points that were NaN, infinite or beyond 1e+09 m",)
@@ -174,14 +175,14 @@ def test_nan_and_absurd_points_are_dropped_and_counted(model, points):
         (50.0 * np.arange(18).reshape(6, 3), "under 5 points within 2 m of the person's middle"),
     ],
 )
-def test_too_few_points_are_no_pose(model, cloud, words):
+def test_predict_gives_no_pose_for_too_few_points(model, cloud, words):
     pose = model.predict(cloud)
     assert pose.joints is None and pose.confidence is None and pose.spread is None
     assert pose.warnings[-1] == f"no pose: {words}" and (words != "under 5 points" or len(pose.warnings) == 1)
     assert json.loads(pose.to_json())["people"][0]["joints"] is None
 
 
-def test_no_returns_are_no_points(model, points, tmp_path):
+def test_predict_drops_points_at_origin(model, points, tmp_path):
     empty = np.zeros((300, 3))
     pose = model.predict(np.concatenate([empty, points]))
     assert pose.warnings == (f"dropped 300 of {len(points) + 300} points at 0,0,0, which are not returns",)
@@ -190,15 +191,15 @@ def test_no_returns_are_no_points(model, points, tmp_path):
     np.save(tmp_path / "empty.npy", empty)
     with pytest.raises(InputError, match="expected points in meters, got only 0,0,0"):
         lidarpose.predict(tmp_path / "empty.npy", model=model)
-    # one may be a point of a cloud that is about its middle
+    # a single one may be a point of a centered cloud
     alone, notes = clean(np.concatenate([empty[:1], points - points.mean(0)]))
     assert len(alone) == len(points) + 1 and not notes
 
 
-# ---- many
+# ---- several people
 
 
-def test_many_are_as_one_by_one(model, points, standing):
+def test_predict_list_matches_single_calls(model, points, standing):
     other = points @ rotation_about("z", 2.0).T.astype(np.float32) + np.float32(4)
     people = model.predict([points, other[:3], other], skeleton="human15")
     assert [person.joints is None for person in people] == [False, True, False]
@@ -210,24 +211,29 @@ def test_many_are_as_one_by_one(model, points, standing):
             )
 
 
-def test_lists_of_none_and_stacks(model, points):
+def test_predict_accepts_lists_of_row_lists(model, points):
+    people = model.predict([list(points), points.tolist()])
+    np.testing.assert_array_equal(people.to_numpy(), model.predict([points, points]).to_numpy())
+
+
+def test_predict_accepts_empty_lists_and_stacks(model, points):
     assert len(model.predict([])) == 0 and json.loads(model.predict([]).to_json())["people"] == []
     assert len(model.predict((points, points))) == len(model.predict(list(np.stack([points] * 2)))) == 2
     assert len(model.predict([records(points)] * 2)) == 2
     assert len(model.predict([points.tolist()])) == len(model.predict([torch.from_numpy(points.copy())])) == 1
     assert [person.joints for person in model.predict([points[:0], [], np.zeros((0, 3))])] == [None] * 3
-    # somebody without points may stand anywhere
+    # people without points may be anywhere in the list
     for empty in ([], np.zeros(0), np.zeros((0, 3)), ()):
         for clouds in ([empty, points], [points, empty], [empty, empty]):
             found = [person.joints is not None for person in model.predict(clouds)]
             assert found == [cloud is points for cloud in clouds]
 
 
-# ---- a crop with more in it than a person
+# ---- crops with clutter
 
 
 def cluttered(points, seed=0):
-    """The person off the middle of a crop 3.9 m wide, with ground, a wall, a post and a tree above."""
+    """A crop 3.9 m wide: a person away from its center, ground, a wall, a post and a tree above."""
     rng = np.random.default_rng(seed)
     low = points.min(0)
     middle = np.append(np.median(points[:, :2], axis=0), low[2])
@@ -239,7 +245,7 @@ def cluttered(points, seed=0):
     return np.concatenate([points, middle + ground, middle + wall, middle + post, middle + tree])
 
 
-def test_a_person_among_clutter_is_one_of_the_candidates(points):
+def test_candidates_include_person_among_clutter(points):
     clouds = candidates(cluttered(points))
     assert 2 <= len(clouds) <= 4 and len(clouds[0]) == len(points) + 9000
     own = {tuple(row) for row in points}
@@ -248,19 +254,19 @@ def test_a_person_among_clutter_is_one_of_the_candidates(points):
     assert all(np.ptp(cloud, axis=0).max() < 2.5 for cloud in clouds[1:])
 
 
-def test_a_person_among_clutter_is_found(model, standing, points):
+def test_predict_finds_person_among_clutter(model, standing, points):
     pose = model.predict(cluttered(points))
     pelvis = standing.sample.pose.joints[0]
     assert np.linalg.norm(pose.joints[0] - pelvis) < 0.4
 
 
-def test_a_crop_of_a_persons_width_is_all_person(points):
+def test_candidates_keep_crop_of_person_width(points):
     arms_out = np.concatenate([points, np.median(points, axis=0) + [[0.95, 0, 0.4], [-0.95, 0, 0.4]]])
     assert [len(cloud) for cloud in candidates(arms_out)] == [len(arms_out)]
 
 
 @pytest.mark.parametrize("wide, least", [(4.0, 4), (20.0, 4), (300.0, 1)])
-def test_the_search_does_not_grow_with_the_cloud(wide, least, monkeypatch):
+def test_candidates_search_is_bounded_for_large_clouds(wide, least, monkeypatch):
     cells, heights = [], people_module._heights
     monkeypatch.setattr(people_module, "_heights", lambda grid, *ring: cells.append(grid.size) or heights(grid, *ring))
     cloud = np.random.default_rng(0).random((50_000, 3)) * (wide, wide, 2.5)
@@ -269,7 +275,7 @@ def test_the_search_does_not_grow_with_the_cloud(wide, least, monkeypatch):
     assert len(cells) == 2 and max(cells) < 1_000_000
 
 
-def test_the_search_survives_strays_and_flat_crops():
+def test_candidates_accept_strays_and_flat_crops():
     rng = np.random.default_rng(0)
     stray = np.concatenate([rng.random((50, 3)), [[1e8, -1e8, 1e8]]])
     assert len(candidates(stray)[0]) == 51
@@ -277,25 +283,31 @@ def test_the_search_survives_strays_and_flat_crops():
     assert len(candidates(np.array([[0.0, 0, 0], [1e8, 0, 0]]))) == 1
 
 
-def test_a_million_points_are_thinned_with_a_note(model, points):
+def test_predict_thins_million_points_with_warning(model, points):
     rng = np.random.default_rng(0)
     cloud = points[rng.integers(len(points), size=1_000_000)] + rng.normal(0, 0.005, (1_000_000, 3))
     pose = model.predict(cloud)
     assert pose.joints is not None and pose.num_points == MAX_POINTS
     assert pose.warnings[0].startswith(f"thinned from 1000000 to {MAX_POINTS} points")
-    # from everywhere
+    # points are removed evenly
     x = clean(np.linspace([0.1, 0, 0], [1.1, 0, 0], 3 * MAX_POINTS))[0][:, 0]
     assert len(x) == MAX_POINTS and np.diff(x).max() < 1e-4 and x[0] == 0.1 and x[-1] > 1.0999
 
 
-def test_map_coordinates_cost_no_accuracy(model, points):
+def test_predict_warns_about_rounded_clouds_of_list(model, points):
+    far = (points + [5e6, 0, 0]).astype(np.float32)
+    warnings = [person.warnings for person in model.predict([points, far, far.astype(float) + 0.01])]
+    assert [any("coordinates are rounded to 0.5 m" in line for line in own) for own in warnings] == [False, True, False]
+
+
+def test_predict_is_accurate_in_map_coordinates(model, points):
     offset = np.array([5e5, 5e6, 300.0])
     moved = model.predict(points.astype(float) + offset)
-    # the coordinates themselves are kept to a nanometre
+    # the coordinates themselves are kept to a nanometer
     assert np.abs(moved.joints - offset - model.predict(points).joints).max() < 1e-5
 
 
-# ---- units, axes, the sensor's place
+# ---- units, axes, sensor origin
 
 
 @pytest.mark.parametrize(
@@ -309,12 +321,12 @@ def test_map_coordinates_cost_no_accuracy(model, points):
         *((np.array(size), None) for size in ([0.4, 0.3, 0.0], [150.0, 200.0, 33.0], [0.0, 0, 0])),
     ],
 )
-def test_units_are_named(size, unit):
+def test_unit_warning_names_unit(size, unit):
     warning = unit_warning(size, what="it")
     assert warning is None if unit is None else unit in warning
 
 
-def test_sensor_origins(model, points):
+def test_predict_sensor_origin_formats(model, points):
     for given in (5, "1,2", "1,2,x", (1, 2, np.nan), "", [1, 2, 3, 4], "nowhere", object(), np.eye(3)):
         with pytest.raises(InputError, match="sensor origin: expected x,y,z in meters or unknown") as raised:
             model.predict(points, sensor_origin=given)
@@ -324,24 +336,24 @@ def test_sensor_origins(model, points):
         np.testing.assert_array_equal(as_origin(given), [1, -2, 3])
 
 
-def test_the_sensors_place_reaches_the_network(model, points):
+def test_predict_uses_sensor_origin(model, points):
     known, unknown = model.predict(points, sensor_origin=(0, 0, 0)), model.predict(points)
     assert not np.allclose(known.joints, unknown.joints, atol=1e-6)
     np.testing.assert_array_equal(unknown.joints, model.predict(points, sensor_origin="unknown").joints)
 
 
-def test_lying(standing, points):
+def test_is_lying(standing, points):
     pose, none = standing.sample.pose, np.zeros((0, 3))
     assert not is_lying(pose, points) and not is_lying(pose, none)
     assert is_lying(pose, points[:, [0, 2, 1]]) and is_lying(pose, points[:, [2, 1, 0]])
-    # one ring of a far person, and a street
+    # one ring on a distant person, and a cluttered crop
     assert not is_lying(pose, points[:, :3] * (1, 1, 0)) and not is_lying(pose, cluttered(points))
     laid = replace(pose, joints=pose.joints @ rotation_about("x", np.pi / 2).T)
     assert is_lying(laid, points) and is_lying(laid.to(SKELETONS["waymo14"]), none)
     assert not is_lying(pose.to(SKELETONS["waymo14"]), none)
 
 
-def test_the_flat_axis_of_a_sweep_is_its_up_axis(points):
+def test_flat_axis_of_sweep_is_up_axis(points):
     rng = np.random.default_rng(0)
     street = rng.normal(0, 1, (2000, 3)) * (40, 15, 1.5)
     for axis, shift in (("z", 0), ("x", 1), ("y", 2)):
@@ -362,7 +374,7 @@ def sweep(tmp_path, points):
     return path, (points, there), [box_around(points, id="a"), box_around(there, track=7, category="PEDESTRIAN")]
 
 
-def test_people_without_an_id_get_their_position_or_a_free_number(model, sweep):
+def test_predict_numbers_boxes_without_id(model, sweep):
     path, _, boxes = sweep
     bare = {name: boxes[0][name] for name in ("center", "size")}
     for ids, expected in (([None, None], [0, 1]), ([None, 0, None], [3, 0, 2]), ([1, None, 3, None], [1, 4, 3, 5])):
@@ -370,7 +382,7 @@ def test_people_without_an_id_get_their_position_or_a_free_number(model, sweep):
         assert [person.id for person in lidarpose.predict(path, boxes=given, model=model)] == expected
 
 
-def test_boxes_keep_their_order_and_ids(model, sweep):
+def test_predict_keeps_order_and_ids_of_boxes(model, sweep):
     path, clouds, boxes = sweep
     people = lidarpose.predict(path, boxes={"people": boxes[::-1]}, model=model)
     assert [person.id for person in people] == [7, "a"]
@@ -392,7 +404,7 @@ def test_boxes_keep_their_order_and_ids(model, sweep):
     ],
     ids=["turned", "wider"],
 )
-def test_any_box_of_the_same_points_gives_the_same_pose(model, sweep, boxes):
+def test_predict_depends_only_on_points_in_box(model, sweep, boxes):
     path, _, (box, _) = sweep
     given = [{"center": box["center"], "size": size, "yaw": yaw} for size, yaw in boxes]
     # one call each, since people share a batch
@@ -402,7 +414,7 @@ def test_any_box_of_the_same_points_gives_the_same_pose(model, sweep, boxes):
         np.testing.assert_array_equal(pose.joints, poses[0].joints)
 
 
-def test_a_box_looks_at_few_of_many_points(monkeypatch):
+def test_rows_inside_checks_few_points_per_box(monkeypatch):
     rng = np.random.default_rng(0)
     points = rng.uniform(-40, 40, (20_000, 3))
     boxes = [Box(center=rng.uniform(-40, 40, 3), size=rng.uniform(0.5, 9, 3), yaw=rng.uniform(-7, 7)) for _ in "ab" * 9]
@@ -414,7 +426,7 @@ def test_a_box_looks_at_few_of_many_points(monkeypatch):
     assert sum(map(len, expected)) > 50 and np.mean(looked) < 0.3 * len(points)
 
 
-def test_an_empty_box_is_no_harm_to_the_others(model, sweep):
+def test_predict_empty_box_does_not_affect_others(model, sweep):
     path, _, boxes = sweep
     nowhere = {"center": [0, 0, 50], "size": [1, 1, 1]}
     people = lidarpose.predict(path, boxes=[boxes[0], nowhere, boxes[1]], model=model)
@@ -422,7 +434,7 @@ def test_an_empty_box_is_no_harm_to_the_others(model, sweep):
     assert people[1].id == 1 and people[1].warnings == ("no pose: under 5 points",) and people.warnings == ()
 
 
-def test_nobody_is_a_legal_answer(model, sweep):
+def test_predict_accepts_empty_list_of_boxes(model, sweep):
     people = lidarpose.predict(sweep[0], boxes={"people": []}, model=model)
     assert len(people) == 0 and people.warnings == () and len(people.picture()) > 1000
 
@@ -446,7 +458,7 @@ def scaled(box, center, size):
     ],
     ids=["elsewhere", "millimeters", "height first", "feet"],
 )
-def test_boxes_in_another_unit_or_convention_are_warned_about(model, sweep, tmp_path, scale, change, words, alone):
+def test_predict_warns_of_boxes_in_other_unit_or_convention(model, sweep, tmp_path, scale, change, words, alone):
     _, clouds, boxes = sweep
     np.save(tmp_path / "scan.npy", np.concatenate(clouds) * scale)
     warnings = lidarpose.predict(tmp_path / "scan.npy", boxes=[change(box) for box in boxes], model=model).warnings
@@ -454,8 +466,8 @@ def test_boxes_in_another_unit_or_convention_are_warned_about(model, sweep, tmp_
     assert not alone or len(warnings) == 1 and "--up" not in warnings[0]
 
 
-def test_a_tree_above_boxes_is_nobody(model, tmp_path, points):
-    """Nor is who shows no legs."""
+def test_predict_does_not_warn_of_tree_above_box(model, tmp_path, points):
+    """Hidden legs cause no warning either."""
     box = box_around(points)
     upper = points[points[:, 2] > box["center"][2]]
     tree = box["center"] + np.random.default_rng(0).uniform((-0.3, -0.3, 1), (0.3, 0.3, 3), (len(points), 3))
@@ -463,7 +475,7 @@ def test_a_tree_above_boxes_is_nobody(model, tmp_path, points):
     assert lidarpose.predict(tmp_path / "a.npy", boxes=[box], model=model).warnings == ()
 
 
-def test_a_sensor_that_cannot_have_seen_the_people_is_unknown(model, sweep, tmp_path):
+def test_predict_ignores_default_origin_far_from_people(model, sweep, tmp_path):
     path, clouds, boxes = sweep
     offset = np.array([5e5, 5e6, 0])
     np.save(tmp_path / "utm.npy", np.concatenate(clouds).astype(float) + offset)
@@ -476,7 +488,7 @@ def test_a_sensor_that_cannot_have_seen_the_people_is_unknown(model, sweep, tmp_
     assert given.warnings == ()
 
 
-def test_the_size_of_a_file_decides_without_flags(model, sweep, tmp_path, points):
+def test_predict_takes_small_file_as_crop(model, sweep, tmp_path, points):
     np.save(tmp_path / "crop.npy", points)
     people = lidarpose.predict(tmp_path / "crop.npy", model=model)
     assert len(people) == 1 and people[0].id == 0 and people[0].box is None
@@ -487,7 +499,7 @@ def test_the_size_of_a_file_decides_without_flags(model, sweep, tmp_path, points
         lidarpose.predict(sweep[0], crop=True, boxes=[], model=model)
 
 
-def test_a_crop_in_other_units_is_told_by_name(model, tmp_path, points):
+def test_predict_warns_of_crop_in_millimeters(model, tmp_path, points):
     np.save(tmp_path / "mm.npy", points * 1000)
     people = lidarpose.predict(tmp_path / "mm.npy", crop=True, model=model)
     assert any("millimeters" in warning for warning in people[0].warnings)
@@ -505,11 +517,11 @@ TILTED = axis_angle_to_matrix([0.0, np.radians(20), 0.0])
     ],
     ids=["y", "x", "-y", "direction", "direction as text"],
 )
-def test_other_up_axes_give_the_same_person_in_the_files_frame(model, sweep, tmp_path, up, R_input_level):
+def test_predict_with_up_gives_same_person_in_frame_of_file(model, sweep, tmp_path, up, R_input_level):
     path, clouds, boxes = sweep
     turned = tmp_path / "turned.npy"
     np.save(turned, np.concatenate(clouds) @ R_input_level.T)
-    # with a direction boxes stand along the file's z: large enough for a person who leans in it
+    # with a direction, boxes are along the file's z: large enough for a person who is tilted in it
     boxes = [{**box, "yaw": 0.1, "size": [2.5, 2.5, 3.0]} for box in boxes]
     moved = [{**box, "center": (R_input_level @ box["center"]).tolist()} for box in boxes]
     for origin in (np.zeros(3), np.array([1.0, 2, 3])):
@@ -524,7 +536,7 @@ def test_other_up_axes_give_the_same_person_in_the_files_frame(model, sweep, tmp
     assert people[0].picture().startswith(b"\x89PNG")
 
 
-def test_boxes_of_a_tilted_file_crop_in_its_own_frame(model, tmp_path, points):
+def test_predict_crops_tilted_file_in_its_own_frame(model, tmp_path, points):
     R_input_level = axis_angle_to_matrix([0.0, np.radians(30), 0.0])
     tilted = points @ R_input_level.T
     low, high = tilted.min(0), tilted.max(0)
@@ -535,7 +547,7 @@ def test_boxes_of_a_tilted_file_crop_in_its_own_frame(model, tmp_path, points):
     assert person.num_points == len(points)
 
 
-def test_people_that_all_lie_raise_the_question_of_the_axis(model, tmp_path, points):
+def test_predict_warns_of_up_axis_if_all_people_lie(model, tmp_path, points):
     np.save(tmp_path / "crop.npy", points)
     assert lidarpose.predict(tmp_path / "crop.npy", model=model).warnings == ()
     np.save(tmp_path / "crop.npy", points @ UP_AXES["y"])
@@ -547,7 +559,7 @@ def test_people_that_all_lie_raise_the_question_of_the_axis(model, tmp_path, poi
     assert lidarpose.predict(tmp_path / "crop.npy", up="y", model=model).warnings == ()
 
 
-def test_a_sweep_of_another_up_axis_is_told(model, tmp_path, points):
+def test_predict_warns_of_up_axis_of_sweep(model, tmp_path, points):
     street = np.random.default_rng(0).normal(0, 1, (9000, 3)) * (40, 15, 0.5)
     np.save(tmp_path / "sweep.npy", np.concatenate([points, street]) @ UP_AXES["x"])
     box = {"center": (np.median(points, axis=0) @ UP_AXES["x"]).tolist(), "size": [0.8, 0.8, 2]}
@@ -560,7 +572,7 @@ def test_a_sweep_of_another_up_axis_is_told(model, tmp_path, points):
 
 
 @pytest.mark.long
-def test_load_takes_names_and_paths(points, tmp_path, monkeypatch):
+def test_load_accepts_names_and_paths(points, tmp_path, monkeypatch):
     expected = lidarpose.load("tiny", tta=1).predict(points).joints
     copy = tmp_path / "mine.safetensors"
     copy.write_bytes(bundled_path("tiny").read_bytes())
@@ -575,8 +587,8 @@ def test_load_takes_names_and_paths(points, tmp_path, monkeypatch):
 @pytest.mark.long
 @pytest.mark.parametrize("gap", [0.7, 1.6, 2.2])
 @pytest.mark.parametrize("meant", [0, 1])
-def test_two_people_in_a_crop_are_flagged_and_the_flag_says_who_is_meant(model, standing, tmp_path, meant, gap):
-    # beyond 1 m the box is so wide that its columns are posed one by one
+def test_predict_warns_of_two_people_and_poses_nearer_to_center(model, standing, tmp_path, meant, gap):
+    # beyond 1 m the box is so wide that its columns are predicted separately
     apart = np.array([0, gap, 0])
     both = np.concatenate([standing.sample.points, standing.sample.points + apart])
     pelvises = standing.sample.pose.joints[0] + [np.zeros(3), apart]
@@ -590,7 +602,7 @@ def test_two_people_in_a_crop_are_flagged_and_the_flag_says_who_is_meant(model, 
         assert person.second_person > 0.5 and person.person > 0.5
         assert any("two people" in line and line.endswith(who) for line in person.warnings)
     assert np.linalg.norm(boxed.joints[0] - pelvises[meant]) < 0.1
-    # whatever is up
+    # with another up axis
     R_input_level = UP_AXES["y"].T
     moved = {**box, "center": (R_input_level @ center).tolist()}
     turned = lidarpose.predict(both @ R_input_level.T, boxes=[moved], up="y", sensor_origin=(0, 0, 0), model=model)[0]
@@ -600,13 +612,13 @@ def test_two_people_in_a_crop_are_flagged_and_the_flag_says_who_is_meant(model, 
     assert entry["second_person"] == round(boxed.second_person, 4) and entry["warnings"] == list(boxed.warnings)
 
 
-def test_a_crop_without_anybody_is_flagged(model, tmp_path, capsys):
+def test_predict_warns_of_crop_without_person(model, tmp_path, capsys):
     rng = np.random.default_rng(0)
     wall = np.column_stack([np.full(400, 6.0), rng.uniform(-0.5, 0.5, 400), rng.uniform(-1, 1, 400)])
     person = model.predict(wall, sensor_origin=(0, 0, 0))
     assert person.person < 0.05
     assert any("look unlike a person" in line and f"{person.person:.2f}" in line for line in person.warnings)
-    # where a score says whether somebody is there, nothing else does
+    # a box with a score has no such warning
     box = {"center": [6, 0, 0], "size": [0.6, 1.2, 2.2]}
     for score, is_flagged in ((None, True), (0.9, False)):
         boxed = model.predict(wall, boxes=[box | {"score": score}], sensor_origin=(0, 0, 0))[0]
@@ -619,7 +631,7 @@ def test_a_crop_without_anybody_is_flagged(model, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("name", ["smpl24", "human15", "waymo14"])
-def test_results_follow_the_schema(model, points, tmp_path, name):
+def test_saved_results_follow_schema(model, points, tmp_path, name):
     pose = model.predict(points, skeleton=name)
     pose.save(tmp_path / "new" / "pose.json")
     document = json.loads((tmp_path / "new" / "pose.json").read_text())
@@ -637,7 +649,7 @@ def test_results_follow_the_schema(model, points, tmp_path, name):
     assert pose.picture(tmp_path / "pose.png") == (tmp_path / "pose.png").read_bytes()
 
 
-def test_files_and_clouds_are_posed_alike_by_default(points, tmp_path):
+def test_predict_file_matches_array_by_default(points, tmp_path):
     np.save(tmp_path / "crop.npy", points)
     (person,) = lidarpose.predict(tmp_path / "crop.npy", sensor_origin=(0, 0, 0), crop=True)
     np.testing.assert_array_equal(person.joints, lidarpose.load().predict(points, sensor_origin=(0, 0, 0)).joints)
@@ -645,7 +657,7 @@ def test_files_and_clouds_are_posed_alike_by_default(points, tmp_path):
 
 @pytest.mark.skipif(not REAL.is_dir(), reason=f"the real sweeps are not at {REAL}")
 @pytest.mark.parametrize("name", ["sweep_0.pcd", "sweep_1.bin", "sweep_2.ply"])
-def test_real_sweeps(model, name):
+def test_predict_real_sweeps(model, name):
     path = REAL / name
     boxes = json.loads(path.with_suffix(".json").read_text())
     people = lidarpose.predict(path, boxes=path.with_suffix(".json"), model=model)
@@ -659,19 +671,19 @@ def test_real_sweeps(model, name):
             assert height(person, "head") > height(person, "pelvis") > height(person, "left_ankle")
 
 
-def test_people_are_found_in_what_holds_them(model, points):
+def test_poses_contain_their_people(model, points):
     poses = model.predict([points, points[:0]])
     assert poses[1] in poses and poses != model.predict([points[:0]]) and len({*poses, poses[0], poses}) == 3
 
 
 @pytest.mark.long
-def test_points_are_as_good_as_their_file(tmp_path, points):
+def test_predict_accepts_array_instead_of_file(tmp_path, points):
     path = tmp_path / "person.npy"
     np.save(path, points)
     from_file, from_array = lidarpose.predict(path, model="tiny"), lidarpose.predict(points, model="tiny")
     np.testing.assert_array_equal(from_file[0].joints, from_array[0].joints)
     assert from_array.source is None and from_array[0].id == from_file[0].id == 0
-    # an array is searched where it is wide, or where that is asked for
+    # an array is searched if it is wide or if that is requested
     wide = np.concatenate([points, points.min(0) + [[0, 0, 0], [30, 30, 0]]])
     assert lidarpose.predict(wide, model="tiny").scan is not None
     assert lidarpose.predict(points, find=True, min_score=0.99, model="tiny").scan is not None
@@ -680,7 +692,7 @@ def test_points_are_as_good_as_their_file(tmp_path, points):
             lidarpose.predict(not_points, model="tiny")
 
 
-def test_nobody_is_in_an_array_without_points(model):
+def test_predict_finds_no_people_without_points(model):
     empty, nan = np.zeros((0, 3)), np.full((300, 3), np.nan)
     for points in (empty, nan, np.zeros((300, 3))):
         for options in ({}, {"find": True}, {"boxes": []}):
@@ -691,7 +703,7 @@ def test_nobody_is_in_an_array_without_points(model):
 
 
 @pytest.mark.parametrize("records", [False, True])
-def test_an_array_in_rows_of_beams_is_no_list_of_people(model, records):
+def test_predict_rejects_range_image(model, records):
     image = np.zeros((32, 1024), [(name, "f4") for name in "xyz"]) if records else np.zeros((32, 1024, 3))
     expected = "got (32, 1024, 3): one scan is points." + ("ravel()" if records else "reshape(-1, 3), several people")
     for predict in (model.predict, lidarpose.predict, lidarpose.detect, lambda a: model.predict(a, find=True)):
@@ -700,26 +712,26 @@ def test_an_array_in_rows_of_beams_is_no_list_of_people(model, records):
     assert len(model.predict(list(np.zeros((2, 9, 3))))) == len(model.predict_clip(np.zeros((2, 9, 3)))) == 2
 
 
-def test_bundled_networks_are_kept_and_files_are_loaded_anew(tmp_path):
+def test_predictor_of_caches_only_bundled_networks(tmp_path):
     assert predictor_of("tiny") is predictor_of("tiny")
     path = shutil.copy(bundled_path("tiny", ".onnx"), tmp_path)
     assert predictor_of(path) is not predictor_of(path)
 
 
 @pytest.mark.parametrize("wrong", [torch.nn.Linear(3, 3), lambda points: points, lambda: None, object()])
-def test_a_model_that_is_no_predictor_is_refused(points, wrong):
+def test_predict_rejects_bad_model(points, wrong):
     with pytest.raises(InputError, match="^model: expected a predictor, weights .*: make one with lidarpose.load$"):
         lidarpose.predict(points, crop=True, model=wrong)
 
 
-def test_boxes_of_another_up_axis_are_refused(model, points):
+def test_predict_rejects_boxes_of_other_up_axis(model, points):
     boxes = lidarpose.read_boxes({"schema": "lidarpose.boxes/1", "up": "y", "people": [box_around(points)]})
     with pytest.raises(InputError, match="the up axis of the boxes is y, not z: give up y"):
         lidarpose.predict(points, boxes=boxes, up="z", model=model)
     assert lidarpose.predict(points, boxes=boxes, up=[0, 1, 1e-3], model=model).up == "0.0,1.0,0.001"
 
 
-def test_a_skeleton_is_taken_as_one_or_by_its_name(model, points):
+def test_predict_accepts_skeleton_or_its_name(model, points):
     pair = lidarpose.Skeleton(name="ankles", joints=("left_ankle", "right_ankle"), parents=(-1, 0))
     pose = model.predict(points, skeleton=pair)
     assert pose.joints.shape == (2, 3) and pose.skeleton is pair
@@ -734,7 +746,7 @@ def test_a_skeleton_is_taken_as_one_or_by_its_name(model, points):
             model.predict(points, skeleton=wrong)
 
 
-def test_the_boxes_of_poses_are_taken(model, sweep):
+def test_predict_accepts_poses_as_boxes(model, sweep):
     path, _, boxes = sweep
     people = lidarpose.predict(path, boxes=boxes, model=model)
     again = lidarpose.read_boxes(people)
@@ -744,7 +756,7 @@ def test_the_boxes_of_poses_are_taken(model, sweep):
         lidarpose.read_boxes(lidarpose.predict(path, crop=True, model=model))
 
 
-def test_ids_are_what_json_can_hold(model, sweep):
+def test_box_id_is_text_or_whole_number(model, sweep):
     path, boxes = sweep[:2]
     box = Box(center=[0, 0, 0], size=[9, 9, 9], id=np.int64(3))
     assert box.id == 3 and type(box.id) is int
@@ -755,8 +767,33 @@ def test_ids_are_what_json_can_hold(model, sweep):
     json.loads(lidarpose.predict(path, boxes=[box], model=model).to_json())
 
 
-def test_without_confidence_the_whole_cloud_is_the_answer(points):
-    """Not the smallest of the candidates, which is seen first."""
+def answers(*people):
+    """Poses of candidates (x m, confidence, probability of a person), each with its part of the cloud."""
+    for k, (x, confidence, person) in enumerate(people):
+        joints, confidences = np.zeros((26, 3)) + [x, 0, 0], np.full(26, confidence)
+        known = {"person": np.array(person), "second_person": np.array(0.1)}
+        yield Pose(joints=joints, skeleton=BODY26, confidence=confidences, **known), np.full((1, 3), float(k))
+
+
+@pytest.mark.parametrize(
+    ("people", "box_x", "best", "second"),
+    [
+        # the most confident pose; confident poses beside it count as a second person
+        ([(0, 0.5, 0.9), (1, 0.9, 0.8), (5, 0.2, 1.0)], None, 1, 0.1),
+        ([(0, 0.6, 0.9), (1, 0.9, 0.8)], None, 1, 0.9),
+        # with a box, the most confident pose of the nearest person among confident poses
+        ([(0, 0.6, 0.9), (0.2, 0.7, 0.5), (1, 0.9, 0.8)], 0.1, 1, 0.8),
+        ([(0.1, 0.3, 0.9), (1, 0.9, 0.8), (2, 0.95, 0.7)], 0.1, 1, 0.7),
+        ([(0, 0.6, 0.05), (1, 0.9, 0.05)], 0.8, 1, 0.1),
+    ],
+)
+def test_select_pose_by_confidence_and_box_center(people, box_x, best, second):
+    pose, part = _select_pose(list(answers(*people)), None if box_x is None else np.array([box_x, 0, 0]))
+    assert part[0, 0] == best and pose.joints[0, 0] == people[best][0] and pose.second_person == second
+
+
+def test_predict_without_confidence_uses_whole_cloud(points):
+    """Not the smallest candidate, which is processed first."""
 
     class Counting:
         name, header, batch = (
@@ -784,14 +821,14 @@ def poses(model, points):
     return model.predict([points, points[:3], points + [0, 4, 0]])
 
 
-def test_results_are_short_to_read(model, poses):
+def test_repr_of_predictor_and_results_is_short(model, poses):
     assert repr(model).startswith("Predictor('small', body26, onnx, tta=1")
     assert repr(poses) == "Poses(2 of 3 people, smpl24)"
     assert re.fullmatch(r"PersonPose\(smpl24, confidence [01]\.\d\d, 590 points\)", repr(poses[0]))
     assert repr(replace(poses[1], id="b")) == "PersonPose(id='b', no pose, 3 points, 1 warning)"
 
 
-def test_notebooks_get_a_table_of_people_and_a_picture_of_a_person(poses):
+def test_notebooks_show_table_of_poses_and_picture_of_person(poses):
     picture = poses[0].picture()
     assert poses[0]._repr_png_() == picture[:] == picture._repr_png_() and picture.startswith(b"\x89PNG")
     assert isinstance(picture, bytes) and repr(picture) == f"<PNG, {len(picture):,} bytes>"
@@ -799,7 +836,7 @@ def test_notebooks_get_a_table_of_people_and_a_picture_of_a_person(poses):
     assert "&lt;b&gt;" in named._repr_html_() and "no pose" in named._repr_html_()
 
 
-def test_people_by_id_and_slices(poses):
+def test_poses_indexed_by_id_and_slice(poses):
     named = replace(poses, people=tuple(replace(p, id=i) for p, i in zip(poses, ("a", "b", 7), strict=True)))
     assert named["b"] is named[1] and named["7"] is named[2]
     assert isinstance(named[1:], type(poses)) and [p.id for p in named[1:]] == ["b", 7]
@@ -807,7 +844,7 @@ def test_people_by_id_and_slices(poses):
         named["c"]
 
 
-def test_results_as_arrays_and_as_a_table(poses, tmp_path):
+def test_poses_to_numpy_and_to_dataframe(poses, tmp_path):
     joints = poses.to_numpy()
     assert joints.shape == (3, 24, 3) and np.isnan(joints[1]).all() and not poses[1].has_pose
     np.testing.assert_array_equal(joints[0], poses[0].joints)
@@ -821,10 +858,12 @@ def test_results_as_arrays_and_as_a_table(poses, tmp_path):
     poses.save(tmp_path / "poses.csv")
     read = pd.read_csv(tmp_path / "poses.csv")
     assert list(read) == list(table) and list(read.joint) == list(table.joint)
-    np.testing.assert_allclose(read[["x", "y", "z"]], table[["x", "y", "z"]])
+    # the decimals of the JSON file
+    np.testing.assert_array_equal(read[["x", "y", "z"]][:24], poses[0].to_dict()["joints"])
+    np.testing.assert_array_equal(read.confidence[:24], poses[0].to_dict()["confidence"])
 
 
-def test_boxes_of_points_in_memory_and_of_a_file_give_the_same(model, points, tmp_path):
+def test_predict_boxes_of_array_match_boxes_of_file(model, points, tmp_path):
     np.save(tmp_path / "sweep.npy", points)
     box = {"center": points.mean(0).tolist(), "size": [1.5, 1.5, 2.2], "id": "a"}
     of_file = lidarpose.predict(tmp_path / "sweep.npy", boxes=[box], model=model)
@@ -833,16 +872,16 @@ def test_boxes_of_points_in_memory_and_of_a_file_give_the_same(model, points, tm
     np.testing.assert_array_equal(of_points.to_numpy(), of_file.to_numpy())
 
 
-def test_one_box_in_centimeters_among_boxes_in_metres_is_noticed(model, points):
+def test_predict_warns_of_one_box_in_other_unit(model, points):
     meters = {"center": points.mean(0).tolist(), "size": [1.5, 1.5, 2.2]}
     wrong = meters | {"size": [60, 60, 180], "id": "c"}
-    # with a street around, whose points are not the person's fault
+    # with a street around, whose points do not matter
     people = model.predict(np.concatenate([points, STREET]), boxes=[meters, wrong, meters])
     (line,) = people.warnings
     assert line.startswith("box c is unlike the others: it is 180 m tall: are the units")
     assert people["c"].has_pose and people["c"].warnings == ()
     assert not any("unlike" in line for line in model.predict(points, boxes=[meters, meters]).warnings)
-    # of two, neither is in between
+    # two boxes have no median to compare with
     (line,) = model.predict(np.concatenate([points, STREET]), boxes=[meters, wrong]).warnings
     assert line.startswith("box c is unlike the others: it is 180 m tall")
     (line,) = model.predict(np.concatenate([points, STREET]), boxes=[wrong, wrong | {"id": "d"}, meters]).warnings
@@ -863,12 +902,12 @@ STREET = np.random.default_rng(0).uniform([-200, -200, -2], [200, 200, -1.9], (3
     ],
     ids=["feet", "twice", "ten times", "upside down", "sweep", "two in feet"],
 )
-def test_what_is_no_person_in_metres_with_z_up_is_warned_about(model, points, change, words):
+def test_predict_warns_of_wrong_unit_axis_or_extent(model, points, change, words):
     assert any(words in line for line in model.predict(change(points)).warnings)
     assert model.predict(points).warnings == ()
 
 
-def test_all_who_may_be_upside_down_are_looked_at_in_one_batch(model, points, monkeypatch):
+def test_predict_checks_upside_down_people_in_one_batch(model, points, monkeypatch):
     batches, origins, run, poses = [], [], model.backend.run, model.poses
 
     def noted(clouds, origin, *arguments, **options):
@@ -880,10 +919,49 @@ def test_all_who_may_be_upside_down_are_looked_at_in_one_batch(model, points, mo
     people = model.predict([points * [1, -1, -1]] * 3, sensor_origin=(0.1, 0.2, 0.3))
     np.testing.assert_allclose(origins, [(0.1, 0.2, 0.3), (0.1, -0.2, -0.3)])
     assert ["try up -z" in person.warnings[-1] for person in people] == [True] * 3
-    # two passes as they are, two turned over
+    # two passes as given, two upside down
     assert batches == [3] * 4
-    # who only wants poses is spared it
+    # the check can be disabled
     batches.clear()
     same = model.predict_in([points * [1, -1, -1]] * 3, np.array([0.1, 0.2, 0.3]), check_upside_down=False)
     assert batches == [3] * 2
     np.testing.assert_array_equal(same.to_numpy(), people.to_numpy())
+    # lying people get no warning of their own
+    monkeypatch.setattr(predictor, "is_lying", lambda pose, part: True)
+    assert not any("try up" in line for line in model.predict(points * [1, -1, -1]).warnings)
+
+
+def test_predict_warns_once_of_boxes_in_millimeters(model, sweep):
+    """The distance of the boxes to sensor and points follows from their unit."""
+    _, clouds, boxes = sweep
+    scaled = [
+        {**box, "center": (1000 * np.array(box["center"])).tolist(), "size": [1000 * value for value in box["size"]]}
+        for box in boxes
+    ]
+    poses = lidarpose.predict(np.concatenate(clouds), boxes=scaled, model=model)
+    (warning,) = poses.warnings
+    assert "a person's box is" in warning and "millimeters" in warning
+
+
+def test_predict_warns_of_few_scored_people_upside_down_only_if_most_are(model, points):
+    flipped = points * [1, -1, -1]
+    for clouds, count in (([flipped, points, points], 0), ([flipped, flipped, points], 2)):
+        centers = np.array([cloud.mean(0) for cloud in clouds])
+        people = model.predict_in(clouds, None, box_centers=centers, is_scored=True)
+        assert sum("try up -z" in " ".join(person.warnings) for person in people) == count
+        people = model.predict_in(clouds, None, box_centers=centers)
+        assert sum("try up -z" in " ".join(person.warnings) for person in people) == max(count, 1)
+
+
+def test_predict_rejects_objects_that_hold_points(model):
+    frame = lidarpose.Frame(points=np.zeros((9, 3)), index=0, id="0")
+    with pytest.raises(InputError, match=r"got Frame, its points are in .points$"):
+        lidarpose.predict(frame, model=model)
+    with pytest.raises(InputError, match=r"array of numbers, got NoneType$"):
+        model.predict(None)
+
+
+def test_scan_unit_warning_of_person_in_millimeters():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (500, 3)) * [500, 300, 950]
+    assert "are the units millimeters? divide all coordinates by 1000" in scan_unit_warning(points, len(points))

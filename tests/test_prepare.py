@@ -1,4 +1,4 @@
-"""`prepare`: real datasets as shards, restartable and in any number of processes; splits, summary, wrong input."""
+"""`prepare`: real datasets as shards, restarts, several processes, splits, summary, bad input."""
 
 import json
 import os
@@ -31,7 +31,7 @@ from lidarpose.skeleton import HUMAN15, WAYMO14
 
 @pytest.fixture(scope="module")
 def raw(tmp_path_factory, smpl):
-    """HumanM3 and what must come out."""
+    """Raw files of HumanM3 and the true joints."""
     root = tmp_path_factory.mktemp("humanm3")
     truth = files.write_humanm3(root, smpl, sequences=("train/a", "train/b/seg0", "test/c"))
     return root, truth
@@ -53,10 +53,10 @@ def content(folder):
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
-# --- what is written
+# --- output
 
 
-def test_items_come_back_from_the_shards(raw, prepared):
+def test_prepare_humanm3_round_trip(raw, prepared):
     out, summary = prepared
     dataset = open_dataset(out)
     items = list(dataset.items())
@@ -77,7 +77,7 @@ def test_items_come_back_from_the_shards(raw, prepared):
         list(dataset.items("val"))
 
 
-def test_pandas_reads_them(prepared):
+def test_prepared_shards_are_readable_by_pandas(prepared):
     out, _ = prepared
     table = pd.concat([pd.read_parquet(path) for path in sorted(out.glob("labelled-*.parquet"))])
     assert len(table) == 18 and set(table["split"]) == {"train", "test"}
@@ -90,7 +90,7 @@ def test_pandas_reads_them(prepared):
     assert card["summary"]["people"] == 18 and "non-commercial" in card["about"]["licence"]
 
 
-def test_datasets_of_smpl_have_its_trans_and_distances(tmp_path, smpl):
+def test_prepare_sloper4d_has_trans_and_distances(tmp_path, smpl):
     root = tmp_path / "raw"
     truth = files.write_sloper4d(root, smpl)
     summary = prepare("sloper4d", root, tmp_path / "out", smpl=smpl, progress=False)
@@ -103,7 +103,7 @@ def test_datasets_of_smpl_have_its_trans_and_distances(tmp_path, smpl):
     assert summary["sources"] == {"sloper4d/opt_pose, male": 6}
     assert summary["skipped"] == {"labels without a cloud": 2}
     assert summary["trunk"][2] > 0.7 and summary["joints"] == {"seen": 144, "hidden": 0, "unlabelled": 0}
-    # the list names sequences that are not in this release
+    # the split has sequences that these files do not contain
     assert any(
         line.startswith("seq003_street_002, ") and line.endswith("of train by lidar-hmr are missing")
         for line in summary["warnings"]
@@ -117,7 +117,7 @@ def test_datasets_of_smpl_have_its_trans_and_distances(tmp_path, smpl):
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6), st.integers(0, 30), st.booleans(), st.booleans())
-def test_any_item_comes_back_as_it_was(tmp_path_factory, seed, count, boxed, rings):
+def test_labeled_row_round_trip(tmp_path_factory, seed, count, boxed, rings):
     rng = np.random.default_rng(seed)
     joints = rng.normal(0, 1, (14, 3)).astype(np.float32)
     labels = rng.integers(0, 3, 14).astype(np.uint8)
@@ -156,7 +156,7 @@ def test_any_item_comes_back_as_it_was(tmp_path_factory, seed, count, boxed, rin
     assert not second.sensor_known and np.isnan(second.distance)
 
 
-def test_only_columns_that_have_a_place_are_written(raw):
+def test_labeled_row_rejects_unknown_centers(raw):
     item = next(HumanM3().read(raw[0], "train/a"))
     with pytest.raises(InputError, match="names of centers must be trans, box, joints_box, got mean"):
         labeled_row(replace(item, centers={"mean": np.zeros(3)}), index=0)
@@ -165,12 +165,12 @@ def test_only_columns_that_have_a_place_are_written(raw):
 # --- stopped, killed, in several processes
 
 
-def test_several_processes_write_the_same_bytes(raw, prepared, tmp_path):
+def test_prepare_with_workers_writes_same_bytes(raw, prepared, tmp_path):
     summary = prepare("humanm3", raw[0], tmp_path / "out", workers=2)
     assert content(tmp_path / "out") == content(prepared[0]) and summary == prepared[1]
 
 
-def test_what_is_whole_is_not_read_again(raw, prepared, tmp_path, monkeypatch):
+def test_prepare_reads_only_missing_or_damaged_parts_again(raw, prepared, tmp_path, monkeypatch):
     out = tmp_path / "out"
     shutil.copytree(prepared[0], out)
     (out / "labelled-00001.parquet").unlink()
@@ -183,7 +183,7 @@ def test_what_is_whole_is_not_read_again(raw, prepared, tmp_path, monkeypatch):
     assert read == [1, 2] and content(out) == content(prepared[0]) and summary == prepared[1]
     prepare("humanm3", raw[0], out)
     assert read == [1, 2]
-    # of the right number of rows, but damaged
+    # a shard with the right number of rows, but damaged content
     table = parquet.read_table(out / "labelled-00001.parquet")
     column = pa.nulls(len(table), table.schema.field("joints").type)
     place = table.schema.get_field_index("joints")
@@ -192,13 +192,13 @@ def test_what_is_whole_is_not_read_again(raw, prepared, tmp_path, monkeypatch):
 
 
 def _gone():
-    """The number of a process that is no more."""
+    """The id of a process that has ended."""
     done = subprocess.Popen([sys.executable, "-c", ""])
     done.wait()
     return done.pid
 
 
-def test_a_stopped_run_goes_on_and_has_no_summary_before(raw, prepared, tmp_path, monkeypatch):
+def test_prepare_resumes_and_has_no_summary_until_finished(raw, prepared, tmp_path, monkeypatch):
     out, whole = tmp_path / "out", PartWriter.__call__
 
     def stop(self, number):
@@ -218,13 +218,13 @@ def test_a_stopped_run_goes_on_and_has_no_summary_before(raw, prepared, tmp_path
         list(open_dataset(out))
     prepare("humanm3", raw[0], out)
     assert content(out) == content(prepared[0])
-    # nor does one that was whole and is not any more
+    # a dataset that is no longer complete has no summary either
     (out / "labelled-00001.parquet").unlink()
     stopped()
 
 
 class Slow:
-    """Makes shards that take for ever, and tells so."""
+    """Makes shards that never end, and writes its process id to a file."""
 
     def __init__(self, folder):
         self.folder = folder
@@ -237,7 +237,7 @@ class Slow:
 
 
 @pytest.mark.long
-def test_workers_end_when_the_run_is_stopped(tmp_path):
+def test_make_shards_workers_end_when_closed(tmp_path):
     made = writer.make_shards(Slow(tmp_path), [0, 1], workers=2)
     for _, people in made:
         if people and len(list(tmp_path.iterdir())) == 2:
@@ -251,7 +251,7 @@ def test_workers_end_when_the_run_is_stopped(tmp_path):
 # --- splits
 
 
-def test_a_user_s_own_lists_win_and_blank_lines_are_no_sequence(tmp_path, smpl):
+def test_prepare_prefers_user_lists_and_ignores_blank_lines(tmp_path, smpl):
     root, out = tmp_path / "raw", tmp_path / "own"
     files.write_lidarhuman26m(root, smpl, sequences=("5", "7", "9"), frames=1)
     assert split_rule("lidarhuman26m", root).of_part("7") == "test"
@@ -260,7 +260,7 @@ def test_a_user_s_own_lists_win_and_blank_lines_are_no_sequence(tmp_path, smpl):
     (root / "test.txt").write_text("5\n")
     assert prepare("lidarhuman26m", root, out, smpl=smpl)["splits"] == {"test": 1, "train": 2}
     assert {item.sequence for item in open_dataset(out).items("test")} == {"5"}
-    # unless the published one is asked for by name
+    # unless the published split is requested by name
     summary = prepare("lidarhuman26m", root, tmp_path / "named", smpl=smpl, split_by="official")
     assert summary["splits"] == {"none": 1, "test": 1, "train": 1}
     (root / "train.txt").write_text("7\n")
@@ -269,7 +269,7 @@ def test_a_user_s_own_lists_win_and_blank_lines_are_no_sequence(tmp_path, smpl):
 
 @pytest.fixture
 def copied(raw, tmp_path):
-    """A copy of HumanM3, and what writes a user's lists into it."""
+    """A function that writes a user's lists into a copy of HumanM3."""
     root = tmp_path / "raw"
     shutil.copytree(raw[0], root)
 
@@ -282,11 +282,11 @@ def copied(raw, tmp_path):
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-8"])
-def test_own_lists_may_leave_out_the_first_folder(copied, encoding):
+def test_split_rule_user_lists_may_omit_first_folder(copied, encoding):
     root = copied("c\r\nb/seg0\r\n".encode(encoding), "train/a\nelsewhere\n".encode(encoding))
     rule = split_rule("humanm3", root, parts=["test/c", "train/a", "train/b/seg0"])
     assert rule.sets == {"train": ("test/c", "train/b/seg0"), "test": ("train/a", "elsewhere")}
-    # of two that end alike neither is meant
+    # a name that fits the end of two sequences matches neither
     rule = split_rule("humanm3", root, parts=["test/c", "train/c", "train/a"])
     assert rule.of_part("test/c") is None and rule.of_part("train/a") == "test"
 
@@ -302,18 +302,18 @@ def test_own_lists_may_leave_out_the_first_folder(copied, encoding):
         ("train/a\n", "\n", "test.txt: names no sequence"),
     ],
 )
-def test_own_lists_that_are_wrong_are_refused(copied, tmp_path, train, test, message):
+def test_prepare_rejects_bad_user_lists(copied, tmp_path, train, test, message):
     refused(message, "humanm3", copied(train, test), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_one_split_alone(raw, tmp_path):
+def test_prepare_single_split(raw, tmp_path):
     summary = prepare("humanm3", raw[0], tmp_path / "out", split="test")
     assert summary["splits"] == {"test": 6} and [part["part"] for part in summary["parts"]] == ["test/c"]
     refused("other settings: count is 1, requested is 2", "humanm3", raw[0], tmp_path / "out", split="train")
 
 
-def test_the_split_in_chunks_leaks_and_says_so(tmp_path, smpl):
+def test_prepare_warns_that_split_in_chunks_leaks(tmp_path, smpl):
     root = tmp_path / "raw"
     files.write_sloper4d(root, smpl, sequences=("seq009_running_002",), frames=101, without=(3,))
     summary = prepare("sloper4d", root, tmp_path / "out", smpl=smpl, split_by="dapt")
@@ -326,7 +326,7 @@ def test_the_split_in_chunks_leaks_and_says_so(tmp_path, smpl):
     assert tests["people"] == splits.count("test") and tests["skipped"] == summary["skipped"]
 
 
-def test_published_splits_are_apart_and_name_their_source(tmp_path):
+def test_published_splits_are_disjoint_and_have_source(tmp_path):
     for name in READERS:
         rules = list(_published(name))
         assert (
@@ -337,7 +337,7 @@ def test_published_splits_are_apart_and_name_their_source(tmp_path):
         rule = split_rule(name, tmp_path)
         assert (rule is None) == (not rules)
         if rule is not None:
-            # Waymo keeps the labels of its test folder to itself
+            # Waymo does not publish the labels of its test folder
             held_out = rule.sets["val" if name == "waymo" else "test"]
             assert rule.source and rule.sets["train"] and held_out
             assert not set(rule.sets["train"]) & set(held_out)
@@ -345,11 +345,11 @@ def test_published_splits_are_apart_and_name_their_source(tmp_path):
     assert len(split_rule("lidarhuman26m", tmp_path).sets["train"]) == 19
 
 
-# --- wrong input
+# --- bad input
 
 
 @pytest.mark.parametrize("name", ["sloper4d", "lidarhuman26m"])
-def test_a_body_that_is_not_smpl_is_refused_before_anything_is_written(tmp_path, smpl, name):
+def test_prepare_rejects_bad_smpl_file_before_writing(tmp_path, smpl, name):
     getattr(files, f"write_{name}")(tmp_path / "raw", smpl)
     wrong = tmp_path / "SMPL_NEUTRAL.npz"
     wrong.write_bytes(b"PK no model")
@@ -358,7 +358,7 @@ def test_a_body_that_is_not_smpl_is_refused_before_anything_is_written(tmp_path,
     assert not (tmp_path / "out").exists()
 
 
-def test_wrong_calls_are_one_line_and_write_nothing(raw, tmp_path, smpl):
+def test_prepare_errors_are_one_line_and_write_nothing(raw, tmp_path, smpl):
     out, mine = tmp_path / "out", tmp_path / "mine.txt"
     mine.write_text("x")
     for arguments, options, message in (
@@ -377,7 +377,7 @@ def test_wrong_calls_are_one_line_and_write_nothing(raw, tmp_path, smpl):
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
-def test_a_corrupted_part_is_counted_and_the_rest_goes_on(tmp_path, smpl):
+def test_prepare_counts_damaged_part_and_continues(tmp_path, smpl):
     root = tmp_path / "raw"
     files.write_sloper4d(root, smpl)
     path = root / "seq002_football_001/seq002_football_001_labels.pkl"
@@ -388,7 +388,7 @@ def test_a_corrupted_part_is_counted_and_the_rest_goes_on(tmp_path, smpl):
     assert "seq002_football_001_labels.pkl" in summary["skipped_first"]["the rest of a part cannot be read"]
     assert any(line == "no people in seq002_football_001" for line in summary["warnings"])
     assert any("skipped 1: the rest of a part" in line for line in summary_lines(summary))
-    # repaired: without its shards it is read again
+    # the repaired part is read again if its shards are deleted
     path.write_bytes(whole)
     for shard in (tmp_path / "out").glob("*-00000.parquet"):
         shard.unlink()
@@ -396,7 +396,7 @@ def test_a_corrupted_part_is_counted_and_the_rest_goes_on(tmp_path, smpl):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names on other systems are text")
-def test_names_that_are_no_text_are_written_escaped(tmp_path, smpl):
+def test_prepare_escapes_undecodable_names(tmp_path, smpl):
     root = tmp_path / "raw"
     files.write_humanm3(root, smpl, sequences=("train/a",), frames=1)
     path = root / "train/a/pose_calib/0007.json"
@@ -408,7 +408,7 @@ def test_names_that_are_no_text_are_written_escaped(tmp_path, smpl):
     assert {item.track for item in people} == {"\\ud800", "10"}
 
 
-def test_what_no_reader_foresaw_is_counted_with_its_kind(raw, tmp_path, monkeypatch):
+def test_prepare_counts_unexpected_errors_by_type(raw, tmp_path, monkeypatch):
     whole = HumanM3.read
 
     def read(self, root, part):
@@ -423,7 +423,7 @@ def test_what_no_reader_foresaw_is_counted_with_its_kind(raw, tmp_path, monkeypa
     assert summary["skipped_first"] == {reason: "train/a: KeyError: 'joints'"}
 
 
-def test_people_who_do_not_stand_and_labels_of_others_are_told(tmp_path, smpl):
+def test_prepare_warns_of_wrong_up_axis_and_mismatched_labels(tmp_path, smpl):
     root = tmp_path / "raw"
     files.write_lidarhuman26m(root, smpl, sequences=("5",))
     for path in (root / "labels/3d/pose/5").iterdir():
@@ -436,7 +436,7 @@ def test_people_who_do_not_stand_and_labels_of_others_are_told(tmp_path, smpl):
     assert any("labels and clouds from different releases" in line for line in warnings)
 
 
-def test_nobody_at_all_is_told(tmp_path, smpl):
+def test_prepare_warns_of_dataset_without_people(tmp_path, smpl):
     root = tmp_path / "raw"
     files.write_humanm3(root, smpl, sequences=("train/a",), frames=2)
     for path in root.glob("**/*.pcd"):

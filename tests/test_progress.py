@@ -1,4 +1,4 @@
-"""Progress of long work: a bar on a terminal, lines elsewhere, nothing when it is to be quiet."""
+"""Progress of long tasks: a bar on a terminal, lines elsewhere, nothing if quiet."""
 
 import re
 import sys
@@ -14,28 +14,28 @@ from lidarpose.progress import Progress
 def quick(monkeypatch):
     monkeypatch.setattr(progress, "LINE_EVERY", 0.02)
     monkeypatch.setattr(progress, "BAR_EVERY", 0.02)
-    # as commands of other tests leave it
+    # commands of other tests may have set it
     monkeypatch.setattr(progress, "_quiet", False)
 
 
-def test_without_a_terminal_there_is_a_line_now_and_then(quick, capsys):
+def test_progress_prints_lines_without_terminal(quick, capsys):
     with Progress(1200, unit="people", label="bench") as shown:
-        # what was there before is not this run's speed
+        # the first 1000 were done before this run and do not count for the speed
         time.sleep(0.4)
         shown.update(1000)
         time.sleep(0.1)
         shown.update(1100, "loss 1.5")
         time.sleep(0.2)
-        # nor is the time before it, where something is compiled
+        # nor does the time before the first update, in which code is compiled
         assert 100 / 0.5 < float(re.search(r"([\d.,]+)/s", shown.line())[1].replace(",", ""))
     lines = capsys.readouterr().err.splitlines()
-    # the same is not said again at once
+    # lines are not repeated
     assert len(lines) == len(set(lines)) >= 2
     pattern = r"lidarpose: bench: 1,100 of 1,200 people, [\d,.]+/s, 0:00:\d\d left, loss 1\.5"
     assert re.fullmatch(pattern, lines[-1])
 
 
-def test_a_bar_moves_while_nothing_is_updated(quick, capsys, monkeypatch):
+def test_progress_redraws_bar_without_updates(quick, capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     with Progress(10, unit="parts") as shown:
         shown.update(3)
@@ -45,7 +45,7 @@ def test_a_bar_moves_while_nothing_is_updated(quick, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("quiet, shown", [(True, True), (False, False)])
-def test_nothing_is_shown_where_it_is_not_wanted(quick, capsys, monkeypatch, quiet, shown):
+def test_progress_prints_nothing_if_quiet_or_not_shown(quick, capsys, monkeypatch, quiet, shown):
     monkeypatch.setattr(progress, "_quiet", quiet)
     with Progress(10, unit="parts", shown=shown) as bar:
         bar.update(3)
@@ -54,7 +54,7 @@ def test_nothing_is_shown_where_it_is_not_wanted(quick, capsys, monkeypatch, qui
     assert bar.line().startswith("3 of 10 parts")
 
 
-def test_an_error_ends_the_thread(quick):
+def test_progress_thread_ends_after_error(quick):
     with pytest.raises(ValueError), Progress(None, unit="parts") as bar:
         raise ValueError
     bar._thread.join(1)

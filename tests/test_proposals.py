@@ -1,4 +1,4 @@
-"""Finding people: the ground under a scan, places where somebody may stand, and what the network sees there."""
+"""Detection of people: the ground under a scan, proposals, and the network's inputs at candidates."""
 
 import pickle
 from concurrent.futures import ThreadPoolExecutor
@@ -34,7 +34,7 @@ def plane(*, slope=(0.0, 0.0), height=-1.8, reach=20.0, step=0.25, noise=0.02, s
 
 
 def column(x, y, *, ground=-1.8, height=1.75, count=150, radius=0.2, seed=1):
-    """Points of an upright cylinder with a narrow head, as a person's."""
+    """Points of an upright cylinder with a narrow head, similar to a person."""
     rng = np.random.default_rng(seed)
     angle = rng.uniform(0, 2 * np.pi, count)
     z = ground + rng.uniform(0.02, height, count)
@@ -43,7 +43,7 @@ def column(x, y, *, ground=-1.8, height=1.75, count=150, radius=0.2, seed=1):
 
 
 def sitter(x, y, *, ground=-1.8):
-    """Points of somebody who sits and looks along -x: body, lap and legs."""
+    """Points of a sitting person who faces -x: body, lap and legs."""
     lap = box([x - 0.4, y - 0.15, ground + 0.4], [x, y + 0.15, ground + 0.55], count=40)
     legs = box([x - 0.45, y - 0.15, ground + 0.05], [x - 0.35, y + 0.15, ground + 0.45], count=30)
     return np.concatenate([column(x, y, ground=ground + 0.45, height=0.85, count=80), lap, legs])
@@ -67,7 +67,7 @@ def nearest(centers, x, y):
 @pytest.fixture(scope="module")
 def scene():
     frame = street(5, 0, sensor="hdl-32e", people=(8, 12)).frames[0]
-    # rays of even angles lie on the borders of cells
+    # noise, because rays at regular angles are on the borders of cells
     points = frame.points + np.random.default_rng(0).normal(0, 0.01, frame.points.shape)
     return frame, points, estimate_ground(points, ORIGIN)
 
@@ -77,7 +77,7 @@ def scene():
 
 @pytest.mark.parametrize("height", [-0.3, -1.8, -6.0])
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.12, -0.05), (0.0, 0.25)])
-def test_a_plane_is_its_own_ground_whatever_stands_on_it(height, slope):
+def test_estimate_ground_of_plane_with_objects(height, slope):
     points = plane(slope=slope, height=height)
     on_it = [
         box([4, -1, height + 8 * slope[0]], [8, 1, height + 1.5 + 8 * slope[0]]),
@@ -89,7 +89,7 @@ def test_a_plane_is_its_own_ground_whatever_stands_on_it(height, slope):
     assert np.abs(ground.at(at) - (height + at @ slope)).max() < 0.2
 
 
-def test_the_ground_goes_on_where_nothing_was_seen():
+def test_estimate_ground_extrapolates_plane():
     points = plane(slope=(0.05, 0.0))
     away = np.hypot(points[:, 0], points[:, 1])
     ring = points[(away > 7) & (away < 15)]
@@ -97,11 +97,11 @@ def test_the_ground_goes_on_where_nothing_was_seen():
     ground = estimate_ground(np.concatenate([ring, hood]), ORIGIN)
     at = np.array([[0.0, 0], [1.5, 0], [3, 3]])
     assert np.abs(ground.at(at) - (-1.8 + 0.05 * at[:, 0])).max() < 0.15
-    # outside as at the border
+    # constant beyond the border
     np.testing.assert_allclose(ground.at(np.array([[1000.0, 0]])), ground.at(np.array([[500.0, 0]])))
 
 
-def test_indoors_the_floor_is_the_ground():
+def test_estimate_ground_finds_indoor_floor():
     floor = plane(reach=4, height=-1.1, step=0.1)
     things = [
         plane(reach=4, height=1.5, step=0.1),
@@ -113,7 +113,7 @@ def test_indoors_the_floor_is_the_ground():
     assert np.abs(ground.at(np.array([[0.8, 0.4], [-2, 1.5], [0, -2]])) + 1.1).max() < 0.12
 
 
-def test_where_there_is_no_ground_there_is_none():
+def test_estimate_ground_is_none_without_ground():
     rng = np.random.default_rng(0)
     assert estimate_ground(np.zeros((0, 3)), ORIGIN) is None
     assert estimate_ground(rng.uniform(-10, 10, (1, 3)), ORIGIN) is None
@@ -124,7 +124,7 @@ def test_where_there_is_no_ground_there_is_none():
     assert without_ground(np.zeros((0, 3))).at(np.zeros((2, 2))).tolist() == [0, 0]
 
 
-def test_ground_moves_with_the_points(scene):
+def test_estimate_ground_moves_with_points(scene):
     _, points, ground = scene
     shift = np.array([7.0, -3.0, 2.0])
     moved = estimate_ground(points + shift, ORIGIN + shift)
@@ -135,7 +135,7 @@ def test_ground_moves_with_the_points(scene):
     assert np.median(np.abs(turned.at(xy @ R[:2, :2].T) - ground.at(xy))) < 0.02
 
 
-def test_a_slope_at_the_bound_is_counted():
+def test_estimate_up_accepts_slope_at_bound():
     x, y = (values.ravel().astype(float) for values in np.meshgrid(np.arange(-10, 11), np.arange(-10, 11)))
     points = np.stack([x, y, np.nextafter(0.9, 0) * x], 1).repeat(3, axis=0)
     up = estimate_up(points)
@@ -143,7 +143,7 @@ def test_a_slope_at_the_bound_is_counted():
 
 
 @pytest.mark.parametrize("degrees", [0, 6, 18, 30])
-def test_a_tilted_cloud_is_told_from_a_level_one(scene, degrees):
+def test_estimate_up_detects_tilted_cloud(scene, degrees):
     points = scene[1]
     R = rotation_about("y", np.radians(degrees)) @ rotation_about("z", 0.7)
     up = estimate_up(points @ R.T, ORIGIN)
@@ -153,14 +153,14 @@ def test_a_tilted_cloud_is_told_from_a_level_one(scene, degrees):
         assert np.degrees(np.arccos(up @ R[:, 2])) < 2
 
 
-def test_up_of_nothing_is_unknown():
+def test_estimate_up_is_none_without_points():
     assert estimate_up(np.zeros((0, 3)), ORIGIN) is None
 
 
 # --- proposals
 
 
-def test_people_of_a_street_have_candidates(scene):
+def test_propose_finds_people_of_street(scene):
     frame, points, ground = scene
     centers = propose(points, ground)
     counts = np.bincount(frame.person[frame.person >= 0], minlength=len(frame.boxes))
@@ -182,18 +182,18 @@ def test_people_of_a_street_have_candidates(scene):
         ([column(9, 1, height=1.3, radius=0.3, count=30)], [(9, 1)]),
         ([sitter(5, 0), box([4.8, -1, -1.8], [5.25, 1, -1.35], count=200)], [(5, 0)]),
         ([column(9, 1, count=7)], [(9, 1)]),
-        # a head that looks over a hedge
+        # a head above a hedge
         ([column(9, 1, ground=-0.4, height=0.25, count=15, radius=0.1)], [(9, 1)]),
     ],
     ids=["pair", "close", "behind", "wall", "child", "touching", "sitting", "bench", "few", "head"],
 )
-def test_candidates_stand_where_people_do(points, places):
+def test_propose_finds_people_near_others_and_objects(points, places):
     points = np.concatenate([plane(), *points])
     centers = propose(points, estimate_ground(points, ORIGIN))
     assert [nearest(centers, *place) < 0.25 for place in places] == [True] * len(places)
 
 
-def test_most_of_a_wall_is_no_candidate_and_who_stands_before_it_is():
+def test_propose_rejects_wall_and_finds_person_in_front_of_it():
     wall = box([6, -10, -1.8], [6.2, 10, 2.5], count=30_000)
     points = np.concatenate([plane(), wall, column(5.5, 3)])
     ground = estimate_ground(points, ORIGIN)
@@ -204,36 +204,36 @@ def test_most_of_a_wall_is_no_candidate_and_who_stands_before_it_is():
 
 
 @pytest.mark.parametrize("gap", [0.5, 0.55, 0.6, 0.65])
-def test_everybody_in_a_row_is_a_candidate(gap):
-    """People abreast look like a wall from afar."""
+def test_propose_finds_all_people_in_row(gap):
+    """From a distance, people side by side look like a wall."""
     places = gap * np.arange(-2, 3)
     points = np.concatenate([plane(), *[column(10, y, seed=k) for k, y in enumerate(places)]])
     centers = propose(points, estimate_ground(points, ORIGIN))
     assert max(nearest(centers, 10, y) for y in places) < 0.15
 
 
-def test_bare_ground_and_nothing_have_no_candidates():
+def test_propose_is_empty_for_bare_ground_and_no_points():
     points = plane()
     ground = estimate_ground(points, ORIGIN)
     assert propose(points, ground).shape == (0, 3)
     assert propose(np.zeros((0, 3)), ground).shape == (0, 3)
 
 
-def test_candidates_do_not_depend_on_the_order_of_points_and_move_with_them(scene, monkeypatch):
+def test_propose_ignores_order_and_moves_with_points(scene, monkeypatch):
     _, points, ground = scene
     centers = propose(points, ground)
     order = np.random.default_rng(0).permutation(len(points))
     np.testing.assert_array_equal(propose(points[order], ground), centers)
     shift = np.array([30.0, -20.0, 0.0])
     moved = propose(points + shift, estimate_ground(points + shift, shift))
-    # cells are cut at whole decimeters: rounding may move single points to the next
+    # borders of cells are whole decimeters: rounding may move single points to the next cell
     gaps = [nearest(moved - shift, *center[:2]) for center in centers]
     assert np.mean(np.array(gaps) < 0.05) > 0.95
     monkeypatch.setattr(proposals, "_MOST", 7)
     np.testing.assert_array_equal(propose(points, ground), centers[:7])
 
 
-def test_threads_do_not_share_their_memory(scene):
+def test_propose_is_thread_safe(scene):
     _, points, ground = scene
     clouds = [points, points[::2], points[::3], points[::5]] * 3
     with ThreadPoolExecutor(4) as pool:
@@ -242,7 +242,7 @@ def test_threads_do_not_share_their_memory(scene):
         np.testing.assert_array_equal(centers, propose(cloud, ground))
 
 
-def test_a_map_wider_than_a_tile_has_the_candidates_of_its_parts():
+def test_propose_finds_people_across_tiles():
     near = np.concatenate([plane(), column(5, 0)])
     # at a border of tiles, and far away
     places = [(0, 0), (64 * 3 - 6, 0), (500, 300)]
@@ -252,7 +252,7 @@ def test_a_map_wider_than_a_tile_has_the_candidates_of_its_parts():
     assert len(centers) == 3
 
 
-def test_tiles_hold_what_lies_in_them_and_a_meter_around():
+def test_tiles_contain_points_with_margin_of_one_meter():
     rng = np.random.default_rng(2)
     x, y = rng.uniform(-50, 300, (2, 4000)).astype(np.float32)
     covered = []
@@ -263,13 +263,13 @@ def test_tiles_hold_what_lies_in_them_and_a_meter_around():
     assert (np.sort(np.concatenate(covered)) == np.arange(len(x))).all()
 
 
-def test_points_of_any_extent_are_shared_out_among_tiles():
+def test_tiles_accept_points_of_any_extent():
     x = np.repeat([0.0, 1e9, 3e15], 6)
     tiles = [rows for _, _, rows in proposals._tiles(x, x)]
     assert [rows.tolist() for rows in tiles] == np.arange(18).reshape(3, 6).tolist()
 
 
-def test_tiles_without_a_dense_place_have_no_column(monkeypatch):
+def test_columns_skips_only_tiles_without_dense_places(monkeypatch):
     rng = np.random.default_rng(3)
     scattered = np.column_stack([rng.uniform(0, 400, (6000, 2)), rng.uniform(0, 2.5, 6000)])
     points = np.concatenate([scattered, *(column(x, y, ground=0.0) for x, y in ((70, 333.5), (128, 192), (5, 5)))])
@@ -285,7 +285,7 @@ def test_tiles_without_a_dense_place_have_no_column(monkeypatch):
 
 
 @pytest.mark.long
-def test_candidates_see_what_the_words_say(scene):
+def test_render_matches_references(scene):
     _, points, ground = scene
     origin = np.array([0.3, -0.2, 0.1])
     heights = heights_above(points, ground)
@@ -308,14 +308,14 @@ def test_candidates_see_what_the_words_say(scene):
         near = local[(np.hypot(*local[:, :2].T) < 1.75) & (np.abs(local[:, 2] - 0.9) < 1.6)]
         if chosen.count[k] <= 1000:
             assert chosen.count[k] == len(near)
-            # a point on the border of cells may fall to either side
+            # a point on the border of two cells may be in either
             assert np.mean(np.abs(fine_reference(near) - inputs["fine"][k]) > 1e-5) < 4e-4
             assert inputs["fine"][k].any()
         context = context_reference(points, heights, center, chosen.yaw[k])
         assert np.mean(np.abs(context - inputs["context"][k]) > 0.005) < 0.01
         seen = range_reference(points, origin, chosen, k)
         drawn = inputs["range_view"][k, 2] > 0
-        # the tables' cells are up to 1.4 times smaller or larger than the picture's
+        # cells of the tables are up to 1.4 times smaller or larger than those of the image
         grown = np.pad(seen, 1)
         grown = np.stack([grown[i : i + 28, j : j + 24] for i in range(3) for j in range(3)]).any(0)
         assert np.mean(grown[drawn]) > 0.97
@@ -324,7 +324,7 @@ def test_candidates_see_what_the_words_say(scene):
 
 
 @pytest.mark.parametrize("origin", [ORIGIN, None], ids=["known", "unknown"])
-def test_inputs_of_places_are_those_of_their_candidates(scene, origin):
+def test_scene_index_pieces_match_candidates(scene, origin):
     _, points, ground = scene
     centers = np.tile(propose(points, ground), (3, 1))[:100]
     index = SceneIndex(points, ground, origin)
@@ -335,8 +335,8 @@ def test_inputs_of_places_are_those_of_their_candidates(scene, origin):
     np.testing.assert_array_equal(index.yaws(centers), index.candidates(centers).yaw)
 
 
-def test_a_crowded_candidate_is_the_same_in_any_order_of_points():
-    """Of more than 1,000 points some stay: in drivers' order, beam after beam, these would be of some beams only."""
+def test_candidates_thinning_ignores_order_of_points():
+    """More than 1,000 points are thinned; in a driver's order, the rest would be from a few beams only."""
     rng = np.random.default_rng(3)
     cloud = np.concatenate([plane(), column(6, 0, count=8000)]).astype(np.float32)
     ground, center = estimate_ground(cloud, ORIGIN), np.array([[6.0, 0, -1.8]])
@@ -345,11 +345,11 @@ def test_a_crowded_candidate_is_the_same_in_any_order_of_points():
         chosen = SceneIndex(cloud[order], ground, ORIGIN).candidates(center)
         assert chosen.sizes[0] == chosen.xyz.shape[1] <= 1000
         drawn.append({tuple(point) for point in chosen.xyz.T.tolist()})
-    # but for points whose scrambled coordinates are equal
+    # except points with equal scrambled coordinates
     assert min(len(drawn[0] & other) for other in drawn[1:]) > 0.95 * len(drawn[0])
 
 
-def test_a_wall_before_the_candidate_hides_and_one_behind_it_is_seen_past():
+def test_render_range_view_shows_wall_before_and_behind():
     wall = np.stack(np.meshgrid(np.linspace(-3, 3, 400), np.linspace(-1.8, 2, 300)), -1).reshape(-1, 2)
     person = column(8, 0, count=400)
     for at, sign in ((5.0, -1), (10.0, 1)):
@@ -362,21 +362,21 @@ def test_a_wall_before_the_candidate_hides_and_one_behind_it_is_seen_past():
         assert distance == pytest.approx(at - 8, abs=0.5) and np.sign(distance) == sign
 
 
-def test_without_a_sensor_candidates_keep_the_level_frame(scene):
+def test_candidates_without_origin_keep_level_frame(scene):
     _, points, ground = scene
     centers = propose(points, ground)[:5]
     chosen = SceneIndex(points, ground, None).candidates(centers)
     inputs = render(chosen)
     assert not inputs["range_view"].any() and not inputs["scalars"][:, [0, 1, 3]].any()
     assert not chosen.yaw.any() and not chosen.distance.any()
-    # as with a sensor that is dropped
+    # equal to inputs with a dropped origin
     seen = SceneIndex(points, ground, ORIGIN).candidates(centers)
     dropped = render(seen, CandidateAugmentation(drop_origin=True, turn=seen.yaw))
     assert not dropped["range_view"].any() and not dropped["scalars"][:, [0, 1, 3]].any()
     assert np.mean(np.abs(dropped["fine"] - inputs["fine"]) > 1e-5) < 1e-3
 
 
-def test_turning_the_scene_about_the_sensor_changes_nothing_that_the_network_sees(scene):
+def test_render_is_invariant_to_rotation_about_sensor(scene):
     _, points, ground = scene
     centers = propose(points, ground)
     centers = centers[np.hypot(*centers[:, :2].T) > 8][:20]
@@ -388,7 +388,7 @@ def test_turning_the_scene_about_the_sensor_changes_nothing_that_the_network_see
     np.testing.assert_allclose(turned["scalars"], plain["scalars"], atol=0.02)
 
 
-def test_duplicate_points_only_add_to_counts(scene):
+def test_duplicate_points_do_not_change_candidates(scene):
     _, points, ground = scene
     centers = propose(points, ground)
     twice = np.repeat(points, 2, 0)
@@ -398,7 +398,7 @@ def test_duplicate_points_only_add_to_counts(scene):
     assert ((one["fine"] > 0) == (two["fine"] > 0)).mean() > 0.999
 
 
-def test_augmentation_moves_points_and_labels_alike():
+def test_candidate_augmentation_moves_points_and_labels_alike():
     rng = np.random.default_rng(4)
     change = CandidateAugmentation(turn=0.3, mirror=True, scale=1.05, shift=(0.06, -0.04))
     ball = rng.normal(0, 0.03, (300, 3)) + [0.4, 0.3, 1.0]
@@ -416,7 +416,7 @@ def test_augmentation_moves_points_and_labels_alike():
     np.testing.assert_allclose(expected, [1.05 * x + 0.06, 1.05 * y - 0.04])
 
 
-def test_augmented_candidates_depend_on_their_own_augmentation_alone(scene):
+def test_render_augments_candidates_independently(scene):
     _, points, ground = scene
     chosen = SceneIndex(points, ground, ORIGIN).candidates(propose(points, ground)[:6])
     changes = draw_augmentation(np.random.default_rng(1), 6)
@@ -431,7 +431,7 @@ def test_augmented_candidates_depend_on_their_own_augmentation_alone(scene):
     assert 0.3 < (half["fine"] > 0).sum() / (unchanged["fine"] > 0).sum() < 0.9
 
 
-def test_no_points_and_no_candidates_are_legal():
+def test_render_accepts_no_points_and_no_candidates():
     ground = estimate_ground(plane(), ORIGIN)
     empty = SceneIndex(np.zeros((0, 3)), ground, ORIGIN)
     nobody = empty.candidates(np.zeros((0, 3)))
@@ -444,18 +444,18 @@ def test_no_points_and_no_candidates_are_legal():
     assert outside.count[0] == 0 and not render(outside)["context"].any()
 
 
-def test_dense_places_cost_no_more_than_thinned_ones():
+def test_candidates_thins_dense_places():
     person = np.concatenate([column(5, 0, count=200_000), plane(reach=8)])
     scene = SceneIndex(person, estimate_ground(person, ORIGIN), ORIGIN)
     chosen = scene.candidates(np.array([[5.0, 0, -1.8]]))
     assert chosen.sizes[0] <= 1000 < chosen.count[0] < 100_000
-    # the whole body is still there
+    # the whole body is kept
     x, y, z = chosen.xyz * 5e-4
     height = z[np.hypot(x, y) < 0.3]
     assert height.max() > 1.7 and np.diff(np.sort(height)).max() < 0.1
 
 
-def test_a_candidates_points_are_those_around_it(scene):
+def test_candidates_count_points_around_them(scene):
     _, points, ground = scene
     places, _ = columns(points, heights_above(points, ground))
     centers = np.concatenate([places, ground.at(places)[:, None]], 1)
@@ -466,21 +466,21 @@ def test_a_candidates_points_are_those_around_it(scene):
         assert abs(count - is_near.sum()) <= 1
 
 
-def test_of_places_too_near_to_each_other_the_weaker_goes():
+def test_suppress_near_removes_weaker_of_close_places():
     rng = np.random.default_rng(0)
     centers, strength = rng.uniform(0, 3, (200, 3)), rng.permutation(200)
     kept = suppress_near(centers, strength, 0.25)
     assert kept.tolist() == suppress_near_reference(centers, strength, 0.25)
     assert 20 < len(kept) < 200
-    # one that goes takes nobody along
+    # a removed place does not remove others
     row = np.array([[0.0, 0], [0.2, 0], [0.4, 0]])
     assert suppress_near(row, np.array([3.0, 2, 1]), 0.25).tolist() == [0, 2]
     assert len(suppress_near(np.zeros((0, 3)), np.zeros(0), 0.25)) == 0
 
 
 @pytest.mark.parametrize("shift", [(-3000.0, -3000.0), (3000.0, 0.0), (-20_000.0, 5000.0)])
-def test_what_is_looked_at_does_not_depend_on_where_zero_is(scene, shift):
-    """A scan in a map's coordinates, far from zero, is cut as one about the sensor."""
+def test_candidates_do_not_depend_on_coordinate_origin(scene, shift):
+    """A scan in map coordinates, far from zero, has the same candidates as one centered on the sensor."""
     _, points, ground = scene
     offset = np.array([*shift, 0.0])
     centers = propose(points, ground)[:20]
@@ -492,7 +492,7 @@ def test_what_is_looked_at_does_not_depend_on_where_zero_is(scene, shift):
     assert (there.contexts != here.contexts).mean() < 0.01
 
 
-def test_ground_on_a_slope_is_found_wherever_zero_is():
+def test_estimate_ground_of_slope_far_from_coordinate_origin():
     slope = plane()
     slope[:, 2] += 0.2 * slope[:, 0]
     for x in (-300.0, 0.0, 300.0):

@@ -1,4 +1,4 @@
-"""What people carry, use and wear: closed meshes, attached where they belong, for any pose and for the next one."""
+"""Props that people carry, use and wear: closed meshes, attached at the right places for any pose."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def bodies():
 
 @pytest.fixture(scope="module")
 def drawn(bodies):
-    """name -> (prop, its person's row), the people of the block asked a few times."""
+    """name -> [(prop, its person's row)], drawn a few times for all people of the block."""
     by_name: dict[str, list] = {}
     rng = np.random.default_rng(0)
     for _ in range(4):
@@ -50,13 +50,13 @@ def placed(drawn, bodies):
     return of_name
 
 
-def test_every_thing_is_drawn_and_is_within_reach(drawn, bodies):
+def test_draw_props_covers_all_props_near_body(drawn, bodies):
     assert THINGS | {"skirt", "hat"} == set(drawn)
     for name, props in drawn.items():
         for prop, row in props[:40]:
             mesh = prop.place(bodies.joints[row])
             assert np.isfinite(mesh.vertices).all() and mesh.vertices.dtype == np.float32, name
-            # nothing in the ground, and something of it near the body
+            # not below the ground, and close to the body
             assert mesh.vertices[:, 2].min() > -prop.lift - 0.03, name
             gap = np.linalg.norm(mesh.vertices[:, None] - bodies.vertices[row][None, ::7], axis=-1).min()
             assert gap < (0.6 if name == "chair" else 0.3), name
@@ -65,7 +65,7 @@ def test_every_thing_is_drawn_and_is_within_reach(drawn, bodies):
                 assert min(piece_volumes(mesh)) > 0, f"{name}: a piece is inside out"
 
 
-def test_shares_and_draws_that_repeat(bodies):
+def test_draw_props_has_expected_shares_and_is_deterministic(bodies):
     rng, joints = np.random.default_rng(1), bodies.joints
     walkers = [r for r, kind in enumerate(bodies.kinds) if kind in ("walk", "idle")]
     carries = [bool({p.name for p in draw_props(rng, kind="walk", joints=joints[r])} & THINGS) for r in walkers * 5]
@@ -73,7 +73,7 @@ def test_shares_and_draws_that_repeat(bodies):
     for kind in KINDS:
         counts = [len(draw_props(rng, kind=kind, joints=joints[r])) for r in range(100)]
         assert max(counts) <= 4 and (kind != "lie" or max(counts) == 0), kind
-    # draws repeat and leave the pose alone
+    # draws are deterministic and do not change the pose
     before = joints.copy()
     for row, kind in enumerate(bodies.kinds[:60]):
         first, again = (draw_props(np.random.default_rng(row), kind=kind, joints=joints[row]) for _ in range(2))
@@ -86,25 +86,25 @@ def test_shares_and_draws_that_repeat(bodies):
 
 @settings(max_examples=25, deadline=None)
 @given(st.floats(-np.pi, np.pi), st.floats(-5, 5), st.integers(0, 39))
-def test_what_is_carried_goes_along(drawn, bodies, yaw, x, pick):
-    """Turned and moved with its person."""
+def test_prop_place_follows_person_and_hands(drawn, bodies, yaw, x, pick):
+    """Props rotate and move with their person."""
     turn, move = rotation_about("z", yaw), np.array([x, -x, 0])
     for name, props in drawn.items():
         prop, row = props[pick % len(props)]
         if name == "ball":
-            continue  # round: its facets keep their place
+            continue  # round: its facets do not rotate
         joints = bodies.joints[row]
         there = (joints @ turn.T + move).astype(np.float32)
         expected = prop.place(joints).vertices @ turn.T + move
         np.testing.assert_allclose(prop.place(there).vertices, expected, atol=2e-4, err_msg=name)
         if name in ("bag", "stick", "umbrella", "suitcase", "phone"):
-            # with the hands alone
+            # hands move alone
             moved = joints.copy()
             moved[HANDS] += np.float32([0.05, 0.02, 0.03])
             assert (prop.place(moved).vertices - prop.place(joints).vertices).max(0)[0] > 0.02, name
 
 
-def test_bags_hang_straight_down_whatever_the_forearm_does(placed):
+def test_bag_hangs_vertically_from_hand(placed):
     for prop, joints, vertices, _ in placed("bag", 40):
         middle, joints = vertices[:, :2].mean(0), joints.copy()
         hand = joints[HANDS][np.linalg.norm(joints[HANDS, :2] - middle, axis=-1).argmin()]
@@ -116,14 +116,14 @@ def test_bags_hang_straight_down_whatever_the_forearm_does(placed):
 
 
 @pytest.mark.parametrize("name", ["pram", "trolley"])
-def test_prams_are_held_at_their_handles(placed, name):
+def test_pram_and_trolley_are_held_at_handle(placed, name):
     for _, joints, vertices, _ in placed(name):
         assert vertices[:, 2].min() == pytest.approx(0, abs=0.04)
         assert np.linalg.norm(vertices[:, None] - joints[HANDS], axis=-1).min() < 0.3
 
 
 @pytest.mark.parametrize(("name", "radius", "sides"), [("stick", 0.02, 5), ("umbrella", 0.03, 4)])
-def test_sticks_and_shafts_pass_through_a_hand(placed, name, radius, sides):
+def test_stick_and_umbrella_pass_through_hand(placed, name, radius, sides):
     for _, joints, vertices, _ in placed(name, 20):
         low, high = vertices[:sides].mean(0), vertices[sides : 2 * sides].mean(0)
         along, off = (high - low) / np.linalg.norm(high - low), joints[HANDS] - low
@@ -131,7 +131,7 @@ def test_sticks_and_shafts_pass_through_a_hand(placed, name, radius, sides):
         assert name == "umbrella" or abs(vertices[:, 2].min()) < 0.02
 
 
-def test_rucksacks_touch_the_back(drawn, bodies):
+def test_rucksack_touches_back(drawn, bodies):
     rig = load_rig()
     trunk = rig.dense_weight[:, [J[n] for n in ("spine1", "spine2", "spine3")]].sum(1) > 0.6
     gaps = []
@@ -143,12 +143,12 @@ def test_rucksacks_touch_the_back(drawn, bodies):
         inside = (bodies.vertices[row][trunk] - fit[3]) @ np.linalg.inv(fit[:3])
         behind = inside[(np.abs(inside[:, 1]) < 0.45) & (inside[:, 2] > 0) & (inside[:, 2] < 1)]
         gaps.append(-behind[:, 0].min() * np.linalg.norm(fit[0]))
-    # how deep the skin is in the pack, m
+    # depth of the skin in the rucksack, m
     assert len(gaps) > 30 and -0.02 < np.median(gaps) < 0.03
     assert np.percentile(gaps, 5) > -0.05 and np.percentile(gaps, 95) < 0.10
 
 
-def test_seats_are_under_the_thighs(drawn, bodies):
+def test_seat_is_under_thighs(drawn, bodies):
     rig = load_rig()
     thigh = rig.dense_weight[:, [J["left_hip"], J["right_hip"], J["pelvis"]]].sum(1) > 0.8
     for name, seat in (("chair", 1.0), ("wheelchair", 0.5)):
@@ -160,24 +160,24 @@ def test_seats_are_under_the_thighs(drawn, bodies):
             skin = bodies.vertices[row][thigh]
             along = (skin[:, :2] - (joints[J["left_hip"], :2] + joints[J["right_hip"], :2]) / 2) @ ahead
             lowest = skin[(along > -0.12) & (along < 0.2), 2].min()
-            # the row of the mesh that tells where its seat is
+            # affine fit of the placed mesh, which gives the height of the seat
             rest = np.c_[prop.mesh.vertices, np.ones(len(vertices))]
             fit = np.linalg.lstsq(rest, vertices, rcond=None)[0]
             assert abs(seat * fit[2, 2] + fit[3, 2] - lowest) < 0.06, name
 
 
-def test_cyclists_sit_hold_and_pedal(placed):
+def test_bicycle_is_at_hands_and_feet(placed):
     held = []
     for prop, joints, vertices, _ in placed("bicycle"):
         assert vertices[:, 2].min() == pytest.approx(-prop.lift, abs=0.03) and prop.lift == pytest.approx(0.1)
         held += [np.linalg.norm(vertices - joints[hand], axis=-1).min() for hand in HANDS]
         feet = [np.linalg.norm(vertices - joints[J[f]], axis=-1).min() for f in ("left_foot", "right_foot")]
         assert min(feet) < 0.2
-    # hands' joints are knuckles; a few cyclists wave
+    # joints of hands are the knuckles; a few cyclists wave
     assert np.median(held) < 0.2
 
 
-def test_pedals_go_along_with_the_feet():
+def test_bicycle_pedals_move_with_feet():
     moving, rng, apart = draw_bodies(None, 0.0, 200, 5, 0), np.random.default_rng(0), []
     for row in np.flatnonzero(np.array(moving.kinds) == "cycle"):
         (prop,) = (p for p in draw_props(rng, kind="cycle", joints=moving.joints[row]) if p.name == "bicycle")
@@ -189,7 +189,7 @@ def test_pedals_go_along_with_the_feet():
     assert len(now) >= 3 and np.median(later) < np.median(now) + 0.02
 
 
-def test_girths_are_those_of_the_skin():
+def test_girth_matches_skin():
     rig = load_rig()
     people = rig.rest(sample_people(np.random.default_rng(7), 200).coefficients)
     trunk = rig.dense_weight[:, [J[n] for n in ("pelvis", "spine1", "spine2", "spine3", "left_hip", "right_hip")]].sum(
@@ -211,7 +211,7 @@ def test_girths_are_those_of_the_skin():
 
 
 def inside_share(prop, vertices, joints, legs):
-    """Share of the legs' vertices between the hips and the hem that a skirt's rings go around."""
+    """Share of the legs' vertices between hips and hem that are inside the skirt's rings."""
     rings = prop.place(joints).vertices.reshape(4, 14, 3)
     points = vertices[legs]
     points = points[(points[:, 2] < rings[1, :, 2].min()) & (points[:, 2] > rings[3, :, 2].max())]
@@ -228,7 +228,7 @@ def inside_share(prop, vertices, joints, legs):
     return np.mean(inside) if inside else 1.0
 
 
-def test_skirts_bridge_the_legs_and_hold_them(drawn, bodies):
+def test_skirt_encloses_legs_and_has_their_parts(drawn, bodies):
     rig = load_rig()
     legs = rig.dense_weight[:, [J[n] for n in ("left_hip", "right_hip", "left_knee", "right_knee")]].sum(1) > 0.7
     legs = np.flatnonzero(legs)[::4]
@@ -246,7 +246,7 @@ def test_skirts_bridge_the_legs_and_hold_them(drawn, bodies):
     assert ((prop.face_part == 1 + J["left_hip"]) == on_left)[thighs].mean() > 0.8
 
 
-def test_hats_sit_on_the_head(placed, bodies):
+def test_hat_is_on_head(placed, bodies):
     head = load_rig().dense_weight[:, J["head"]] > 0.8
     for prop, joints, hat, row in placed("hat", 40):
         assert set(prop.face_part) == {1 + J["head"]}
@@ -255,7 +255,7 @@ def test_hats_sit_on_the_head(placed, bodies):
         assert -0.02 < ((hat @ up).max() - (skin @ up).max()) / np.linalg.norm(up) < 0.08
 
 
-def test_a_long_skirt_s_lower_half_is_of_the_shank_on_its_side():
+def test_long_skirt_parts_are_on_side_of_their_leg():
     joints = load_rig().rest(np.zeros((1, load_rig().coefficients.shape[1]), np.float32)).joints[0]
     joints = joints + [0, 0, 1 - joints[:, 2].min()]
     vertices, mesh, part = skirt(joints.tolist(), [1.0, 0.0, 0.0, 0.0])
@@ -267,7 +267,7 @@ def test_a_long_skirt_s_lower_half_is_of_the_shank_on_its_side():
 
 
 @pytest.mark.parametrize("name", ["bag", "suitcase"])
-def test_either_hand_carries(name):
+def test_bag_and_suitcase_are_carried_by_either_hand(name):
     joints = load_rig().rest(np.zeros((1, load_rig().coefficients.shape[1]), np.float32)).joints[0]
     for side, sign in (("left", 1), ("right", -1)):
         for joint, place in (("elbow", (0, 0.22, 0.15)), ("wrist", (0, 0.24, -0.1)), ("hand", (0, 0.24, -0.18))):

@@ -1,4 +1,4 @@
-"""The public names, what importing them costs, and which package may import which."""
+"""Public names, the libraries that importing them loads, and the allowed imports between packages."""
 
 import ast
 import graphlib
@@ -15,7 +15,7 @@ from lidarpose import _renamed
 SOURCE = Path(lidarpose.__file__).parent
 MODULES = sorted(SOURCE.rglob("*.py"))
 
-# from the ground up: a package imports its own layer and those below
+# lowest layer first: a package may import from its own layer and the lower ones
 LAYERS = (
     {"skeleton", "geometry", "sample", "arrays", "errors", "_version", "_renamed", "progress"},
     {"io"},
@@ -41,7 +41,7 @@ FORBIDDEN = {
 
 
 def loaded_by(code):
-    """Which of the heavy libraries a program loads."""
+    """The heavy libraries that a program imports."""
     heavy = ("torch", "numba", "numpy", "pandas", "matplotlib", "matplotlib.pyplot", "lzf")
     tail = f"\nimport sys; print(*[name for name in {heavy} if name in sys.modules])"
     done = subprocess.run(
@@ -50,18 +50,18 @@ def loaded_by(code):
     return set(done.stdout.split("\n")[-2].split())
 
 
-def test_import_and_help_load_nothing_heavy():
+def test_import_and_help_load_no_heavy_libraries():
     command = "\ntry: main(['predict', '--help'])\nexcept SystemExit: pass"
     assert loaded_by(f"import lidarpose; dir(lidarpose)\nfrom lidarpose.cli import main{command}") == set()
 
 
-def test_reading_casting_and_predicting_need_no_torch():
+def test_public_functions_do_not_import_torch():
     predicting = "lidarpose.load, lidarpose.predict, lidarpose.Poses, lidarpose.read_points, lidarpose.read_boxes"
     assert loaded_by(f"import lidarpose; {predicting}, lidarpose.Sample") <= {"numpy"}
     assert "torch" not in loaded_by("import lidarpose; lidarpose.cast_rays, lidarpose.sample_poses")
 
 
-def test_drawing_leaves_pyplot_alone():
+def test_drawing_does_not_import_pyplot():
     assert "matplotlib" not in loaded_by("from lidarpose.viz import draw, html")
     drawing = (
         "import numpy as np; from lidarpose.viz import draw; draw.draw_people([draw.Panel(points=np.ones((9, 3)))])"
@@ -69,25 +69,25 @@ def test_drawing_leaves_pyplot_alone():
     assert loaded_by(drawing) == {"numpy", "matplotlib"}
 
 
-def test_every_public_name_is_there():
+def test_all_public_names_exist():
     assert set(lidarpose.__all__) <= set(dir(lidarpose))
     for name in lidarpose.__all__:
         assert getattr(lidarpose, name) is not None
 
 
-def test_unknown_names_are_attribute_errors():
+def test_unknown_name_raises_attribute_error():
     with pytest.raises(AttributeError, match="no attribute 'pose'"):
         lidarpose.pose  # noqa: B018
     assert not hasattr(lidarpose, "__wrapped__")
 
 
-def test_no_public_name_is_hidden_by_a_module():
+def test_public_names_are_not_shadowed_by_modules():
     packages = {path.stem for path in SOURCE.glob("*.py")} | {path.name for path in SOURCE.iterdir() if path.is_dir()}
     assert not packages & set(lidarpose.__all__)
 
 
 @pytest.mark.parametrize("old, new", _renamed.RENAMED.items())
-def test_old_module_paths_import_what_has_moved(old, new):
+def test_old_module_paths_import_moved_modules(old, new):
     spec = importlib.import_module(f"lidarpose.{new}").__spec__
     with pytest.warns(DeprecationWarning, match=f"lidarpose.{new}"):
         sys.modules.pop(f"lidarpose.{old}", None)
@@ -109,7 +109,7 @@ def layer(name):
 
 
 def imports(path):
-    """All modules that a file imports, those inside functions too, but for what only type checkers see."""
+    """All modules that a file imports, including imports inside functions but not those under TYPE_CHECKING."""
     tree = ast.parse(path.read_text())
     typing_only = [node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
     tree.body = [node for node in tree.body if node not in typing_only]
@@ -133,14 +133,14 @@ def test_every_package_has_a_layer():
     assert {where(path) for path in MODULES} <= set().union(*LAYERS)
 
 
-def test_imports_go_downwards():
+def test_imports_follow_layer_order():
     for path in MODULES:
         here = where(path)
         for name in imports(path):
             library = name.split(".")[0]
             if library in NO_TORCH[0]:
                 assert here not in NO_TORCH[1], f"{path} imports {name}"
-            # so that everything but synthesis works without the extra
+            # everything except synthesis must work without the extra
             if library == "numba":
                 assert path.stem.endswith("_kernels"), f"{path} imports {name}"
             if library == "lidarpose":
@@ -149,16 +149,16 @@ def test_imports_go_downwards():
                 assert (here, there) not in FORBIDDEN, f"{path} imports {name}"
 
 
-def test_imports_run_in_no_circle():
+def test_modules_have_no_import_cycles():
     names = {path: ".".join(("lidarpose", *path.relative_to(SOURCE).with_suffix("").parts)) for path in MODULES}
     below = {name.removesuffix(".__init__"): set(imports(path)) for path, name in names.items()}
-    # a package may import what it holds
+    # `from lidarpose.x import y` in x/__init__.py is not a cycle
     below = {name: wanted - {name} for name, wanted in below.items()}
     # raises CycleError, which names the modules
     assert len(list(graphlib.TopologicalSorter(below).static_order())) >= len(MODULES)
 
 
-def test_no_two_packages_need_each_other():
+def test_packages_have_no_import_cycles():
     below = {}
     for path in MODULES:
         wanted = {package(name) for name in imports(path) if name.split(".")[0] == "lidarpose"}

@@ -26,7 +26,7 @@ from lidarpose.lidar.sensor import Sensor
 
 PARITY = Path(__file__).parent / "parity" / "raycast.npz"
 FULL_TURN = np.linspace(-np.pi, np.pi, 41)
-# no beam in the horizontal plane, where made-up meshes have edges
+# no beam in the horizontal plane, where the test meshes have edges
 ALL_ELEVATIONS = np.linspace(-1.5, 1.5, 24)
 
 
@@ -35,7 +35,7 @@ SPINNING = [name for name, s in SENSORS.items() if isinstance(s, Sensor)]
 
 @pytest.mark.long
 @pytest.mark.parametrize("scene", range(6))
-def test_same_as_embree(scene):
+def test_cast_rays_matches_embree(scene):
     data = np.load(PARITY)
     vertices, azimuth, elevation = (data[f"{scene}_{name}"] for name in ("vertices", "azimuth", "elevation"))
     want = data[f"{scene}_range"], data[f"{scene}_face"]
@@ -47,8 +47,8 @@ def test_same_as_embree(scene):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_the_first_cast_compiles_once(dtype):
-    """Whatever array comes, by whatever way: compiling for another type takes seconds."""
+def test_raster_compiles_once_for_all_input_types(dtype):
+    """All input types and functions share one compiled version; another one would take seconds."""
     vertices, faces = sphere()
     vertices = (vertices + [5.0, 0, 0]).astype(dtype)
     vertices.setflags(write=False)
@@ -61,11 +61,11 @@ def test_the_first_cast_compiles_once(dtype):
 
 @pytest.mark.parametrize("name", [name for name in SPINNING if not SENSORS[name].origins])
 @pytest.mark.parametrize("distance, azimuth", [(2.5, np.pi), (8.0, -np.pi + 1e-3), (20.0, 0.7)])
-def test_scan_same_as_reference(name, distance, azimuth):
+def test_scan_matches_reference(name, distance, azimuth):
     s = replace(sensor(name), range_min=0.0)
     rng = np.random.default_rng(3)
     person = body(rng)
-    # turned, since the slow twin may lose a ray that runs along an edge
+    # rotated because the reference may miss rays along an edge
     person = person[0] @ rotation_about("z", 0.1234).T, person[1]
     there = np.array([np.cos(azimuth), np.sin(azimuth), 0]) * distance + [0, 0, 0.9 - s.height]
     vertices, faces = join((person[0] + there, person[1]), (ground(1.0, 0)[0] + there - [0, 0, 0.9], ground(1, 0)[1]))
@@ -89,7 +89,7 @@ def test_scan_same_as_reference(name, distance, azimuth):
 
 
 @pytest.mark.parametrize("name", [name for name in SPINNING if not SENSORS[name].origins])
-def test_the_window_of_a_scan_holds_the_body_and_no_more(name):
+def test_scan_window_matches_reference(name):
     s = sensor(name)
     for i in range(25):
         rng = np.random.default_rng(i)
@@ -98,7 +98,7 @@ def test_the_window_of_a_scan_holds_the_body_and_no_more(name):
         vertices, faces = body(rng)
         hits = scan(vertices + there, faces[:0], s, margin=0.001 * i)
         assert window_of(hits) == window_reference(vertices + there, s, margin=0.001 * i) and len(hits.face) == 0
-    # -pi and +pi are one column, a body around the sensor gets the whole turn, one above it no row
+    # -pi and +pi are one column; a body around the sensor gets all columns; a body above the sensor gets no rows
     behind = scan(np.array([[-1.0, -0.01, 0], [-1.0, 0.01, 0]]), faces[:0], s)
     assert behind.column0 + behind.columns > s.columns and behind.columns < 12
     assert scan(vertices, faces[:0], s).columns == s.columns
@@ -120,8 +120,8 @@ def test_the_window_of_a_scan_holds_the_body_and_no_more(name):
     ],
     ids=["soup", "near", "small", "wide", "ground", "ceiling", "quad behind", "inside a body", "inside a sphere"],
 )
-def test_any_mesh_all_round_same_as_reference(mesh):
-    # tilted by an odd angle, so that no beam runs along an edge
+def test_full_turn_matches_reference(mesh):
+    # rotated randomly so that no beam runs along an edge
     turn = np.linalg.qr(np.random.default_rng(9).normal(size=(3, 3)))[0]
     for vertices in (mesh[0], mesh[0] @ turn + 1e-3):
         azimuth = FULL_TURN[:-1] + 0.0123
@@ -138,7 +138,7 @@ def test_any_mesh_all_round_same_as_reference(mesh):
     seed=st.integers(0, 2**32 - 1), spread=st.floats(0.05, 20), size=st.floats(0.01, 10), count=st.integers(1, 40),
     speed=st.floats(0, 5),
 )  # fmt: skip
-def test_random_soups_same_as_reference(seed, spread, size, count, speed):
+def test_random_triangles_match_reference(seed, spread, size, count, speed):
     rng = np.random.default_rng(seed)
     mesh = soup(rng, count, spread, size)
     azimuth, elevation = rng.uniform(-7, 7, 19), rng.uniform(-1.57, 1.57, 17)
@@ -162,14 +162,14 @@ COORDINATE = st.one_of(st.sampled_from([0.0, 1.0, -1.0, 1e-30, 5e-324, -5e-324])
     faces=[(0, 1, 2)],
     azimuth=[0.0],
     elevation=[3.8742073780626264e-22],
-)  # through the sensor
+)  # triangle through the sensor
 @given(
     vertices=st.lists(st.tuples(COORDINATE, COORDINATE, COORDINATE), min_size=3, max_size=8),
     faces=st.lists(st.tuples(*[st.integers(0, 7)] * 3), max_size=6),
     azimuth=st.lists(st.floats(-10, 10), max_size=5),
     elevation=st.lists(st.floats(-np.pi / 2, np.pi / 2), max_size=5),
 )
-def test_degenerate_meshes_give_sane_results(vertices, faces, azimuth, elevation):
+def test_degenerate_meshes_give_valid_ranges_and_faces(vertices, faces, azimuth, elevation):
     faces = np.array(faces, int).reshape(-1, 3) % len(vertices)
     distance, face = cast_rays(np.array(vertices), faces, azimuth, elevation)
     assert distance.shape == face.shape == (len(azimuth), len(elevation))
@@ -183,7 +183,7 @@ def test_degenerate_meshes_give_sane_results(vertices, faces, azimuth, elevation
 def test_closed_meshes_have_no_holes():
     vertices, faces = sphere(24)
     azimuth, elevation = np.linspace(-0.13, 0.13, 700), np.linspace(-0.13, 0.13, 600)
-    # the disc of a sphere of radius 1 at 5 m is 0.2 rad wide: all beams hit; then once more with beams on vertices
+    # at 5 m, a sphere of radius 1 m has an angular radius of 0.2 rad: all beams hit, and below also beams on vertices
     for shift in ([5, 0, 0], [-5, 0, 0], [0.3, 4.9, 0.1]):
         turned = azimuth + np.arctan2(shift[1], shift[0])
         assert (cast_rays(vertices * 1.02 + shift, faces, turned, elevation)[1] >= 0).all()
@@ -195,12 +195,12 @@ def test_closed_meshes_have_no_holes():
 
 
 @pytest.mark.parametrize("shift", [(0, 0, 0), (0.3, 0.2, 0.1), (0.7, -0.6, 0.0)])
-def test_no_holes_from_inside(shift):
+def test_closed_mesh_has_no_holes_from_inside(shift):
     vertices, faces = sphere(12)
     azimuth, elevation = np.linspace(-np.pi, np.pi, 700), np.linspace(-np.pi / 2, np.pi / 2, 301)
     distance, _ = cast_rays(vertices + shift, faces, azimuth, elevation)
     assert np.isfinite(distance).all() and distance.max() < 2.1
-    # half planes through edges and vertices
+    # beam planes through edges and vertices
     azimuth = np.arctan2(vertices[:, 1] + shift[1], vertices[:, 0] + shift[0])
     assert np.isfinite(cast_rays(vertices + shift, faces, azimuth, elevation)[0]).all()
     directions = np.random.default_rng(0).normal(size=(20_000, 3))
@@ -209,8 +209,8 @@ def test_no_holes_from_inside(shift):
     assert np.isfinite(cast_ray_list(vertices + shift, faces, vertices + shift)[0]).all()
 
 
-def test_a_moving_closed_mesh_has_no_holes():
-    # from inside, at any time, through vertices too
+def test_moving_closed_mesh_has_no_holes():
+    # rays from inside at random times, some of them through vertices
     corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], float)
     faces = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
     vertices, moved = corners * 2 + [0.1, 0, 0], corners @ rotation_about("x", 0.7).T * 3 + [0.2, 0.1, -0.1]
@@ -222,7 +222,7 @@ def test_a_moving_closed_mesh_has_no_holes():
     assert (cast_ray_list(vertices, faces, rays, moved=moved, time=time)[1] >= 0).all()
 
 
-def test_any_order_of_angles():
+def test_cast_rays_accepts_angles_in_any_order():
     rng = np.random.default_rng(1)
     vertices, faces = soup(rng, 50, 3, 1)
     azimuth, elevation = FULL_TURN[:-1] + 0.01, ALL_ELEVATIONS
@@ -289,24 +289,24 @@ WIDE = partial(scan, sensor=sensor("vlp-16"), divergence=0.003)
         (WIDE, {"pulse": -1.0}, "pulse must be"),
     ],
 )
-def test_bad_input_says_what_is_wrong(call, change, message):
+def test_raycast_rejects_invalid_input(call, change, message):
     with pytest.raises(InputError, match=message):
         call(**{"vertices": CORNERS, "faces": QUAD, **change})
 
 
-def test_nothing_of_the_body_is_seen_outside_its_window():
+def test_wider_scan_window_adds_no_body_points():
     s = sensor("vlp-32c")
     person = body(np.random.default_rng(5))
     vertices = person[0] + [4, 3, -0.8]
     tight, wide = scan(vertices, person[1], s), scan(vertices, person[1], s, margin=0.2)
-    # nor does a wall behind widen it
+    # a wall behind the person does not widen the window
     room = join((vertices, person[1]), ground(5.0, -1.5))
     assert window_of(scan(*room, s, window_vertices=vertices)) == window_of(tight)
     assert len(tight.points) == len(wide.points) and wide.columns > tight.columns and wide.rows >= tight.rows
     assert (tight.points == wide.points).mean() > 0.5 and np.abs(tight.points - wide.points).max() < 1e-5
 
 
-def test_scan_keeps_the_range_limits_and_hides_what_is_behind():
+def test_scan_applies_range_limits_and_occlusion():
     far, near = ground(1.0, 0), ground(1.0, 0)
     up = np.array([[0, 0, 1], [0, 1, 0], [1, 0, 0]])
     vertices, faces = join((far[0] @ up + [10, 0, 0], far[1]), (near[0] @ up * 0.2 + [3, 0, 0], near[1]))
@@ -314,13 +314,13 @@ def test_scan_keeps_the_range_limits_and_hides_what_is_behind():
     assert set(scan(vertices, faces, sensor("vlp-16")).face) == {0, 1, 2, 3}
     only = scan(vertices, faces, s)
     assert set(only.face) == {2, 3} and np.linalg.norm(only.points, axis=1).max() < 3.1
-    # the near surface is too near to return, and hides the far one all the same
+    # the near surface is closer than range_min and still occludes the far one
     assert len(scan(vertices, faces, replace(s, range_min=4.0, range_max=20.0)).points) + len(only.points) == len(
         scan(vertices, faces, sensor("vlp-16")).points
     )
 
 
-def test_input_is_not_changed_and_threads_agree():
+def test_scan_keeps_input_and_is_thread_safe():
     s = sensor("os1-128")
     vertices, faces = join(body(np.random.default_rng(6)), ground(2, -0.9))
     vertices = (vertices + [5, 1, -0.5]).astype(np.float32)
@@ -332,7 +332,7 @@ def test_input_is_not_changed_and_threads_agree():
     assert (vertices == kept).all()
 
 
-def test_all_round_window_casts_a_room():
+def test_scan_inside_sphere_fills_full_window():
     vertices, faces = sphere(8, radius=4.0)
     s = Sensor(name="coarse", elevations=np.linspace(-1.2, 1.2, 30), azimuth_step=2 * np.pi / 360)
     hits = scan(vertices, faces, s)

@@ -1,4 +1,4 @@
-"""Readers of real datasets: joints come out where they went in, quirks, and what is wrong is named and counted."""
+"""Readers of real datasets: joints, peculiarities of the formats, and reports of skipped data."""
 
 import json
 import pickle
@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from lidarpose.data.prepare import READERS, reader
+from lidarpose.data.readers import sloper4d
 from lidarpose.data.readers.base import Skipped, SmplJoints, read_cloud
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
@@ -38,7 +39,7 @@ def everything(name, root, smpl):
 
 
 def check(items, truth):
-    """Everybody who went in comes out, once, to 1 mm."""
+    """Each written person is read exactly once, with joints within 1 mm."""
     found = {(item.sequence, item.frame, item.track): item for item in items}
     assert len(found) == len(items) and found.keys() == truth.keys()
     for key, joints in truth.items():
@@ -54,7 +55,7 @@ def reasons(skipped):
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_joints_come_out_where_they_went_in(name, tmp_path, smpl):
+def test_readers_return_written_joints(name, tmp_path, smpl):
     truth = WRITERS[name](tmp_path, smpl)
     items, _ = everything(name, tmp_path, smpl)
     check(items, truth)
@@ -62,7 +63,7 @@ def test_joints_come_out_where_they_went_in(name, tmp_path, smpl):
     assert {len(item.joint_labels) for item in items} == {len(items[0].skeleton)}
     assert all(item.skeleton.name == source.skeleton for item in items)
     assert source.about["licence"] and source.about["get"] and source.about["notes"]
-    # the same again, in the same order
+    # a second read gives the same samples in the same order
     again, _ = everything(name, tmp_path, smpl)
     for a, b in zip(items, again, strict=True):
         np.testing.assert_array_equal(a.points, b.points)
@@ -71,16 +72,16 @@ def test_joints_come_out_where_they_went_in(name, tmp_path, smpl):
 # --- HumanM3
 
 
-def test_humanm3_files_of_any_number_of_digits(tmp_path, smpl):
+def test_humanm3_sorts_frames_and_people_by_number(tmp_path, smpl):
     truth = files.write_humanm3(tmp_path, smpl, sequences=("basketball2",), digits=0, first=9)
     items, skipped = everything("humanm3", tmp_path, smpl)
     check(items, truth)
-    # people in the order of their numbers, not of their names
+    # people are sorted by number, not by name
     assert not skipped and [item.track for item in items[:2]] == ["2", "10"]
     assert [item.time for item in items[::2]] == pytest.approx([0.0, 0.1, 0.2])
 
 
-def test_humanm3_boxes_are_of_the_joints_and_crop_the_points(tmp_path, smpl):
+def test_humanm3_box_encloses_joints_and_crops_points(tmp_path, smpl):
     files.write_humanm3(tmp_path, smpl)
     items, _ = everything("humanm3", tmp_path, smpl)
     for item in items:
@@ -88,7 +89,9 @@ def test_humanm3_boxes_are_of_the_joints_and_crop_the_points(tmp_path, smpl):
         np.testing.assert_allclose(box.size, np.ptp(joints, 0) + 0.4, atol=1e-5)
         np.testing.assert_array_equal(item.centers["joints_box"], box.center)
         assert box.contains(item.points, 0.3001).all() and len(item.points) >= 150
-    # the box is 20 cm larger than the joints, and points are taken within 30 cm of it
+        # the clouds are fused from four LiDARs
+        assert not item.sensor_known and np.isnan(item.distance)
+    # the box extends 20 cm beyond the joints; points within 30 cm of the box are kept
     top = items[0].box.center + [0, 0, items[0].box.size[2] / 2]
     path = tmp_path / items[0].sequence / f"pointcloud/{items[0].frame:06d}.pcd"
     files.write_pcd(path, [top + [0, 0, more] for more in (0.0, 0.28, 0.32)])
@@ -96,13 +99,13 @@ def test_humanm3_boxes_are_of_the_joints_and_crop_the_points(tmp_path, smpl):
     assert len(item.points) == 2
 
 
-def test_humanm3_s_database_has_everybody_once(tmp_path, smpl):
+def test_humanm3_database_gives_same_people_as_folders(tmp_path, smpl):
     truth = files.write_humanm3(tmp_path, smpl)
     files.write_humanm3_database(tmp_path, truth)
     folders, _ = everything("humanm3", tmp_path, smpl)
     for folder in tmp_path.glob("**/pose_calib"):
         shutil.rmtree(folder)
-    # of two clouds that a path may mean, it is the one of more of its folders
+    # if two clouds match a path, the one that matches more of its folders is used
     files.write_pcd(tmp_path / "000007.pcd", np.zeros((1, 3)))
     source = made("humanm3", smpl)
     assert source.parts(tmp_path) == ["train.pkl"]
@@ -112,7 +115,7 @@ def test_humanm3_s_database_has_everybody_once(tmp_path, smpl):
         np.testing.assert_array_equal(a.points, b.points)
         np.testing.assert_array_equal(a.joints, b.joints)
         assert (a.sequence, a.frame) == (b.sequence, b.frame)
-    # clouds may lie beside the database
+    # clouds may be in the folder of the database
     flat = tmp_path / "flat"
     flat.mkdir()
     shutil.copy(tmp_path / "train.pkl", flat)
@@ -124,7 +127,7 @@ def test_humanm3_s_database_has_everybody_once(tmp_path, smpl):
         source.parts(tmp_path)
 
 
-def test_humanm3_s_database_tells_who_is_visible(tmp_path, smpl):
+def test_humanm3_database_gives_joint_visibility(tmp_path, smpl):
     files.write_humanm3_database(tmp_path, files.write_humanm3(tmp_path, smpl, frames=1))
     frames = pickle.loads((tmp_path / "train.pkl").read_bytes())["db"]
     for k, camera in enumerate(frames[0]["info"]):
@@ -136,13 +139,13 @@ def test_humanm3_s_database_tells_who_is_visible(tmp_path, smpl):
     (tmp_path / "test.pkl").write_bytes(pickle.dumps({"db": frames}))
     found = list(made("humanm3", smpl).read(tmp_path, "test.pkl"))
     items = [one for one in found if isinstance(one, LabeledSample)]
-    # one camera that sees a joint is enough
+    # a joint is labeled if at least one camera sees it
     assert [int((item.joint_labels == UNLABELED).sum()) for item in items] == [1, 0, 0, 0]
     assert np.isnan(items[0].joints[5]).all()
     assert reasons(found[len(items) :]) == {"entry in another format": 1, "labels without a cloud": 1}
 
 
-def test_humanm3_says_which_folder_is_incomplete_or_above_the_root(tmp_path, smpl):
+def test_humanm3_names_incomplete_folder_and_likely_root(tmp_path, smpl):
     files.write_humanm3(tmp_path / "HumanM3", smpl, sequences=("train/a", "train/plaza/p1", "test/c"), frames=1)
     with pytest.raises(
         InputError, match="is a folder above HumanM3's root, which is likely .*HumanM3: give that folder"
@@ -150,7 +153,7 @@ def test_humanm3_says_which_folder_is_incomplete_or_above_the_root(tmp_path, smp
         made("humanm3", smpl).parts(tmp_path)
     assert made("humanm3", smpl).parts(tmp_path / "HumanM3") == ["test/c", "train/a", "train/plaza/p1"]
     shutil.rmtree(tmp_path / "HumanM3/train/a/pose_calib")
-    # its body is no database of people; nor is the database read where a sequence is complete
+    # an SMPL file is not a database, and a database is not used if another sequence is complete
     for name in ("SMPL_NEUTRAL.pkl", "train.pkl"):
         (tmp_path / "HumanM3" / name).write_bytes(pickle.dumps({}))
         with pytest.raises(InputError, match="has .*train/a without pose_calib: add what is missing"):
@@ -158,7 +161,7 @@ def test_humanm3_says_which_folder_is_incomplete_or_above_the_root(tmp_path, smp
 
 
 @pytest.mark.parametrize("too_deep", ["train", "train/a"])
-def test_humanm3_s_root_named_too_deep_is_said(tmp_path, smpl, too_deep):
+def test_humanm3_folder_inside_root_names_likely_root(tmp_path, smpl, too_deep):
     root = tmp_path / "train/HumanM3"
     files.write_humanm3(root, smpl, sequences=("train/a", "test/c"), frames=1)
     assert made("humanm3", smpl).parts(root) == ["test/c", "train/a"]
@@ -166,14 +169,14 @@ def test_humanm3_s_root_named_too_deep_is_said(tmp_path, smpl, too_deep):
         made("humanm3", smpl).parts(root / too_deep)
 
 
-def test_a_sequence_of_humanm3_that_lacks_clouds_and_labels_is_named(tmp_path, smpl):
+def test_humanm3_names_sequence_without_clouds_and_labels(tmp_path, smpl):
     files.write_humanm3(tmp_path, smpl, sequences=("train/a", "test/c"), frames=1)
     (tmp_path / "test/intersection/smpl_estimated").mkdir(parents=True)
     with pytest.raises(InputError, match="intersection without pointcloud and pose_calib: add what is missing"):
         made("humanm3", smpl).parts(tmp_path)
 
 
-def test_a_joint_of_humanm3_that_is_null_is_not_labeled(tmp_path, smpl):
+def test_humanm3_null_joint_is_unlabeled(tmp_path, smpl):
     files.write_humanm3(tmp_path, smpl, sequences=("train/a",), frames=1)
     (path,) = (tmp_path / "train/a/pose_calib").glob("*.json")
     bodies = json.loads(path.read_text())
@@ -185,7 +188,7 @@ def test_a_joint_of_humanm3_that_is_null_is_not_labeled(tmp_path, smpl):
     assert np.isnan(item.joints[3]).all() and item.joint_labels[3] == 0 and (np.delete(item.joint_labels, 3) > 0).all()
 
 
-def test_humanm3_skips_are_counted_and_named(tmp_path, smpl):
+def test_humanm3_counts_and_names_skipped_frames(tmp_path, smpl):
     truth = files.write_humanm3(tmp_path, smpl, sequences=("train/a",), frames=9, first=0)
     here = tmp_path / "train/a"
     (here / "pointcloud/000000.pcd").write_bytes((here / "pointcloud/000000.pcd").read_bytes()[:300])
@@ -215,7 +218,7 @@ def test_humanm3_skips_are_counted_and_named(tmp_path, smpl):
 # --- LiDARHuman26M
 
 
-def test_lidarhuman26m_one_bad_file_costs_one_frame(tmp_path, smpl):
+def test_lidarhuman26m_bad_file_skips_one_frame(tmp_path, smpl):
     truth = files.write_lidarhuman26m(tmp_path, smpl, sequences=("7",), frames=11)
     pose, segment = tmp_path / "labels/3d/pose/7", tmp_path / "labels/3d/segment/7"
 
@@ -247,8 +250,8 @@ def test_lidarhuman26m_one_bad_file_costs_one_frame(tmp_path, smpl):
 
 
 @pytest.mark.parametrize("bad", [1e30, np.finfo(np.float32).max, -1e10])
-def test_points_out_of_reach_are_left_out(tmp_path, smpl, bad):
-    """They moved the center by up to 1e18 m."""
+def test_readers_drop_points_out_of_range(tmp_path, smpl, bad):
+    """Such points moved the center by up to 1e18 m."""
     root = tmp_path / "lidarhuman26m"
     files.write_lidarhuman26m(root, smpl, sequences=("5",), frames=1)
     path = root / "labels/3d/segment/5/000001.ply"
@@ -268,7 +271,7 @@ def test_points_out_of_reach_are_left_out(tmp_path, smpl, bad):
         assert np.abs(item.center - item.joints.mean(0)).max() < 1
 
 
-def test_lidarhuman26m_s_trans_is_a_center(tmp_path, smpl):
+def test_lidarhuman26m_trans_is_a_center(tmp_path, smpl):
     files.write_lidarhuman26m(tmp_path, smpl)
     items, _ = everything("lidarhuman26m", tmp_path, smpl)
     for item in items:
@@ -282,7 +285,7 @@ def test_lidarhuman26m_s_trans_is_a_center(tmp_path, smpl):
 # --- SLOPER4D
 
 
-def test_sloper4d_reads_refined_poses_and_else_the_others(tmp_path, smpl):
+def test_sloper4d_prefers_refined_poses(tmp_path, smpl):
     for refined, which in ((True, "opt_pose"), (False, "pose")):
         root = tmp_path / which
         truth = files.write_sloper4d(root, smpl, refined=refined, total=3, frames=5)
@@ -294,21 +297,21 @@ def test_sloper4d_reads_refined_poses_and_else_the_others(tmp_path, smpl):
         assert [item.time for item in items[:2]] == pytest.approx([0.0, 0.1], abs=1e-6)
 
 
-def test_sloper4d_is_level_and_about_the_sensor(tmp_path, smpl):
+def test_sloper4d_joints_are_level_and_relative_to_sensor(tmp_path, smpl):
     content, _ = files.sloper4d_labels(smpl, "seq001", without=())
     write_labels(tmp_path, content)
     for k, item in enumerate(everything("sloper4d", tmp_path, smpl)[0]):
-        # SMPL's trans moves with the joints
+        # SMPL's trans is transformed like the joints
         place, heading = content["first_person"]["lidar_traj"][k, 1:4], 0.4 + 0.1 * k
         trans = rotation_about("z", -heading) @ (content["second_person"]["opt_trans"][k] - place)
         np.testing.assert_allclose(item.centers["trans"], trans, atol=1e-6)
-        # the head is above the feet, whatever the sensor's tilt, and the person some metres away
+        # the head is above the feet for any tilt of the sensor; the person is a few meters away
         joints = item.joints
         assert joints[15, 2] > joints[[10, 11], 2].max() + 0.8
         assert 1 < np.linalg.norm(item.center) < 8
 
 
-def test_sloper4d_takes_the_gender_s_own_body(tmp_path):
+def test_sloper4d_uses_body_model_of_gender(tmp_path):
     for k, gender in enumerate(("NEUTRAL", "MALE")):
         files.write_smpl(tmp_path / f"SMPL_{gender}.npz", seed=k)
     root = tmp_path / "data"
@@ -324,12 +327,12 @@ def test_sloper4d_takes_the_gender_s_own_body(tmp_path):
         reader("sloper4d", tmp_path)
 
 
-def test_sloper4d_of_two_releases_in_one_folder(tmp_path, smpl):
+def test_sloper4d_rejects_two_releases_in_one_folder(tmp_path, smpl):
     for release in ("v0", "v1"):
         files.write_sloper4d(tmp_path / release, smpl, sequences=("seq003_street_002",))
     with pytest.raises(InputError, match="has seq003_street_002_labels.pkl twice"):
         made("sloper4d", smpl).parts(tmp_path)
-    # a sequence's own folder is a root, too
+    # the folder of a sequence is also accepted as root
     assert made("sloper4d", smpl).parts(tmp_path / "v1/seq003_street_002") == ["seq003_street_002"]
 
 
@@ -338,7 +341,17 @@ def write_labels(root, content):
     (root / "seq001_labels.pkl").write_bytes(pickle.dumps(content))
 
 
-def test_sloper4d_skips_are_counted(tmp_path, smpl):
+def test_sloper4d_matches_scans_by_time(tmp_path):
+    folder = tmp_path / "lidar_data" / "lidar_frames_rot"
+    folder.mkdir(parents=True)
+    for name in ("1641234567_500", "1641234567_550", "notes"):
+        (folder / f"{name}.pcd").touch()
+    times = {1: 1641234567.485, 2: 1641234567.524, 3: 1641234567.535}
+    found = sloper4d._scans(tmp_path, times)
+    assert {frame: path.stem for frame, path in found.items()} == {1: "1641234567_500", 3: "1641234567_550"}
+
+
+def test_sloper4d_counts_skipped_frames(tmp_path, smpl):
     content, truth = files.sloper4d_labels(smpl, "seq001", frames=7, without=())
     person = content["second_person"]
     person["point_clouds"][0] = np.zeros((0, 3))
@@ -346,15 +359,15 @@ def test_sloper4d_skips_are_counted(tmp_path, smpl):
     person["point_clouds"][2] = [["x", 1, 2]]
     person["opt_pose"][3, 5] = np.nan
     person["opt_pose"], person["opt_trans"] = person["opt_pose"][:6], person["opt_trans"][:6]
-    content["first_person"]["lidar_traj"][4, 4:8] = 0
-    # with a fourth column, which would shift all that follows
+    content["first_person"]["lidar_traj"][4, 4:8] *= 1.02
+    # a fourth column must not shift the values that follow
     person["point_clouds"][3] = np.hstack([person["point_clouds"][3], np.ones((150, 1))])
     person["point_clouds"].append(person["point_clouds"][5][:9])
     person["point_frame"] = [*person["point_frame"], 7777]
     person["point_clouds"][5] = np.concatenate([person["point_clouds"][5][:9], [[1.0, np.nan, 2.0]]])
     write_labels(tmp_path, content)
     items, skipped = everything("sloper4d", tmp_path, smpl)
-    # nine points are kept: protocols leave them out later
+    # nine points are kept here; protocols exclude such people later
     assert [(item.frame, len(item.points)) for item in items] == [(125, 9)]
     assert reasons(skipped) == {
         "empty cloud": 2, "cloud cannot be read": 2, "cloud without a pose": 1, "cloud without the LiDAR's position": 1,
@@ -385,7 +398,7 @@ def test_sloper4d_skips_are_counted(tmp_path, smpl):
         ({"point_clouds": np.array(5.0)}, "should be a list"),
     ],
 )
-def test_sloper4d_labels_that_are_wrong_are_one_line(tmp_path, smpl, change, message):
+def test_sloper4d_rejects_invalid_labels(tmp_path, smpl, change, message):
     content = files.sloper4d_labels(smpl, "seq001")[0]
     if callable(change):
         content = change(content)
@@ -401,7 +414,7 @@ def test_sloper4d_labels_that_are_wrong_are_one_line(tmp_path, smpl, change, mes
 # --- corpora
 
 
-def test_lipd_places_joints_by_the_points_and_says_how(tmp_path, smpl):
+def test_lipd_source_records_how_joints_are_placed(tmp_path, smpl):
     files.write_lipd(tmp_path, smpl)
     items, skipped = everything("lipd", tmp_path, smpl)
     assert [item.source for item in items] == [
@@ -410,7 +423,7 @@ def test_lipd_places_joints_by_the_points_and_says_how(tmp_path, smpl):
     assert reasons(skipped) == {"joints are far from the points": 1}
 
 
-def test_entries_of_another_form_cost_one_entry(tmp_path, smpl):
+def test_corpus_entry_in_other_format_is_skipped(tmp_path, smpl):
     files.write_freemotion(tmp_path, smpl, frames=5)
     path = tmp_path / "fm_test2.pkl"
     entries = pickle.loads(path.read_bytes())
@@ -432,18 +445,18 @@ def test_entries_of_another_form_cost_one_entry(tmp_path, smpl):
     assert "y.bin is not in" in skipped[0].where
 
 
-def test_noisemotion_without_poses_says_how_they_are_made(tmp_path, smpl):
+def test_noisemotion_without_poses_names_authors_script(tmp_path, smpl):
     (tmp_path / "pc_1/train/run1").mkdir(parents=True)
     with pytest.raises(InputError, match="SURREAL: run the authors' dataloader_NoiseMotion.py") as caught:
         made("noisemotion", smpl).parts(tmp_path)
     assert "\n" not in str(caught.value)
 
 
-# --- roots, SMPL and what readers share
+# --- roots and SMPL models
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_wrong_root_is_one_line_that_says_what_is_expected_and_where_to_get_it(name, tmp_path, smpl):
+def test_wrong_root_error_names_expected_files_and_source(name, tmp_path, smpl):
     (tmp_path / "other").mkdir()
     with pytest.raises(InputError, match="is not the root of .*expected .* got .* get it at ") as caught:
         made(name, smpl).parts(tmp_path)
@@ -456,7 +469,7 @@ def test_a_wrong_root_is_one_line_that_says_what_is_expected_and_where_to_get_it
         assert made(name, smpl).parts(tmp_path) == ["5"]
 
 
-def test_smpl_where_it_is_needed(tmp_path, smpl):
+def test_reader_requires_matching_smpl_model(tmp_path, smpl):
     for name in ("lidarhuman26m", "sloper4d", "freemotion"):
         with pytest.raises(InputError, match=f"{name} has SMPL poses.*register at smpl.is.tue.mpg.de"):
             reader(name)
@@ -474,11 +487,11 @@ def test_smpl_where_it_is_needed(tmp_path, smpl):
         SmplJoints(tmp_path / "y.npz", "x")(np.zeros((1, 10)), np.zeros((1, 72)), np.zeros((1, 3)))
 
 
-def test_published_names_of_smpl_are_known(tmp_path):
+def test_published_smpl_file_names_are_recognized(tmp_path):
     names = ("basicModel_f_lbs_10_207_0_v1.0.0", "basicmodel_m_lbs_10_207_0_v1.1.0", "SMPL_NEUTRAL", "other")
     for name in names:
         (tmp_path / f"{name}.pkl").write_bytes(b"x")
-    # the one that is read at once
+    # the neutral model is read immediately
     (tmp_path / f"{names[2]}.pkl").unlink()
     files.write_smpl(tmp_path / f"{names[2]}.npz")
     found = SmplJoints(tmp_path, "x")

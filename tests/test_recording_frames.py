@@ -1,4 +1,4 @@
-"""Recordings whose sensor goes and turns, whose times are uneven, or whose up is not z; the columns of their tables."""
+"""Recordings of moving sensors, with irregular times or another up axis; columns of the result tables."""
 
 import json
 from itertools import pairwise
@@ -37,14 +37,14 @@ def one_model(model, monkeypatch):
 
 
 def written(source, path, model, *, world=False, **options):
-    """The lines that `write_recording` writes, of people in given boxes."""
+    """The lines that `write_recording` writes for people in given boxes."""
     predictor = FramePredictor(model=model, **options)
     output.write_recording(source, predictor, path, command={}, world=world)
     return [json.loads(line) for line in open(path)]
 
 
 def assert_where_people_are(lines, tolerance=0.25):
-    """Lines in the world's frame have both people where they are."""
+    """Both people are at their true positions in lines in the world frame."""
     assert len(lines) == FRAMES
     for k, line in enumerate(lines):
         assert line["coordinates"] == "world"
@@ -53,11 +53,11 @@ def assert_where_people_are(lines, tolerance=0.25):
         assert offsets.shape == (2, 2) and offsets.min(1).max() < tolerance and set(offsets.argmin(1)) == {0, 1}
 
 
-# ---- a sensor that moves
+# ---- moving sensors
 
 
 @pytest.mark.parametrize("options", [{}, {"track": True}, {"live": True}], ids=["frames", "smoothed", "live"])
-def test_poses_in_the_world_of_a_sensor_that_moves(options, model, tmp_path):
+def test_moving_sensor_poses_are_in_world_frame(options, model, tmp_path):
     source = moving_source(walking_clouds())
     lines = written(source, tmp_path / "a.jsonl", model, world=True, boxes=boxes_of(FRAMES), **options)
     assert_where_people_are(lines)
@@ -66,13 +66,13 @@ def test_poses_in_the_world_of_a_sensor_that_moves(options, model, tmp_path):
         offsets = np.linalg.norm(np.array(frame_centers)[:, None] - places_in_world(k), axis=-1)
         assert offsets.min(1).max() < 0.01
     if options:
-        # steady: from frame to frame people go as they do
+        # tracked poses move smoothly from frame to frame
         tracks = [{person["track"]: np.mean(person["joints"], 0) for person in line["people"]} for line in lines]
         steps = np.array([[now[id] - before[id] for id in (0, 1)] for before, now in pairwise(tracks)])
         assert np.linalg.norm(steps, axis=-1).max() < 0.2
 
 
-def test_printed_lines_in_the_world(monkeypatch, tmp_path, capsys):
+def test_world_option_prints_lines_in_world_frame(monkeypatch, tmp_path, capsys):
     clouds = walking_clouds()
     monkeypatch.setattr("lidarpose.io.sources.open_source", lambda *_, **__: moving_source(clouds))
     boxes = [
@@ -87,13 +87,13 @@ def test_printed_lines_in_the_world(monkeypatch, tmp_path, capsys):
     assert all("coordinates" not in json.loads(line) for line in capsys.readouterr().out.splitlines())
 
 
-def test_frames_whose_pose_is_missing_stay_where_the_sensor_was():
+def test_fixed_frame_reuses_last_pose_if_missing():
     T = world_pose(3)
     fixed = FixedFrame("z")
     np.testing.assert_array_equal(fixed.from_sensor(None), np.eye(4))
     np.testing.assert_array_equal(fixed.from_sensor(T.tolist()), T)
     np.testing.assert_array_equal(fixed.from_sensor(None), T)
-    # without any pose z is up
+    # without any pose, only the up axis is rotated to z
     y_up = FixedFrame("y").from_sensor(None)
     np.testing.assert_allclose(y_up[:3, :3] @ [0, 1, 0], [0, 0, 1], atol=1e-12)
 
@@ -103,7 +103,7 @@ def test_frames_whose_pose_is_missing_stay_where_the_sensor_was():
 
 @pytest.mark.long
 @pytest.mark.parametrize("live", [False, True])
-def test_tracks_with_another_axis_up(live, model):
+def test_tracks_do_not_depend_on_up_axis(live, model):
     frames = {}
     for up in ("z", "-y"):
         source = moving_source(walking_clouds(), up=up)
@@ -116,15 +116,15 @@ def test_tracks_with_another_axis_up(live, model):
             np.testing.assert_allclose(other.points @ R_level_input.T, one.points, atol=2e-3)
             np.testing.assert_allclose(R_level_input @ other.box.center, one.box.center, atol=2e-3)
             assert abs(np.angle(np.exp(1j * (other.box.yaw - one.box.yaw)))) < 0.01
-            # on foot, as long as they are known too
+            # `mounted` stays False for people known from earlier frames
             assert one.box.mounted is other.box.mounted is False
 
 
 # ---- times and origins
 
 
-def test_times_of_frames_part_tracks_and_a_known_origin_is_read(model, monkeypatch):
-    """After a gap nobody is known any more."""
+def test_time_gap_ends_tracks_and_frame_origin_is_used(model, monkeypatch):
+    """Tracks end at a gap in the times. The predictor gets the origin of each frame."""
     times = 1.7e9 + np.array([0, 0.1, 0.25, 0.3, 9.0, 9.1, 9.2])
     origins, predict_in = [], Predictor.predict_in
 
@@ -142,7 +142,7 @@ def test_times_of_frames_part_tracks_and_a_known_origin_is_read(model, monkeypat
     np.testing.assert_allclose(origins, expected_origins)
 
 
-def test_times_that_stand_still_or_jump_back_cost_no_frame(model, tmp_path):
+def test_repeated_or_decreasing_times_lose_no_frames(model, tmp_path):
     times = [0.0, 0.1, 0.1, 0.05, 0.2, 0.3, 0.4]
     source = moving_source(walking_clouds(), times=times)
     lines = written(source, tmp_path / "a.jsonl", model, world=True, boxes=boxes_of(FRAMES), track=True)
@@ -151,14 +151,14 @@ def test_times_that_stand_still_or_jump_back_cost_no_frame(model, tmp_path):
 
 
 def walker(times, rng):
-    """Poses, one a time, of somebody who walks along x, each joint off by 3 cm on an axis."""
+    """One pose per time of a person who walks along x, with noise of 3 cm per joint and axis."""
     for time in times:
         joints = mean_adult_joints() + [1.2 * time, 0, 0] + rng.normal(scale=0.03, size=(24, 3))
         yield Pose(joints=joints, skeleton=SMPL24, spread=np.full(24, 0.05))
 
 
 def steady_rows(times, damaged=()):
-    """Which frames of somebody at those times smoothing changes."""
+    """Indices of the frames whose pose is changed by smoothing, for a person at the given times."""
     lines = [
         {"time": time, "T_world_sensor": None, "error": None, "people": []}
         | ({"error": "damaged"} if k in damaged else {"people": [{"track": 0} | person_values(pose)]})
@@ -172,21 +172,25 @@ def person_values(pose):
     return {"joints": pose.joints.tolist(), "spread": pose.spread.tolist(), "visible": [], "confidence": []}
 
 
-def test_times_that_are_wrong_cost_the_smoothing_of_their_frames_alone():
+def test_wrong_times_only_disable_smoothing_of_their_frames():
     times = (np.arange(20) / 10).tolist()
     rows = list(range(20))
     assert steady_rows(times) == rows
-    # a damaged frame whose time is another clock's, a good one's, and a clock that begins again
+    # a damaged frame with the time of another clock, a valid frame with such a time, and a clock that restarts
     wrong = [*times[:9], 1.7e9, *times[10:]]
     assert steady_rows(wrong, damaged=[9]) == rows[:9] + rows[10:]
     assert steady_rows(wrong) == steady_rows(times[:10] * 2) == rows
-    # two frames that changed places: one of them stays as it is
+    # two swapped frames: one of them is not smoothed
     assert steady_rows([*times[:9], times[10], times[9], *times[11:]]) == rows[:10] + rows[11:]
+    # both frames after a later one are not smoothed
+    assert steady_rows([*times[:9], times[11], times[9], times[10], *times[12:]]) == rows[:10] + rows[12:]
+    # people are not filled in in damaged frames
+    assert steady_rows(times, damaged=[9]) == rows[:9] + rows[10:]
 
 
-def test_a_late_frame_does_not_end_the_memory_of_live_poses():
+def test_late_frame_does_not_reset_live_filter():
     def live_joints(times):
-        """Of the frames, by their times."""
+        """By time of the frame: joints from the live filter, and the input pose."""
         known = KnownPeople(up="z", least_score=0.5, live=True)
         joints = {}
         for time, pose in zip(times, walker(times, np.random.default_rng(1)), strict=True):
@@ -206,11 +210,11 @@ def test_a_late_frame_does_not_end_the_memory_of_live_poses():
     assert np.mean(errors[22:]) < 0.7 * np.linalg.norm(np.full(3, 0.03))
 
 
-# ---- what is known of people
+# ---- people known from earlier frames
 
 
-def test_known_places():
-    """Of two people, one of whom needs no verification, and of a place that held nobody."""
+def test_known_places_match_detections_and_set_thresholds():
+    """Two tracked people, one of whom needs no verification, and two rejected positions."""
     box = Box(center=np.array([5.0, 0.0, 1.0]), size=np.array([0.6, 0.6, 1.8]), score=0.9)
     known = KnownPlaces(
         boxes=[box],
@@ -221,16 +225,16 @@ def test_known_places():
     )
     centers = np.array([[5.2, 0.0, 0.9], [5.05, 0.1, 0.9], [9.3, 0.0, 1.0], [0.2, 7.0, 1.0], [0.4, 7.0, 1.0]])
     assert known.index_of(centers, np.ones(5, bool)).tolist() == [-1, 0, -1, -1, -1]
-    # only who is sure enough is the person known
+    # only detections marked as sure are matched to a known person
     assert known.index_of(centers, np.array([1, 0, 1, 1, 1], bool)).tolist() == [0, -1, -1, -1, -1]
-    # of the second nobody is known: what is where they are expected may be weak, even where nobody was
+    # no detection matches the second track: near it, a low score is enough, even at a rejected position
     assert known.least_scores(centers, np.array([-1, 0, -1, -1, -1]), 0.5).tolist() == [0.5, 0.5, 0.1, np.inf, 0.5]
     moved = known.level(UP_AXES["y"])
     np.testing.assert_allclose(moved.rejected, known.rejected @ UP_AXES["y"].T)
     np.testing.assert_allclose(moved.boxes[0].center, UP_AXES["y"] @ box.center)
 
 
-def test_places_that_held_nobody_are_known_where_the_sensor_has_gone():
+def test_rejected_positions_are_kept_in_world_frame():
     people = KnownPeople(up="z", least_score=0.5, live=False)
     T = world_pose(1)
     people._rejected = np.array([[*(T[:3, :3] @ [4.0, 1.0, 0.0] + T[:3, 3]), 10.0]])
@@ -254,7 +258,7 @@ def line_of(frame, people):
 
 
 def person_of(number, **changes):
-    """Somebody all of whose values differ."""
+    """A person whose values are all different."""
     values = np.arange(12) / 100 + number
     person = {"id": f"p{number}", "track": number, "filled": number % 2 == 1, "mounted": number % 2 == 0}
     person |= {"joints": [values[:3].tolist(), values[3:6].tolist()], "confidence": values[6:8].tolist()}
@@ -264,13 +268,13 @@ def person_of(number, **changes):
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_tables_have_every_value_of_every_frame(suffix, tmp_path, monkeypatch):
+def test_tables_have_all_values_of_all_frames(suffix, tmp_path, monkeypatch):
     if suffix == "parquet":
         pytest.importorskip("pyarrow")
     lines = [line_of(k, [person_of(2 * k), person_of(2 * k + 1)] if k else []) for k in range(5)]
     read = pandas.read_csv if suffix == "csv" else pandas.read_parquet
     tables = []
-    # the first rows that are written together have nobody
+    # the first block of rows has no people
     for rows in (200, 1, 2):
         monkeypatch.setattr(result_files, "_ROWS_OF", rows)
         result_files.write_result(tmp_path / f"{rows}.{suffix}", lines)

@@ -1,4 +1,4 @@
-"""Folders and recordings: people of every frame, their tracks, and files that grow and go on after a kill."""
+"""Predictions for folders and recordings: people and tracks per frame, and result files that can be resumed."""
 
 import errno
 import json
@@ -14,7 +14,7 @@ import pytest
 from walking_people import FRAMES, PLACES, STEPS, moving_source, walking_clouds
 
 import lidarpose
-from lidarpose import Box, InputError
+from lidarpose import Box, Boxes, InputError
 from lidarpose.cli import main
 from lidarpose.geometry import UP_AXES, rigid_transform, rotation_about
 from lidarpose.io.sources.frame import Frame, FrameSource, IndexedRecording, Sweep
@@ -34,7 +34,7 @@ def clouds():
 
 @pytest.fixture(scope="module")
 def drive(clouds, tmp_path_factory):
-    """A folder of the frames, of which one is damaged."""
+    """A folder of frames, one of them damaged."""
     folder = tmp_path_factory.mktemp("recordings") / "drive"
     folder.mkdir()
     for k, points in enumerate(clouds):
@@ -63,7 +63,7 @@ def folder(drive):
 
 @pytest.fixture(scope="module")
 def tracked(drive, folder):
-    """The lines of the folder with tracks, made in one go, and the file."""
+    """The lines of the folder with tracks, written without interruption, and their file."""
     return run(drive, "--track", "--out", folder / "whole.jsonl"), folder / "whole.jsonl"
 
 
@@ -76,11 +76,11 @@ def run(*words, status=0):
 
 
 def places(line):
-    """By track where people are: the mean of their joints, (3,) m."""
+    """Positions of people by track: the mean of their joints, (3,) m."""
     return {person["track"]: np.mean(person["joints"], 0) for person in line["people"] if person["joints"]}
 
 
-def test_a_line_a_frame_in_the_order_of_numbers(tracked):
+def test_result_has_one_line_per_frame_sorted_by_number(tracked):
     lines, _ = tracked
     assert [line["frame"] for line in lines] == list(range(FRAMES))
     assert [line["id"] for line in lines] == [f"frame_{k + 5}" for k in range(FRAMES)]
@@ -90,7 +90,7 @@ def test_a_line_a_frame_in_the_order_of_numbers(tracked):
     assert lines[DAMAGED]["people"] == [] and ".npy" in lines[DAMAGED]["error"]
 
 
-def test_people_keep_their_tracks_and_go_their_ways(tracked):
+def test_tracks_follow_walking_people(tracked):
     lines = [line for k, line in enumerate(tracked[0]) if k != DAMAGED]
     assert [set(places(line)) for line in lines] == [{0, 1}] * len(lines)
     first, last = places(lines[0]), places(lines[-1])
@@ -103,7 +103,7 @@ def test_people_keep_their_tracks_and_go_their_ways(tracked):
         assert len(person["joints"]) == len(person["spread"]) == 24 and person["num_points"] > 50
 
 
-def test_without_tracks_a_frame_is_what_its_file_alone_is(drive, folder, clouds, model):
+def test_untracked_frame_equals_prediction_of_single_file(drive, folder, clouds, model):
     lines = run(drive, "--every", 3, "--end", 0.4, "--out", folder / "plain.jsonl")
     assert [line["frame"] for line in lines] == [0, 3]
     alone = lidarpose.predict(drive / "frame_8.npy", model=model).to_dict()
@@ -112,7 +112,7 @@ def test_without_tracks_a_frame_is_what_its_file_alone_is(drive, folder, clouds,
 
 
 @pytest.mark.parametrize("flag", ["--track", "--live"])
-def test_a_killed_command_goes_on_and_ends_the_same(flag, drive, folder, tracked, monkeypatch, capsys):
+def test_killed_command_resumes_to_same_file(flag, drive, folder, tracked, monkeypatch, capsys):
     words, path = (drive, flag, "--out", folder / f"killed{flag}.jsonl"), folder / f"killed{flag}.jsonl.part"
     whole = tracked[1] if flag == "--track" else folder / "live.jsonl"
     if flag == "--live":
@@ -129,7 +129,7 @@ def test_a_killed_command_goes_on_and_ends_the_same(flag, drive, folder, tracked
     run(*words, status=130)
     error = capsys.readouterr().err
     assert f"stopped: the finished frames are in {path}, and the same command resumes" in error
-    # a torn line, and one that is whole but that the predictor's state does not know
+    # append a complete line that is not in the predictor's state, and an incomplete line
     with open(path, "ab") as file:
         file.write(path.read_bytes().splitlines()[0] + b'\n{"schema": "lidar')
     assert not (folder / f"killed{flag}.jsonl").exists()
@@ -140,9 +140,7 @@ def test_a_killed_command_goes_on_and_ends_the_same(flag, drive, folder, tracked
     assert not list(folder.glob("killed*.part*"))
 
 
-def test_a_command_stopped_before_its_frames_leaves_nothing_and_after_them_says_what_it_leaves(
-    drive, tmp_path, monkeypatch, capsys
-):
+def test_stopped_command_keeps_unfinished_file_only_with_frames(drive, tmp_path, monkeypatch, capsys):
     def stop(*_):
         raise KeyboardInterrupt
 
@@ -156,7 +154,7 @@ def test_a_command_stopped_before_its_frames_leaves_nothing_and_after_them_says_
     assert len(run(*words)) == 2
 
 
-def test_lines_of_another_command_are_not_gone_on_with(drive, folder, monkeypatch, capsys):
+def test_unfinished_file_of_other_command_is_not_resumed(drive, folder, monkeypatch, capsys):
     def stop(self, *of):
         raise KeyboardInterrupt
 
@@ -167,7 +165,7 @@ def test_lines_of_another_command_are_not_gone_on_with(drive, folder, monkeypatc
         run(drive, "--end", 0.2, "--out", out, status=130)
     part = Path(f"{out}.part")
     finished = part.read_bytes()
-    # a command that is wrong costs nothing, and leaves nothing of its own
+    # an invalid command leaves the unfinished file unchanged and creates no file
     run(drive, "--end", 0.2, "--skeleton", "coco", "--out", out, status=2)
     assert part.read_bytes() == finished
     run(drive, "--end", 0.2, "--skeleton", "coco", "--out", folder / "wrong.jsonl", status=2)
@@ -178,13 +176,13 @@ def test_lines_of_another_command_are_not_gone_on_with(drive, folder, monkeypatc
     assert [len(json.loads(line)["people"]) for line in open(out)] == [1, 1, 1]
 
 
-def test_finished_lines_of_other_frames_are_an_error(drive, folder, monkeypatch, tmp_path, capsys):
+def test_unfinished_file_of_other_frames_raises(drive, folder, monkeypatch, tmp_path, capsys):
     steps = FramePredictor(crop=True, model=lidarpose.load("tiny", tta=1))
     frame = Frame(points=np.ones((9, 3)), index=0, id="gone", time=0.0)
     with output.PartFile(tmp_path / "a.jsonl", {}) as part:
         part.append(steps.predict(frame), steps.state(), 0)
         written = part.path.read_bytes()
-        # by another process, whatever its command is
+        # opening it a second time fails, with the same command and with another
         for command in ({}, {"min_score": 0.1}):
             with pytest.raises(InputError, match=r"a.jsonl.part: another lidarpose process is writing it"):
                 output.PartFile(tmp_path / "a.jsonl", command)
@@ -194,8 +192,8 @@ def test_finished_lines_of_other_frames_are_an_error(drive, folder, monkeypatch,
         output.write_recording(FrameSource(recording), steps, tmp_path / "a.jsonl", command={})
 
 
-def test_finished_lines_of_points_that_changed_are_an_error(tmp_path, model, monkeypatch):
-    """A folder may have been exported anew under the same names."""
+def test_unfinished_file_of_changed_points_raises(tmp_path, model, monkeypatch):
+    """A folder may have been exported again with the same file names."""
     crop, predict = np.random.default_rng(0).normal(scale=0.3, size=(99, 3)), FramePredictor._predicted
 
     def write(points):
@@ -219,7 +217,7 @@ def test_finished_lines_of_points_that_changed_are_an_error(tmp_path, model, mon
 
 @pytest.fixture
 def stopped(drive, folder, monkeypatch):
-    """A command on the folder that is stopped after its first frame: words -> words."""
+    """Function that runs a command on the folder, stops it after the first frame, and returns the given words."""
     predict = FramePredictor._predicted
 
     def stop_at_second(self, *of):
@@ -236,7 +234,7 @@ def stopped(drive, folder, monkeypatch):
     return stop
 
 
-def test_a_page_asked_for_later_keeps_finished_frames(stopped, drive, tmp_path, capsys):
+def test_resume_with_html_keeps_finished_frames(stopped, drive, tmp_path, capsys):
     words = stopped("--end", 0.2, "--out", tmp_path / "a.jsonl")
     assert main(["predict", str(drive), *map(str, words), "--html"]) == 0
     assert "1 frames are in" in capsys.readouterr().err
@@ -244,8 +242,8 @@ def test_a_page_asked_for_later_keeps_finished_frames(stopped, drive, tmp_path, 
 
 
 @pytest.mark.parametrize("form", ["file", "folder"])
-def test_boxes_that_are_corrected_begin_anew(form, stopped, drive, tmp_path, capsys):
-    """Poses of boxes that were wrong are not kept."""
+def test_changed_boxes_file_restarts_prediction(form, stopped, drive, tmp_path, capsys):
+    """Poses made with the old boxes are not kept."""
     path = boxes = tmp_path / "boxes.json"
     if form == "folder":
         boxes = tmp_path / "boxes"
@@ -261,13 +259,13 @@ def test_boxes_that_are_corrected_begin_anew(form, stopped, drive, tmp_path, cap
     assert "from another command (files changed): starting over" in capsys.readouterr().err
 
 
-def test_printed_lines_have_the_boxes_of_their_frames_too(drive, tmp_path, capsys):
+def test_printing_rejects_boxes_of_other_frames(drive, tmp_path, capsys):
     (tmp_path / "b.json").write_text('[{"frame": "elsewhere", "people": []}]')
     assert main(["predict", str(drive), "--end", "0.1", "--boxes", str(tmp_path / "b.json"), "--out", "-"]) == 2
     assert "has boxes of frames elsewhere, but this recording has other frames" in capsys.readouterr().err
 
 
-def test_boxes_with_another_axis_up_are_not_taken_for_these_frames(drive, tmp_path, capsys):
+def test_boxes_with_other_up_axis_are_rejected(drive, tmp_path, capsys):
     people = [{"center": [4.1, 0, 1.5], "size": [1, 1, 2]}]
     entry = {"schema": "lidarpose.boxes/1", "people": people, "up": "y"}
     (tmp_path / "b.json").write_text(json.dumps([{"frame": k} | entry for k in range(2)]))
@@ -277,7 +275,7 @@ def test_boxes_with_another_axis_up_are_not_taken_for_these_frames(drive, tmp_pa
     assert main([*words, str(tmp_path / "o.jsonl"), "--up", "y"]) == 0
 
 
-def test_a_frame_without_points_costs_itself_alone(clouds, model, tmp_path, capsys):
+def test_frame_without_points_gives_no_pose_and_no_error(clouds, model, tmp_path, capsys):
     feet = PLACES[0]
     crop = clouds[0][(np.abs(clouds[0][:, :2] - feet) < 0.7).all(1)]
     np.save(tmp_path / "0.npy", crop)
@@ -286,11 +284,11 @@ def test_a_frame_without_points_costs_itself_alone(clouds, model, tmp_path, caps
     for options in ({"crop": True}, {"boxes": boxes}, {}):
         frames = list(lidarpose.predict_recording(tmp_path, model=model, **options))
         assert [frame.error for frame in frames] == [None, None]
-        assert [person.has_pose for person in frames[1].poses] in ([], [False])
+        assert [person.has_pose for person in frames[1].poses] == [False]
     assert not model.predict(np.zeros((0, 3)), boxes=boxes[0])[0].has_pose
 
 
-def test_names_that_are_no_text_are_escaped_in_tables(clouds, tmp_path):
+def test_undecodable_file_names_are_escaped_in_tables(clouds, tmp_path):
     name = os.fsdecode(b"\xff0.npy")
     np.save(tmp_path / name, clouds[0])
     for suffix in ("csv", "parquet"):
@@ -300,21 +298,21 @@ def test_names_that_are_no_text_are_escaped_in_tables(clouds, tmp_path):
 
 
 @pytest.mark.long
-def test_a_file_of_the_folder_is_not_overwritten(clouds, tmp_path, capsys):
+def test_predict_does_not_overwrite_input_files(clouds, tmp_path, capsys):
     np.savetxt(tmp_path / "0.csv", clouds[0], fmt="%.3f", delimiter=",")
     before = (tmp_path / "0.csv").read_bytes()
     for source in (tmp_path, tmp_path / "*.csv"):
         assert main(["predict", str(source), "--format", "csv", "--out", str(tmp_path / "0.csv")]) == 2
         assert "0.csv" in capsys.readouterr().err
     assert (tmp_path / "0.csv").read_bytes() == before
-    # what an earlier command wrote there is
+    # results of an earlier command may be overwritten
     for _ in range(2):
         words = ["predict", str(tmp_path), "--out", f"{tmp_path}/", "--picture", "--html", "--quiet"]
         assert main(words) == 0, capsys.readouterr().err
     assert {path.suffix for path in tmp_path.iterdir()} == {".csv", ".jsonl", ".png", ".html"}
 
 
-def test_csv_and_parquet_have_a_row_a_person_and_joint(tracked, tmp_path):
+def test_csv_and_parquet_have_one_row_per_person_and_joint(tracked, tmp_path):
     pytest.importorskip("pyarrow")
     lines, _ = tracked
     made = []
@@ -330,21 +328,21 @@ def test_csv_and_parquet_have_a_row_a_person_and_joint(tracked, tmp_path):
     assert (row.frame, row.frame_id, row.track, row.joint) == (line["frame"], line["id"], person["track"], "pelvis")
     assert [row.x, row.y, row.z] == person["joints"][0] and row.spread == person["spread"][0]
     np.testing.assert_allclose(csv[["x", "y", "z", "confidence"]], parquet[["x", "y", "z", "confidence"]])
-    # the world's frame is not known in all
+    # the world frame is known for some frames only
     moved = [in_world(line | {"T_world_sensor": np.eye(4).tolist()}) if line["frame"] % 2 else line for line in lines]
     result_files.write_result(tmp_path / "world.csv", moved)
     world = pandas.read_csv(tmp_path / "world.csv")
     assert (world.coordinates == np.where(world.frame % 2, "world", "sensor")).all()
-    # nobody in all frames: the columns are there
+    # the columns exist even if no frame has people
     result_files.write_result(tmp_path / "none.parquet", [line | {"people": []} for line in lines])
     none = pandas.read_parquet(tmp_path / "none.parquet")
     assert len(none) == 0 and list(none.columns) == list(parquet.columns) and none.dtypes.equals(parquet.dtypes)
 
 
-# ---- in Python
+# ---- Python API
 
 
-def test_tracks_of_a_moving_sensor_live_in_the_world(clouds, model):
+def test_tracks_of_moving_sensor_use_world_frame(clouds, model):
     frames = list(lidarpose.predict_recording(moving_source(clouds), track=True, model=model))
     assert [{person.id for person in frame.poses} for frame in frames] == [{0, 1}] * FRAMES
     first = {person.id: person.joints.mean(0) for person in frames[0].poses}
@@ -357,8 +355,8 @@ def test_tracks_of_a_moving_sensor_live_in_the_world(clouds, model):
 
 
 @pytest.mark.parametrize("up", UP_AXES)
-def test_boxes_keep_their_heading_in_the_world(up):
-    """A box's yaw is about the input's up axis, in the world about z."""
+def test_in_world_converts_box_heading(up):
+    """The yaw of a box is about the input's up axis; in the world frame it is about z."""
     R_level_input, R_world_level = UP_AXES[up], rotation_about("z", 0.4)
     T_world_sensor = rigid_transform(R_world_level @ R_level_input, np.array([1.0, 2.0, 3.0]))
     box = {"center": [4.0, 5.0, 6.0], "size": [0.5, 0.6, 1.8], "yaw": 0.3}
@@ -368,7 +366,7 @@ def test_boxes_keep_their_heading_in_the_world(up):
     np.testing.assert_allclose(moved["center"], R_world_level @ R_level_input @ [4, 5, 6] + [1, 2, 3], atol=1e-4)
 
 
-def test_the_first_frame_names_the_axis_with_which_people_are_detected(clouds, model, tmp_path):
+def test_first_frame_suggests_up_axis(clouds, model, tmp_path):
     for k, points in enumerate(clouds[:3]):
         np.save(tmp_path / f"{k}.npy", points @ UP_AXES["-y"])
     first, *others = lidarpose.predict_recording(tmp_path, model=model)
@@ -378,7 +376,7 @@ def test_the_first_frame_names_the_axis_with_which_people_are_detected(clouds, m
     assert [len(frame.poses) for frame in frames] == [2, 2, 2]
 
 
-def test_known_people_are_not_verified_again_and_keep_their_score(clouds, model, monkeypatch):
+def test_known_people_are_not_verified_again(clouds, model, monkeypatch):
     from lidarpose.inference import detection, verification
 
     posed, verified = [], detection.verified
@@ -393,7 +391,7 @@ def test_known_people_are_not_verified_again_and_keep_their_score(clouds, model,
     frames = list(lidarpose.predict_recording(moving_source(clouds), track=True, model=model))
     assert len(posed[0][0]) >= 2
     for places, frame in zip(map(np.concatenate, posed[2:]), frames[2:], strict=True):
-        # a place beside a person at most, none of the two people again
+        # at most one position beside a person, and neither of the two people
         people = np.array([person.joints[0, :2] for person in frame.poses])
         assert len(people) == 2 and len(places) <= 1
         assert (np.linalg.norm(places[:, None] - people, axis=-1) > 0.3).all()
@@ -401,7 +399,7 @@ def test_known_people_are_not_verified_again_and_keep_their_score(clouds, model,
     assert all(line == scores[-1] for line in scores[2:])
 
 
-def test_a_folder_of_crops_is_one_person(clouds, folder, model):
+def test_folder_of_crops_gives_one_track(clouds, folder, model):
     crops = folder / "crops"
     crops.mkdir()
     for k, points in enumerate(clouds):
@@ -411,12 +409,12 @@ def test_a_folder_of_crops_is_one_person(clouds, folder, model):
     assert [[person["track"] for person in line["people"]] for line in lines] == [[0]] * FRAMES
     way = np.array([places(line)[0] for line in lines])
     assert np.linalg.norm(np.diff(way, axis=0) - [*STEPS[0], 0], axis=1).max() < 0.05
-    # without --crop the first frame tells
+    # without --crop the first frame decides
     frame = next(lidarpose.predict_recording(crops, model=model))
     assert [person.box for person in frame.poses] == [None]
 
 
-def test_people_hidden_for_a_while_are_filled_in(clouds, folder, model, monkeypatch):
+def test_hidden_people_are_filled_in(clouds, folder, model, monkeypatch):
     boxes = {}
     for k in range(FRAMES):
         at = PLACES + k * STEPS
@@ -440,7 +438,7 @@ def test_people_hidden_for_a_while_are_filled_in(clouds, folder, model, monkeypa
 
 
 @pytest.mark.parametrize("form", ["folder", "list", "lines"])
-def test_boxes_of_frames_are_read_by_name_or_number(form, tmp_path):
+def test_frame_boxes_match_frames_by_name_or_number(form, tmp_path):
     people = [{"center": [1, 2, 3], "size": [1, 1, 2]}]
     entries = [{"frame": 0, "people": []}, {"frame": "b", "people": people}]
     path = tmp_path / "boxes.json"
@@ -468,7 +466,7 @@ def test_boxes_of_frames_are_read_by_name_or_number(form, tmp_path):
         ("[]", "expected boxes for each frame"),
     ],
 )
-def test_boxes_that_are_not_of_frames(content, problem, drive, tmp_path, capsys):
+def test_predict_rejects_boxes_without_frames(content, problem, drive, tmp_path, capsys):
     (tmp_path / "b.json").write_text(content)
     assert main(["predict", str(drive), "--boxes", str(tmp_path / "b.json"), "--out", str(tmp_path / "o.jsonl")]) == 2
     error = capsys.readouterr().err
@@ -479,31 +477,31 @@ def test_boxes_that_are_not_of_frames(content, problem, drive, tmp_path, capsys)
 # ---- the command line
 
 
-def test_the_command_line(drive, folder, tmp_path, monkeypatch, capsys):
+def test_predict_command_writes_files_and_summary(drive, folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["predict", f"{drive}/frame_*.npy", "--start", "0.3", "--format", "csv", "--picture", "--track"]) == 0
     said = capsys.readouterr().err
-    assert "4 frames, 6 people, 2 tracks, 1 damaged -> drive.poses.csv and drive.poses.png" in said
+    assert "4 frames, 6 poses, 2 tracks, 1 damaged -> drive.poses.csv and drive.poses.png" in said
     assert "warning: 1 damaged, first frame 4 (frame_9): " in said
     assert {path.name for path in tmp_path.iterdir()} == {"drive.poses.csv", "drive.poses.png"}
     assert (tmp_path / "drive.poses.png").read_bytes().startswith(b"\x89PNG")
     assert main(["predict", str(drive), "--end", "0.1", "--live", "--out", "-"]) == 0
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert [line["frame"] for line in lines] == [0, 1] and lines[1]["people"][0]["track"] == 0
-    # pictures of what is printed
+    # a page for printed results
     assert main(["predict", str(drive), "--end", "0.1", "--out", "-", "--html"]) == 0
-    assert "2 frames, 4 people -> drive.poses.html" in capsys.readouterr().err
+    assert "2 frames, 4 poses -> drive.poses.html" in capsys.readouterr().err
     assert (tmp_path / "drive.poses.html").is_file()
 
 
-def test_what_is_wrong_with_a_source_is_said_after_pictures_too(clouds, tmp_path, monkeypatch, capsys):
+def test_source_warnings_are_printed_with_picture_option(clouds, tmp_path, monkeypatch, capsys):
     source = moving_source(clouds, times=[0.0, 0.2, 0.1, *np.arange(3, FRAMES) / 10])
     monkeypatch.setattr("lidarpose.io.sources.open_source", lambda *_, **__: source)
     assert main(["predict", "made", "--track", "--picture", "--out", str(tmp_path / "a.jsonl")]) == 0
     assert "warning: moving: time jumps back 1 times" in capsys.readouterr().err
 
 
-def test_a_folder_without_one_readable_scan_is_an_error(tmp_path, capsys):
+def test_folder_without_readable_scans_is_an_error(tmp_path, capsys):
     for name in "ab":
         (tmp_path / f"{name}.pcd").write_bytes(b"garbage")
     assert main(["predict", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
@@ -513,20 +511,20 @@ def test_a_folder_without_one_readable_scan_is_an_error(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-def test_tables_of_joints_are_no_scans_and_the_world_may_not_be_known(clouds, tmp_path, capsys):
+def test_joint_tables_are_not_scans_and_unknown_world_warns(clouds, tmp_path, capsys):
     for k in range(2):
         np.savetxt(tmp_path / f"{k}.csv", clouds[k], fmt="%.3f", delimiter=",")
     words = ["predict", str(tmp_path), "--world", "--format", "csv", "--out"]
     for _ in range(2):
         assert main([*words, str(tmp_path)]) == 0
         output = capsys.readouterr()
-        assert "2 frames, 4 people" in output.out + output.err
+        assert "2 frames, 4 poses" in output.out + output.err
         assert "the sensor's pose in the world is unknown in 2 of 2 frames" in output.err
     assert len(list(tmp_path.glob("*.poses.csv"))) == 1
 
 
-def test_warnings_that_differ_in_numbers_and_their_signs_are_one():
-    """As of a tilted sensor, whose direction jitters about an axis."""
+def test_summary_merges_warnings_that_differ_in_numbers():
+    """Example: the direction of a tilted sensor varies slightly about an axis."""
     summary = output.Summary()
     for up in ("-0.342,0.003,0.94", "-0.341,-0.002,0.94", "-0.342,0,0.94", "0.342,0.003,-0.94"):
         summary.add(
@@ -539,7 +537,7 @@ def test_warnings_that_differ_in_numbers_and_their_signs_are_one():
 
 
 @pytest.mark.long
-def test_of_a_recording_of_one_frame_the_people_are_drawn(drive, tmp_path, monkeypatch):
+def test_picture_of_single_frame_shows_people(drive, tmp_path, monkeypatch):
     drawn, above = [], []
 
     def draw(scan, people, **words):
@@ -553,7 +551,7 @@ def test_of_a_recording_of_one_frame_the_people_are_drawn(drive, tmp_path, monke
     assert main([*command, "--end", "0.05"]) == 0
     (line,) = (json.loads(text) for text in open(tmp_path / "a.jsonl"))
     assert len(drawn) == len(line["people"]) == 2
-    # from above with the numbers of their cards; of two frames only their ways
+    # the view from above has the ids of the cards; for two frames it has only the tracks
     assert [len(panel.tracks) for panel in above] == [2, 2] and above[0].poses is None
     assert [box.id for box in above[1].boxes] == [person["id"] for person in line["people"]]
     np.testing.assert_allclose(above[1].poses.joints, [person["joints"] for person in line["people"]], atol=1e-9)
@@ -564,11 +562,11 @@ def test_of_a_recording_of_one_frame_the_people_are_drawn(drive, tmp_path, monke
 
 
 def page_data(path):
-    """What a page shows."""
+    """The data embedded in a page."""
     return json.loads(path.read_text("utf-8").split('id="data">')[1].split("</script>")[0])
 
 
-def test_the_page_of_a_recording_is_played_frame_by_frame(drive, tmp_path):
+def test_recording_page_contains_all_frames(drive, tmp_path):
     assert main(["predict", str(drive), "--track", "--html", "--out", str(tmp_path / "a.jsonl")]) == 0
     lines = [json.loads(text) for text in open(tmp_path / "a.jsonl")]
     lines = [line for line in lines if line["error"] is None]
@@ -585,20 +583,20 @@ def test_the_page_of_a_recording_is_played_frame_by_frame(drive, tmp_path):
             points = np.reshape(shown["points"], (-1, 3))
             nearest = min(nearest, np.linalg.norm(points[:, None] - own, axis=-1).min())
     assert nearest < 100
-    # what stands still is without people, who would stay where they were
+    # the static points contain no people
     still = np.reshape(scan["points"], (-1, 3))
     pelvis = np.array([pose["joints"][0] for pose in scan["frames"][-1]["poses"]])
     assert len(still) and np.linalg.norm(still[:, None] - pelvis, axis=-1).min() > 300
     assert "<th scope=col>track</th>" in text.replace(' class="number"', "")
 
 
-def test_of_a_long_recording_the_page_shows_some_frames(drive, tmp_path, monkeypatch):
+def test_recording_page_limits_number_of_frames(drive, tmp_path, monkeypatch):
     monkeypatch.setattr(page, "_MOST_FRAMES", 2)
     assert main(["predict", str(drive), "--html", "--out", str(tmp_path / "a.jsonl")]) == 0
     lines = [json.loads(text) for text in open(tmp_path / "a.jsonl")]
     times = [line["time"] for line in lines if line["error"] is None]
     labels = [frame["label"].split(",")[0] for frame in page_data(tmp_path / "a.html")["scans"][0]["frames"]]
-    # every fourth: of six frames, each second one is too many
+    # every fourth frame: every second of the six would exceed the limit
     assert labels == [f"{time:.2f} s" for time in times[::4]] and len(labels) == 2
 
 
@@ -617,7 +615,7 @@ def test_of_a_long_recording_the_page_shows_some_frames(drive, tmp_path, monkeyp
         (["DRIVE", "--format", "csv", "--out", "-"], "--out - prints lines of JSON, not csv"),
     ],
 )
-def test_wrong_commands_are_one_line(words, problem, drive, tmp_path, monkeypatch, capsys):
+def test_predict_rejects_invalid_options_in_one_line(words, problem, drive, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["predict", *(word.replace("DRIVE", str(drive)) for word in words)]) == 2
     error = capsys.readouterr().err
@@ -626,7 +624,7 @@ def test_wrong_commands_are_one_line(words, problem, drive, tmp_path, monkeypatc
 
 
 def damaged_states(path, state_path):
-    """What a power cut or a bad disk may leave of a part and of its state."""
+    """Contents of an unfinished file and its state after a power cut or a disk error."""
     lines, state = path.read_bytes(), json.loads(state_path.read_text())
     yield lines[:-300] + bytes(300), state
     yield lines[:300] + bytes(300) + lines[600:], state
@@ -637,7 +635,7 @@ def damaged_states(path, state_path):
             yield lines, state | {key: value}
 
 
-def test_a_damaged_part_is_begun_anew(drive, stopped, tmp_path):
+def test_damaged_unfinished_file_is_restarted(drive, stopped, tmp_path):
     out, fresh = tmp_path / "a.jsonl", tmp_path / "fresh.jsonl"
     words = stopped("--end", 0.2, "--out", out)
     path, state_path = tmp_path / "a.jsonl.part", tmp_path / "a.jsonl.part.json"
@@ -655,7 +653,7 @@ def test_a_damaged_part_is_begun_anew(drive, stopped, tmp_path):
     assert run(drive, *words) == run(drive, "--end", 0.2, "--out", fresh)
 
 
-def test_a_full_disk_is_an_error_of_the_file(tmp_path, monkeypatch):
+def test_full_disk_error_names_file(tmp_path, monkeypatch):
     steps = FramePredictor(crop=True, model=lidarpose.load("tiny", tta=1))
     frame = Frame(points=np.ones((9, 3)), index=0, id="a", time=0.0)
     with output.PartFile(tmp_path / "a.jsonl", {}) as part:
@@ -670,7 +668,7 @@ def test_a_full_disk_is_an_error_of_the_file(tmp_path, monkeypatch):
     assert not list(tmp_path.glob("*.new"))
 
 
-def test_a_pose_of_the_sensor_that_cannot_be_costs_its_frame(clouds, model):
+def test_impossible_sensor_pose_fails_only_its_frame(clouds, model):
     boxes = {k: [[*place, 0, 1, 1, 2, 0] for place in PLACES] for k in range(3)}
     places = [np.eye(4) for _ in range(3)]
     places[1][0, 3] = 1e12
@@ -686,28 +684,28 @@ def test_a_pose_of_the_sensor_that_cannot_be_costs_its_frame(clouds, model):
 
 
 @pytest.mark.parametrize("source", [None, 5, np.zeros((9, 3)), [np.zeros((9, 3))]])
-def test_what_is_no_source_is_refused(source, model):
+def test_predict_recording_rejects_invalid_sources(source, model):
     with pytest.raises(InputError, match="expected (one or more paths|paths)"):
         lidarpose.predict_recording(source, model=model)
 
 
-def test_an_option_that_is_none_is_refused_at_once():
+def test_predict_recording_rejects_unknown_option():
     with pytest.raises(TypeError, match="predict_recording.. got an unexpected keyword argument 'min_scor'"):
         lidarpose.predict_recording("nowhere", min_scor=0.5)
 
 
-# ---- frames that a running sensor gives
+# ---- frames of a live sensor
 
 
 def fed(clouds, buffer=None):
-    """Frames of clouds, in one array that is used again where it is given."""
+    """Frames of clouds; with `buffer`, all frames share this array, which is overwritten."""
     for k, cloud in enumerate(clouds):
         if buffer is not None:
             buffer[:] = cloud
         yield lidarpose.Frame(points=cloud if buffer is None else buffer, index=k, id=str(k), time=k / 10)
 
 
-def test_frames_of_a_running_sensor_are_posed_as_they_come(model):
+def test_live_frames_are_predicted_one_by_one(model):
     rng = np.random.default_rng(0)
     clouds = [rng.normal((5, 0, 0), (0.2, 0.2, 0.5), (99, 3)) for _ in range(3)]
     expected = [model.predict(cloud).joints for cloud in clouds]
@@ -720,7 +718,7 @@ def test_frames_of_a_running_sensor_are_posed_as_they_come(model):
             np.testing.assert_allclose(result.poses[0].joints, joints, atol=1e-6)
 
 
-def test_a_scan_keeps_its_points_when_the_driver_fills_its_array_again(model, monkeypatch):
+def test_scan_is_copied_from_reused_buffer(model, monkeypatch):
     buffer = np.zeros((400, 3), np.float64)
     clouds = [np.full((400, 3), k) + np.arange(1200).reshape(400, 3) / 100 for k in (1.0, 2.0, 3.0)]
     results = list(lidarpose.predict_recording(fed(clouds, buffer), find=True, model=model))
@@ -728,7 +726,7 @@ def test_a_scan_keeps_its_points_when_the_driver_fills_its_array_again(model, mo
         np.testing.assert_array_equal(result.poses.scan, cloud)
 
 
-def test_paths_may_come_from_a_generator_and_nothing_else_is_a_source(model, tmp_path):
+def test_predict_recording_checks_generators_and_their_options(model, tmp_path):
     np.save(tmp_path / "a.npy", np.random.default_rng(0).normal(scale=0.3, size=(99, 3)))
     assert len(list(lidarpose.predict_recording(tmp_path.glob("*.npy"), crop=True, model=model))) == 1
     with pytest.raises(InputError, match="expected paths or frames, got ndarray: make a lidarpose.Frame"):
@@ -742,15 +740,14 @@ def test_paths_may_come_from_a_generator_and_nothing_else_is_a_source(model, tmp
 @pytest.mark.parametrize(
     "T", [np.eye(3), 2 * np.eye(4), np.full((4, 4), np.nan), np.diag([1, 1, -1, 1]), "pose", [[1]]]
 )
-def test_the_pose_of_a_frame_is_a_rigid_transform(T):
+def test_frame_rejects_pose_that_is_not_rigid(T):
     with pytest.raises(InputError, match=r"^Frame.T_world_sensor: expected \(4, 4\)[^\n]*: give None"):
         lidarpose.Frame(points=np.zeros((0, 3)), index=0, id="0", T_world_sensor=T)
-    assert lidarpose.Frame(points=np.zeros((0, 3)), index=0, id="0", T_world_sensor=np.eye(4).tolist()).T_world_sensor[
-        0, 0
-    ]
+    frame = lidarpose.Frame(points=np.zeros((0, 3)), index=0, id="0", T_world_sensor=np.eye(4).tolist())
+    np.testing.assert_array_equal(frame.T_world_sensor, np.eye(4))
 
 
-def test_who_leaves_early_does_not_wait_for_the_next_frame(model):
+def test_close_does_not_wait_for_next_frame(model):
     cloud, is_over = np.random.default_rng(0).normal(scale=0.3, size=(99, 3)), threading.Event()
 
     def endless():
@@ -765,8 +762,15 @@ def test_who_leaves_early_does_not_wait_for_the_next_frame(model):
     is_over.set()
 
 
-def test_boxes_of_other_frames_are_an_error_at_the_end(model):
+def test_boxes_of_unknown_frames_raise_at_the_end(model):
     boxes = {"b": [[0, 0, 0, 1, 1, 2, 0]]}
     frames = lidarpose.predict_recording(fed([np.ones((9, 3))]), boxes=boxes, model=model)
     with pytest.raises(InputError, match="has boxes of frames b, but this recording has other frames, the last one 0"):
         list(frames)
+
+
+def test_boxes_of_one_scan_are_rejected_for_recording(tmp_path, model):
+    path = tmp_path / "a.boxes.json"
+    Boxes([Box(center=np.zeros(3), size=np.ones(3))]).save(path)
+    with pytest.raises(InputError, match="a.boxes.json: expected one entry per frame.*one box file is one scan"):
+        next(iter(lidarpose.predict_recording(fed([np.ones((9, 3))]), boxes=path, model=model)))

@@ -1,4 +1,4 @@
-"""The tables of the docs: they say what the scores say, and differences come with intervals that are right."""
+"""Tables of the docs: agreement with the scores, and confidence intervals of differences."""
 
 import importlib
 import json
@@ -23,7 +23,7 @@ def changed():
 
 
 def benchmark(name):
-    # what it imports lies beside it
+    # its imports are in the same folder
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(BENCHMARKS)
         return importlib.import_module(name)
@@ -35,7 +35,7 @@ def run(variant, seed, value, people=100, **more):
     return {"variant": variant, "seed": seed, "people": people, "what": variant, "figures": figures} | more
 
 
-def test_the_pages_say_what_the_scores_say(results):
+def test_pages_match_scores(results):
     for path in results.PAGES:
         page = path.read_text()
         assert results.written(page) == page, f"{path.name}: run python benchmarks/results.py"
@@ -47,11 +47,11 @@ def test_every_bundled_model_has_a_card(results):
         card = (BENCHMARKS.parent / "docs" / "cards" / f"{name}.md").read_text()
         for table in (f"{name} card", f"{name} by sensor", f"{name} by distance, m", f"{name} by all+condition"):
             assert f"<!-- table {table} -->" in card, table
-        # of whom it learned
+        # subjects of the training motion
         assert re.search(r"^\| captured motion \| \S+, subjects (all|[0-9a-z, ]+) \|$", card, re.MULTILINE)
 
 
-def test_networks_that_say_whether_somebody_is_there_have_figures_of_it(results):
+def test_pages_report_auroc_of_person_outputs(results):
     said = {x.figure: x.value for x in results.own_lines(results._scored("small-2").results[0])}
     for page in ("results.md", "cards/small.md"):
         text = (BENCHMARKS.parent / "docs" / page).read_text("utf-8")
@@ -59,8 +59,8 @@ def test_networks_that_say_whether_somebody_is_there_have_figures_of_it(results)
             assert re.search(rf"^\| `{name}`: .* \| {said[f'{name}_auroc']:.2f} \|$", text, re.MULTILINE), (page, name)
 
 
-def test_the_headline_and_the_conditions_are_those_of_the_scores(results):
-    """Of the default, the sensor known and not, and of the mean pose beside it; the README's three figures."""
+def test_headline_and_condition_figures_match_scores(results):
+    """The default model with known and unknown sensor position, the mean pose, and the three figures of the README."""
     page = (BENCHMARKS.parent / "docs" / "results.md").read_text("utf-8")
     rows = {
         "sensor's position known": (results.DEFAULT, results.DEFAULT),
@@ -78,29 +78,29 @@ def test_the_headline_and_the_conditions_are_those_of_the_scores(results):
         if file == results.DEFAULT:
             headline.append(f"{known['all', 'all']:.1f}")
     readme = (BENCHMARKS.parent / "README.md").read_text("utf-8")
-    # the last is what the paper prints for Waymo, 51.59
+    # the last figure is the paper's for Waymo, 51.59
     assert re.findall(r"^\| .*?(\d+\.\d)\b.*\|$", readme, re.MULTILINE)[:3] == [*headline, "51.6"]
 
 
-def test_a_difference_of_runs_of_one_seed_is_of_that_seed(changed):
+def test_difference_compares_runs_of_same_seed(changed):
     own = changed.Runs([run("base", 1, 10.0), run("base", 2, 20.0), run("x", 1, 11.0), run("x", 2, 22.0)], 100)
     assert own.difference("x") == pytest.approx(1.5) and own.freedom == 1
-    # seed 2 is harder for all: that x was run on it alone does not tell against x
+    # errors of seed 2 are higher for all variants; x, run on seed 2 only, is compared on seed 2
     own = changed.Runs([run("base", 1, 10.0), run("base", 2, 20.0), run("x", 2, 19.0)], 100)
     assert own.difference("x") == pytest.approx(-1.0)
     assert np.isnan(own.deviation) and own.difference_text("x") == "-1.0"
-    # nothing is said of what shares no seed with base, nor with anything that does
+    # no difference without seeds that link the variant to base, directly or through other variants
     own = changed.Runs([run("base", 1, 10.0), run("x", 2, 19.0)], 100)
     assert own.difference_text("x") == "-"
 
 
-def test_a_variant_without_the_seeds_of_base_is_reached_by_others(changed):
+def test_difference_links_variants_without_common_seed(changed):
     runs = [run("base", 1, 10.0), run("y", 1, 12.0), run("y", 2, 22.0), run("x", 2, 19.0)]
     assert changed.Runs(runs, 100).difference("x") == pytest.approx(-1.0)
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say(changed):
-    """95 % of the intervals hold a difference of 3 mm, of variants of three seeds, of two and of one; seeds differ."""
+def test_difference_intervals_have_nominal_coverage(changed):
+    """95 % of the intervals contain the true difference of 3 mm, for variants with one, two and three seeds."""
     rng = np.random.default_rng(0)
     held = {1: [], 2: [], 3: []}
     for _ in range(1500):
@@ -117,7 +117,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(changed):
         assert 0.935 < np.mean(found) < 0.965, count
 
 
-def test_what_noise_hides_is_called_so(changed):
+def test_difference_within_noise_is_unresolved(changed):
     runs = [run("base", seed, 100.0) for seed in (1, 2)]
     runs += [run("large", 1, 150.0), run("large", 2, 151.0), run("small", 1, 100.5), run("small", 2, 99.6)]
     own = changed.Runs(runs, 100)
@@ -125,7 +125,7 @@ def test_what_noise_hides_is_called_so(changed):
     assert own.difference_text("small").endswith("unresolved")
 
 
-def test_runs_are_added_to_those_known(changed, tmp_path):
+def test_collect_adds_new_runs_to_known_runs(changed, tmp_path):
     known = [run("base", 1, 10.0, begun=0), run("x", 1, 12.0, begun=0)]
     again, new = run("x", 1, 11.0, begun=0), run("base", 2, 13.0, begun=0)
     for one in (again, new):
@@ -135,17 +135,17 @@ def test_runs_are_added_to_those_known(changed, tmp_path):
     assert changed.collect(tmp_path, known) == [known[0], new, again]
 
 
-def test_a_doubling_of_people(changed):
+def test_scaling_reports_change_per_doubling(changed):
     _, rows = changed.scaling([run("base", 1, 200.0), run("base", 1, 180.0, 200), run("base", 1, 150.0, 800)])
     assert [row[2] for row in rows] == ["", "-20.0", "-15.0"]
 
 
-def test_errors_of_who_is_kept_are_rounded_once():
+def test_rejection_does_not_round_errors():
     predictions = Namespace(confidence=np.ones((1, 1)), errors=lambda: np.array([[47.249]]))
     assert benchmark("test_time").rejection(predictions)[0] == {"kept": 100, "people": 47.249, "joints": 47.249}
 
 
-def test_recall_of_people_in_scans_is_a_table(results, monkeypatch):
+def test_detector_table_lists_recall(results, monkeypatch):
     recall = {"figure": "recall", "count": 1200}
     rows = [
         recall | {"at": at, "group": group, "of": of, "value": value, "low": low, "high": value}

@@ -1,4 +1,4 @@
-"""Point clouds of ROS recordings, written by rosbags' own writers: every layout, container and kind of damage."""
+"""Point clouds of ROS recordings written with rosbags: containers, field layouts, transforms and damaged files."""
 
 import struct
 from concurrent.futures import ThreadPoolExecutor
@@ -78,7 +78,7 @@ def transform(stamp, parent, child, translation, yaw=0.0, store=ROS2):
 
 
 def write(path, messages, *, compression=None):
-    """A recording of (topic, message, ns); the suffix says the container. Returns the path to open."""
+    """Writes (topic, message, ns); the suffix selects the container. Returns the path to open."""
     store = ROS1 if path.suffix == ".bag" else ROS2
     if path.suffix == ".bag":
         writer = Writer1(path)
@@ -105,7 +105,7 @@ def store_of(suffix):
 
 
 def points_of(k, n=40):
-    """Points of frame k that are float32 numbers."""
+    """Points (n, 3) m of frame k, exactly representable in float32."""
     return np.random.default_rng(k).normal(scale=10, size=(n, 3)).astype(np.float32).astype(float)
 
 
@@ -133,7 +133,7 @@ CONTAINERS = [
 
 
 @pytest.mark.parametrize("suffix, compression", CONTAINERS)
-def test_every_container_yields_its_clouds(tmp_path, suffix, compression):
+def test_every_container_format_is_read(tmp_path, suffix, compression):
     source = open_source(write(tmp_path / f"drive{suffix}", clouds(suffix), compression=compression))
     for _ in range(2):
         frames = list(source)
@@ -146,8 +146,8 @@ def test_every_container_yields_its_clouds(tmp_path, suffix, compression):
 
 
 @pytest.mark.parametrize("has_chunk", [True, False])
-def test_an_mcap_without_an_index_is_read(tmp_path, has_chunk):
-    """As streaming recorders write it: lz4 or no chunks at all, no summary, and ROS 1 messages."""
+def test_mcap_without_index_is_read(tmp_path, has_chunk):
+    """As written by streaming recorders: lz4 chunks or no chunks, no summary, ROS 1 messages."""
 
     def record(op, content):
         return struct.pack("<BQ", op, len(content)) + content
@@ -174,7 +174,7 @@ def test_an_mcap_without_an_index_is_read(tmp_path, has_chunk):
         assert np.array_equal(frame.points, points_of(k))
 
 
-def test_a_ros_2_folder_is_a_recording_of_its_files(tmp_path):
+def test_ros2_folder_includes_all_its_files(tmp_path):
     file = write(tmp_path / "drive.mcap", clouds(".mcap"))
     second = write(tmp_path / "next.mcap", clouds(".mcap", 3))
     second.rename(file.with_name("drive_10.mcap"))
@@ -201,7 +201,7 @@ LAYOUTS = {
 
 
 @pytest.mark.parametrize("name", LAYOUTS)
-def test_any_layout_of_fields_is_read(name):
+def test_decode_cloud_reads_all_field_layouts(name):
     points = points_of(3)
     points[[2, 5]] = np.nan
     ring = np.arange(len(points)) % 128
@@ -211,7 +211,7 @@ def test_any_layout_of_fields_is_read(name):
     assert np.array_equal(got_ring, ring) if "ring" in name else got_ring is None
 
 
-def test_returns_that_are_none_are_left_out_with_their_rings(tmp_path):
+def test_invalid_returns_are_dropped_with_their_rings(tmp_path):
     points = points_of(1)
     points[3], points[7] = np.nan, 0
     fields = (*XYZ, ("ring", 12, "u2"))
@@ -220,12 +220,12 @@ def test_returns_that_are_none_are_left_out_with_their_rings(tmp_path):
     (frame,) = source
     rest = np.delete(np.arange(len(points)), [3, 7])
     assert np.array_equal(frame.points, points[rest]) and np.array_equal(frame.ring, rest)
-    # without a stamp, the time when it was recorded
+    # without a stamp, the recording time is used
     assert frame.time == START / 1e9 and "their recording times" in source.warnings[0]
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".db3", ".bag"])
-def test_topics_are_chosen_and_named(tmp_path, suffix):
+def test_topic_can_be_selected_and_is_listed(tmp_path, suffix):
     store = store_of(suffix)
     rare = [("/rear/points", cloud(points_of(9), store=store), START)]
     path = write(tmp_path / f"two{suffix}", rare + clouds(suffix))
@@ -244,7 +244,7 @@ def test_topics_are_chosen_and_named(tmp_path, suffix):
     assert "\n" not in str(error.value)
 
 
-def test_a_background_is_learned_of_the_topic_that_is_read(tmp_path, capsys):
+def test_background_is_learned_from_selected_topic(tmp_path, capsys):
     messages = clouds(".mcap") + [("/rear", cloud(points_of(9) + 90), START + k * 10**8) for k in range(3)]
     path = str(write(tmp_path / "two.mcap", messages))
     assert is_static(points_of(9) + 90, learn_background(path, topic="/rear")).all()
@@ -257,7 +257,7 @@ def test_a_background_is_learned_of_the_topic_that_is_read(tmp_path, capsys):
 
 @pytest.mark.parametrize("suffix", [".mcap", ".bag"])
 def test_sensor_poses_come_from_transforms(tmp_path, suffix):
-    """A vehicle that drives along a line and turns; its transforms are recorded after the clouds that they place."""
+    """A vehicle drives along a line and turns; transforms are recorded after the clouds to which they apply."""
     store = store_of(suffix)
     messages = [("/tf_static", transform(0, "base_link", "lidar", (1, 0, 2), np.pi / 2, store), START - 1)]
     for k in range(12):
@@ -277,8 +277,8 @@ def test_sensor_poses_come_from_transforms(tmp_path, suffix):
     assert [frame.index for frame in source.frames(7)] == [7, 8, 9]
 
 
-def test_a_recording_gone_on_with_stays_in_its_world(tmp_path):
-    """`odom` is known from cloud 15 on, when the first was given without a pose; `map`, which is preferred, from 25."""
+def test_resumed_recording_keeps_world_frame(tmp_path):
+    """`odom` is known from cloud 15 on; `map`, which is preferred, from cloud 25 on."""
     messages = clouds(".mcap", 40)
     for k in range(15, 40):
         time = START + k * 10**8
@@ -294,8 +294,8 @@ def test_a_recording_gone_on_with_stays_in_its_world(tmp_path):
 @pytest.mark.parametrize(
     "names", [("drive_0.mcap", "drive_1.mcap"), ("a_2024-05-01-10-00-00_0.bag", "a_2024-05-01-10-00-02_1.bag")]
 )
-def test_a_split_recording_without_its_metadata_is_one(tmp_path, names):
-    """Where the sensor is on the vehicle is only in the first file."""
+def test_split_recording_without_metadata_is_joined(tmp_path, names):
+    """The static transform of the sensor is in the first file only."""
     folder = tmp_path / "drive"
     folder.mkdir()
     for part, name in enumerate(names):
@@ -316,7 +316,7 @@ def test_a_split_recording_without_its_metadata_is_one(tmp_path, names):
     assert len(list(source)) == 10 and "left out: " in source.warnings[0]
 
 
-def test_a_pose_is_none_where_no_chain_is_known(tmp_path):
+def test_sensor_pose_is_none_without_transform_chain(tmp_path):
     gone = ("/tf", transform(START, "map", "base_link", (0, 0, 0)), START)
     far = [("/tf", transform(START + t, "odom", "lidar", (t / 1e9, 0, 0)), START + t) for t in (0, 10**8, 5 * 10**9)]
     circle = [
@@ -333,19 +333,19 @@ def test_a_pose_is_none_where_no_chain_is_known(tmp_path):
         assert [pose is not None for pose in poses] == [i < num_posed for i in range(6)]
         assert len(source.warnings) == (num_posed > 0)
 
-    # clouds that do not say in which frame they are
+    # clouds without a frame id
     nameless = [("/p", cloud(points_of(k), stamp=START + k, frame=""), START + k) for k in range(2)]
     source = open_source(write(tmp_path / "nameless.mcap", nameless))
     assert [frame.T_world_sensor for frame in source] == [None, None] and not source.warnings
 
-    # a cloud that is in the world already; where the sensor was is not known
+    # a cloud that is already in the world frame; the sensor's position is unknown
     (frame,) = open_source(write(tmp_path / "map.mcap", [("/p", cloud(points_of(1), frame="/map"), START)]))
     assert np.array_equal(frame.T_world_sensor, np.eye(4)) and frame.origin is None
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("suffix, compression", CONTAINERS)
-def test_a_recording_that_is_cut_off_keeps_what_is_whole(tmp_path, suffix, compression):
+def test_truncated_recording_keeps_complete_frames(tmp_path, suffix, compression):
     path = write(tmp_path / f"drive{suffix}", clouds(suffix, 40, 2000), compression=compression)
     data = path.read_bytes()
     most = 0
@@ -354,7 +354,7 @@ def test_a_recording_that_is_cut_off_keeps_what_is_whole(tmp_path, suffix, compr
         try:
             frames = list(open_source(path))
         except InputError as error:
-            # bz2 packs 900 kB at once
+            # bz2 compresses blocks of 900 kB
             assert "\n" not in str(error) and share < (0.7 if compression == "bz2" else 0.5)
             continue
         whole = [frame for frame in frames if not isinstance(frame, DamagedFrame)]
@@ -366,7 +366,7 @@ def test_a_recording_that_is_cut_off_keeps_what_is_whole(tmp_path, suffix, compr
 
 
 @pytest.mark.parametrize("suffix", [".mcap", ".db3", ".bag"])
-def test_damaged_bytes_cost_frames_and_never_more(tmp_path, suffix):
+def test_damaged_bytes_lose_frames_only(tmp_path, suffix):
     path = write(tmp_path / f"drive{suffix}", clouds(suffix, 8))
     data = path.read_bytes()
     random = np.random.default_rng(5)
@@ -380,7 +380,7 @@ def test_damaged_bytes_cost_frames_and_never_more(tmp_path, suffix):
             assert all(isinstance(frame, DamagedFrame) or np.isfinite(frame.points).all() for frame in frames)
 
 
-def test_clouds_that_do_not_fit_their_layout_are_damaged_frames(tmp_path):
+def test_clouds_with_inconsistent_layout_are_damaged_frames(tmp_path):
     good = cloud(points_of(0))
     broken = []
     for change in (
@@ -400,15 +400,15 @@ def test_clouds_that_do_not_fit_their_layout_are_damaged_frames(tmp_path):
     assert np.array_equal(last.points, points_of(0))
 
 
-def test_a_damaged_message_keeps_its_time_among_stamps_of_another_clock(tmp_path):
-    """Sensors whose clock began when they were switched on."""
+def test_damaged_message_gets_time_of_sensor_clock(tmp_path):
+    """The clock of the sensor starts at power-on."""
     boot = [("/points", cloud(points_of(k), stamp=5 * 10**9 + k * 10**8), START + k * 10**8) for k in range(8)]
     path = write(tmp_path / "a.mcap", boot)
     data = path.read_bytes()
     at = -1
     for _ in range(4):
         at = data.index(b"lidar\0", at + 1)
-    # the length of the name of its frame
+    # corrupt the length of the frame id
     path.write_bytes(data[: at - 4] + b"\xff\xff\xff\x7f" + data[at:])
     source = open_source(path, end=0.5)
     frames = list(source)
@@ -417,7 +417,7 @@ def test_a_damaged_message_keeps_its_time_among_stamps_of_another_clock(tmp_path
     assert not source.warnings
 
 
-def test_a_chunk_that_would_unpack_to_more_than_it_may_is_left_out(tmp_path):
+def test_mcap_chunk_above_size_limit_is_skipped(tmp_path):
     path = write(tmp_path / "drive.mcap", clouds(".mcap"), compression="zstd")
     data = bytearray(path.read_bytes())
     at = data.index(b"\x04\x00\x00\x00zstd") - 12
@@ -427,7 +427,7 @@ def test_a_chunk_that_would_unpack_to_more_than_it_may_is_left_out(tmp_path):
         open_source(path)
 
 
-def test_what_is_no_recording_is_one_line(tmp_path):
+def test_open_source_rejects_invalid_recordings(tmp_path):
     for suffix in (".mcap", ".db3", ".bag"):
         for content in (b"", b"nothing of the kind" * 9):
             path = Path(tmp_path / f"a{suffix}")
@@ -444,15 +444,15 @@ def test_what_is_no_recording_is_one_line(tmp_path):
 @pytest.mark.parametrize(
     "changes",
     [
-        # 7 bytes of what are 8 a connection; a field without a value, and another longer by a byte
+        # 7 bytes instead of 8 per connection; a field without a value and another field longer by one byte
         {b"\x01\x00\x00\x00\x08\x00\x00\x00\x00": b"\x01\x00\x00\x00\x07\x00\x00\x00\x00"},
         {b"\x04\x00\x00\x00op=\x06": b"\x03\x00\x00\x00op=", b"\x0a\x00\x00\x00count=": b"\x0b\x00\x00\x00count=\x00"},
     ],
     ids=["odd length", "no operation"],
 )
-def test_a_damaged_record_at_the_end_of_a_bag_costs_none_before_it(changes, tmp_path):
+def test_damaged_last_bag_record_keeps_earlier_frames(changes, tmp_path):
     path = write(tmp_path / "drive.bag", clouds(".bag"))
-    # the record that says what a chunk holds
+    # the chunk info record
     at = path.read_bytes().index(b"op=\x06") - 8
     start, info = path.read_bytes()[:at], path.read_bytes()[at:]
     for old, new in changes.items():
@@ -466,7 +466,7 @@ def test_a_damaged_record_at_the_end_of_a_bag_costs_none_before_it(changes, tmp_
         assert np.array_equal(frame.points, points_of(k))
 
 
-def test_a_stopped_recording_of_sqlite_goes_on_in_another_thread(tmp_path):
+def test_sqlite_recording_continues_in_another_thread(tmp_path):
     source = open_source(write(tmp_path / "drive.db3", clouds(".db3")))
     frames = source.frames(2)
     first = next(frames)

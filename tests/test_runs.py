@@ -1,4 +1,4 @@
-"""Runs that can be killed and taken up again, numbered folders, several processes."""
+"""Training runs: killed and resumed runs, numbered run folders, several processes."""
 
 import json
 import os
@@ -33,7 +33,7 @@ from lidarpose.train.objectives.posenet_objective import PoseNetObjective
 from lidarpose.train.optim import optimizers, rate_factor
 from lidarpose.train.recipes import Pretrain
 
-# people of a chunk; a run of three chunks
+# people per chunk; a run has three chunks
 CHUNK = BATCHES * 2
 RECIPE = Pretrain(scene="paper", people=3 * CHUNK, batch=2, workers=0, seed=5, easy=0.15, pictures=0, validate=1000)
 TINY = preset("tiny")
@@ -70,7 +70,7 @@ def assert_resumes_to(unbroken, folder):
 
 @pytest.fixture
 def copy(tmp_path, unbroken):
-    """A run that ended, to be changed."""
+    """A copy of a finished run that tests may change."""
     return shutil.copytree(unbroken, tmp_path / "run")
 
 
@@ -81,7 +81,7 @@ def unbroken(tmp_path_factory):
     return folder
 
 
-def test_what_is_saved_is_the_running_mean_of_the_weights(unbroken, tmp_path):
+def test_saved_weights_are_running_mean(unbroken, tmp_path):
     loop.train(replace(RECIPE, ema=0.0), tmp_path / "run")
     for line, other in zip(log_of(unbroken), log_of(tmp_path / "run"), strict=True):
         assert line["joints"] == pytest.approx(other["joints"], abs=2e-4)
@@ -100,7 +100,7 @@ def test_gradients_are_clipped(clip, moves, tmp_path):
     assert moved > 1e-3 if moves else moved < 1e-5
 
 
-def test_an_unbroken_run(unbroken):
+def test_finished_run_folder_contents(unbroken):
     names = [run_dir.BEST, run_dir.CONFIG, run_dir.LOG, run_dir.MODEL, run_dir.STATE]
     assert sorted(p.name for p in unbroken.iterdir()) == sorted(names)
     config = json.loads((unbroken / run_dir.CONFIG).read_text())
@@ -110,7 +110,7 @@ def test_an_unbroken_run(unbroken):
     assert header.card["people_seen"] == RECIPE.people and header.card["recipe"]["seed"] == 5
     lines = log_of(unbroken)
     assert lines[-1]["vote"] < lines[0]["vote"]
-    # at the end at the latest
+    # validation runs at the end of the run at the latest
     assert lines[-1]["validation_mm"] == header.card["validation_mm"] > 0 and "validation_mm" not in lines[0]
 
 
@@ -121,21 +121,21 @@ def test_an_unbroken_run(unbroken):
         ("_step", 2, 0),  # before the first chunk is done: nothing saved yet
         ("_step", BATCHES + 2, 1),  # within the second chunk
         ("save_state", 1, 1),  # the second chunk is in the log but not in the state
-        ("_save", 1, 1),  # a validation may have been told
+        ("_save", 1, 1),  # the validation may have been reported
         ("save_state", 2, 2),
     ],
 )
-def test_a_killed_run_goes_on_to_the_same_end(tmp_path, unbroken, name, call, saved):
+def test_killed_run_resumes_to_same_result(tmp_path, unbroken, name, call, saved):
     folder = tmp_path / "run"
     train_until_killed(RECIPE, folder, name, call)
     assert (folder / run_dir.STATE).exists() == bool(saved)
     with open(folder / run_dir.LOG, "a") as log:
-        # half a line is no obstacle
+        # an incomplete line is ignored
         log.write('{"people": 32, "sec')
     assert_resumes_to(unbroken, folder)
 
 
-def test_a_finished_run_stays_as_it_is(tmp_path, unbroken):
+def test_finished_run_is_not_changed(tmp_path, unbroken):
     before = {p.name: p.read_bytes() for p in unbroken.iterdir()}
     assert loop.train(RECIPE, unbroken, resume=True) == unbroken / run_dir.MODEL
     assert before == {p.name: p.read_bytes() for p in unbroken.iterdir()}
@@ -144,8 +144,8 @@ def test_a_finished_run_stays_as_it_is(tmp_path, unbroken):
     assert before == {p.name: p.read_bytes() for p in unbroken.iterdir()}
 
 
-def test_what_a_run_begins_with_may_have_been_moved(tmp_path):
-    """The weights it was begun with are read again: it could not go on without them."""
+def test_resume_accepts_moved_input_files(tmp_path):
+    """Input files may be in another folder, but must have the same names; the initial weights are read again."""
     with_body = Pretrain(body="/old/smpl.npz", motion="/old/motion.npz")
     run_dir.check_resumable(tmp_path, with_body, replace(with_body, body="/new/smpl.npz", motion="/new/motion.npz"))
     begun = Pretrain(init=str(tmp_path / "old/model.safetensors"))
@@ -156,13 +156,13 @@ def test_what_a_run_begins_with_may_have_been_moved(tmp_path):
 
 
 @pytest.mark.parametrize("change", [{"seed": 6}, {"batch": 16}, {"rate": 1e-3}, {"scene": "wild"}, {"muon_rate": 0.0}])
-def test_a_run_keeps_its_recipe(unbroken, change):
+def test_resume_rejects_changed_recipe(unbroken, change):
     with refused(f"the run has {next(iter(change))} = .* a run keeps its recipe"):
         loop.train(replace(RECIPE, **change), unbroken, resume=True)
 
 
 @pytest.mark.long
-def test_a_run_may_become_shorter_and_longer(tmp_path):
+def test_resume_accepts_shorter_and_longer_runs(tmp_path):
     folder = tmp_path / "run"
     train_until_killed(RECIPE, folder, "_step", BATCHES)
     loop.train(replace(RECIPE, people=CHUNK + 4, workers=1), folder, resume=True)
@@ -173,8 +173,8 @@ def test_a_run_may_become_shorter_and_longer(tmp_path):
     assert people_of(folder)[-1] == RECIPE.people
 
 
-def test_a_longer_run_sees_everybody(monkeypatch, tmp_path):
-    """Those of the last, short chunk of the shorter run too."""
+def test_longer_run_sees_all_people(monkeypatch, tmp_path):
+    """Including the people of the shorter run's last, incomplete chunk."""
     folder, seen = tmp_path / "run", []
     original = SyntheticSource.example
     monkeypatch.setattr(SyntheticSource, "example", lambda self, index: seen.append(index) or original(self, index))
@@ -187,7 +187,7 @@ def test_a_longer_run_sees_everybody(monkeypatch, tmp_path):
 
 
 def started(recipe, folder, environment=None, **options):
-    """A process that trains, and saves after every chunk."""
+    """Starts a training process that saves after every chunk."""
     code = (
         "import sys, json, torch; torch.set_num_threads(1)\n"
         "from lidarpose.train import data_loader, loop, setup; from lidarpose.train.recipes import Pretrain\n"
@@ -200,8 +200,8 @@ def started(recipe, folder, environment=None, **options):
 
 
 @pytest.mark.long
-def test_killed_for_good_with_workers_and_taken_up(tmp_path):
-    """SIGKILL: nothing is tidied, and the workers end by themselves."""
+def test_run_with_workers_resumes_after_sigkill(tmp_path):
+    """After SIGKILL nothing is cleaned up, and the workers exit on their own."""
     recipe = replace(RECIPE, workers=1, people=40 * CHUNK)
     process = started(recipe, tmp_path / "run", start_new_session=True)
     deadline = time.monotonic() + 120
@@ -210,7 +210,7 @@ def test_killed_for_good_with_workers_and_taken_up(tmp_path):
         time.sleep(0.05)
     process.kill()
     process.wait()
-    # the group has no process left once its workers have seen that their parent is gone
+    # the process group is empty once the workers have noticed that their parent is gone
     while True:
         try:
             os.killpg(process.pid, 0)
@@ -226,15 +226,15 @@ def test_killed_for_good_with_workers_and_taken_up(tmp_path):
 
 
 @pytest.mark.long
-def test_what_a_kill_leaves_is_no_obstacle(tmp_path, unbroken):
+def test_leftover_files_of_killed_run_are_ignored(tmp_path, unbroken):
     folder = tmp_path / "run"
     folder.mkdir()
-    # killed while the very first file was written, and while it held the folder
+    # killed while writing the first file and holding the lock
     (folder / ".123-0-config.json").write_text('{"schema"')
     (folder / LOCK).touch()
     loop.train(RECIPE, folder)
     assert_close(folder, unbroken)
-    # a power cut may leave zeros in the log, and half of a file
+    # a power cut may leave zeros in the log, and an incomplete file
     with open(folder / run_dir.LOG, "ab") as log:
         log.write(b"\0\0\0\0" + b'{"people": 12}\n[1]\n{"seconds": 3}\n')
     (folder / ".123-1-model.safetensors").write_bytes(b"half")
@@ -243,8 +243,8 @@ def test_what_a_kill_leaves_is_no_obstacle(tmp_path, unbroken):
 
 
 @pytest.mark.parametrize(("where", "name"), [(loop, "loader"), (PoseNetObjective, "terms")])
-def test_a_dead_worker_is_one_line(tmp_path, monkeypatch, where, name):
-    """It is noticed while batches are waited for, or in the middle of a step."""
+def test_killed_worker_raises_input_error(tmp_path, monkeypatch, where, name):
+    """The error is raised while waiting for batches or within a step."""
 
     def lost(*_, **__):
         raise RuntimeError("DataLoader worker (pid 12) is killed by signal: Killed.")
@@ -254,7 +254,7 @@ def test_a_dead_worker_is_one_line(tmp_path, monkeypatch, where, name):
         loop.train(RECIPE, tmp_path / "run")
 
 
-def test_a_run_has_one_process_at_a_time(monkeypatch, copy):
+def test_run_folder_is_locked_for_other_processes(monkeypatch, copy):
     monkeypatch.setattr(run_dir, "LOCK_WAIT", 0.0)
     longer = replace(RECIPE, people=RECIPE.people + 2 * CHUNK)
     before = {p.name: p.read_bytes() for p in copy.iterdir()}
@@ -266,7 +266,7 @@ def test_a_run_has_one_process_at_a_time(monkeypatch, copy):
     assert people_of(copy)[-1] == longer.people
 
 
-def test_folders_that_cannot_be(tmp_path):
+def test_train_rejects_unusable_folders(tmp_path):
     (tmp_path / "file").write_text("")
     with refused("cannot write into the folder"):
         loop.train(RECIPE, tmp_path / "file" / "run")
@@ -281,7 +281,7 @@ def written(content):
 
 
 def rewritten(tensors=lambda tensors: tensors, progress=lambda progress: progress):
-    """What rewrites state.safetensors."""
+    """Returns a function that rewrites state.safetensors."""
 
     def rewrite(path):
         with safe_open(path, framework="pt") as file:
@@ -354,25 +354,25 @@ DAMAGE = [
 
 @pytest.mark.long
 @pytest.mark.parametrize(("name", "damage", "message"), DAMAGE)
-def test_a_damaged_run_is_one_line_that_names_the_file(copy, name, damage, message):
+def test_damaged_run_error_names_file(copy, name, damage, message):
     damage(copy / name)
     with refused(f"^{re.escape(str(copy / name))}: .*({message})"):
         loop.train(RECIPE, copy, resume=True)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
-def test_a_config_in_another_unicode_encoding_is_read(copy, unbroken, encoding):
+def test_config_in_other_unicode_encoding_is_read(copy, unbroken, encoding):
     (copy / run_dir.CONFIG).write_bytes((copy / run_dir.CONFIG).read_text("utf-8").encode(encoding))
     assert_resumes_to(unbroken, copy)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_run_that_is_told_to_stop_saves_and_goes_on_to_the_same_losses(monkeypatch, tmp_path, unbroken, number):
+def test_stopped_run_saves_and_resumes_to_same_losses(monkeypatch, tmp_path, unbroken, number):
     folder, original = tmp_path / "run", PoseNetObjective.terms
 
     def interrupted(*args, **kwargs):
-        # once
+        # only in the first call
         monkeypatch.setattr(PoseNetObjective, "terms", original)
         os.kill(os.getpid(), number)
         return original(*args, **kwargs)
@@ -386,7 +386,28 @@ def test_a_run_that_is_told_to_stop_saves_and_goes_on_to_the_same_losses(monkeyp
     assert_resumes_to(unbroken, folder)
 
 
-def test_a_second_request_stops_at_once():
+@pytest.mark.long
+def test_stop_request_in_last_chunk_finishes_run(monkeypatch, tmp_path):
+    original = PoseNetObjective.terms
+
+    def interrupted(*args, **kwargs):
+        monkeypatch.setattr(PoseNetObjective, "terms", original)
+        os.kill(os.getpid(), signal.SIGTERM)
+        return original(*args, **kwargs)
+
+    monkeypatch.setattr(PoseNetObjective, "terms", interrupted)
+    assert loop.train(replace(RECIPE, people=CHUNK), tmp_path / "run") == tmp_path / "run" / run_dir.MODEL
+    assert people_of(tmp_path / "run") == [CHUNK]
+
+
+@pytest.mark.parametrize(("people", "steps"), [(CHUNK, BATCHES), (CHUNK + 1, BATCHES + 1), (1, 1)])
+def test_run_steps_are_rounded_up(people, steps, tmp_path):
+    recipe = replace(RECIPE, people=people)
+    run = loop._Run(recipe, setup.make_setup(recipe), tmp_path, loop.Accelerator(cpu=True), "", None)
+    assert run.steps == steps
+
+
+def test_second_stop_request_interrupts_immediately():
     before = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt), StopRequest() as stop:
         os.kill(os.getpid(), signal.SIGTERM)
@@ -396,13 +417,13 @@ def test_a_second_request_stops_at_once():
 
 
 @pytest.mark.long
-def test_a_run_without_a_state_says_that_it_starts_over(copy, unbroken, capsys):
+def test_run_without_state_reports_restart(copy, unbroken, capsys):
     (copy / run_dir.STATE).unlink()
     assert_resumes_to(unbroken, copy)
     assert "the run starts over" in capsys.readouterr().err
 
 
-# of a value of 0: its slope is infinite, its value is not
+# 0 with an infinite gradient
 def steep(value):
     return (value - value).abs().sqrt()
 
@@ -412,8 +433,8 @@ def steep(value):
     "step, poison",
     [(BATCHES + 2, lambda value: value * float("nan")), *((k, steep) for k in (BATCHES + 1, 2 * BATCHES, 3 * BATCHES))],
 )
-def test_what_is_not_finite_stops_the_run_and_never_reaches_what_is_saved(tmp_path, unbroken, step, poison):
-    """Neither a loss nor a gradient, not even that of the last step of a chunk, or of the run, whose loss is good."""
+def test_non_finite_values_stop_run_and_are_not_saved(tmp_path, unbroken, step, poison):
+    """Also if only the gradient in the last step of a chunk or of the run is not finite, and the loss is."""
     folder, calls, original = tmp_path / "run", [], PoseNetObjective.terms
 
     def poisoned(*args, **kwargs):
@@ -432,23 +453,23 @@ def test_what_is_not_finite_stops_the_run_and_never_reaches_what_is_saved(tmp_pa
     assert people_of(folder) == [CHUNK, 2 * CHUNK][:chunk]
     for name in (run_dir.STATE, run_dir.MODEL):
         assert all(value.isfinite().all() for value in load_file(folder / name).values() if value.is_floating_point())
-    # the state is as good as new
+    # the saved state is intact
     assert_resumes_to(unbroken, folder)
 
 
-def test_an_absurd_rate_stops_the_run(tmp_path):
+def test_too_large_learning_rate_stops_run(tmp_path):
     with refused(f"not finite in batch [0-9] of the {BATCHES} that start at person 0"):
         loop.train(replace(RECIPE, rate=1e30), tmp_path / "run")
 
 
-def test_the_command_line_trains_and_goes_on(tmp_path, capsys):
+def test_pretrain_command_trains_and_resumes(tmp_path, capsys):
     folder = tmp_path / "run"
     words = ["pretrain", str(folder), "--people", "8", "--batch", "2", "--scene", "paper", "--workers", "0"]
     assert not main(words)
     assert str(folder / run_dir.MODEL) in capsys.readouterr().out
     command = load_checkpoint(folder / run_dir.MODEL)[1].card["command"]
     assert command == "lidarpose pretrain --batch 2 --workers 0 --scene paper --people 8"
-    # what is not said again stays as it was
+    # options that are not repeated keep their values
     go_on = ["pretrain", str(folder), "--resume"]
     assert not main([*go_on, "--people", "32"])
     assert "warning" not in capsys.readouterr().err
@@ -467,7 +488,7 @@ def test_the_command_line_trains_and_goes_on(tmp_path, capsys):
 
 
 @pytest.mark.long
-def test_runs_without_a_name_are_numbered(tmp_path, monkeypatch, capsys):
+def test_unnamed_runs_get_numbered_folders(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = ["pretrain", "--people", "4", "--batch", "2", "--scene", "paper", "--workers", "0", "--pictures", "0"]
     assert not main(words) and not main(words)
@@ -477,7 +498,7 @@ def test_runs_without_a_name_are_numbered(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out.split()[-1] == str(run_dir.Path(run_dir.RUNS) / "pretrain-002" / run_dir.MODEL)
     with pytest.raises(InputError, match="has no run finetune-... to resume"):
         run_dir.latest("finetune")
-    # a name that is taken meanwhile is passed over
+    # an existing name is skipped
     (tmp_path / run_dir.RUNS / "pretrain-003").mkdir()
     assert run_dir.numbered("pretrain").name == "pretrain-004"
 
@@ -503,7 +524,7 @@ def test_runs_without_a_name_are_numbered(tmp_path, monkeypatch, capsys):
         ("--motion no.npz --subjects a --workers 1", "no such file"),
     ],
 )
-def test_wrong_words_are_one_line_and_leave_no_folder(tmp_path, monkeypatch, capsys, words, message):
+def test_pretrain_rejects_invalid_options_and_leaves_no_folder(tmp_path, monkeypatch, capsys, words, message):
     monkeypatch.chdir(tmp_path)
     assert main(["pretrain", "--quiet", "--people", "4", "--batch", "2", "--workers", "0", *words.split()]) == 2
     error = capsys.readouterr().err
@@ -512,8 +533,8 @@ def test_wrong_words_are_one_line_and_leave_no_folder(tmp_path, monkeypatch, cap
 
 
 @pytest.mark.slow
-def test_two_processes_take_the_same_steps_as_one(tmp_path):
-    """As torch's and Accelerate's launchers would have it."""
+def test_two_processes_match_single_process(tmp_path):
+    """With the environment variables of torch's and Accelerate's launchers."""
     recipe = replace(RECIPE, people=4 * CHUNK, batch=4, seed=3, rate=2e-4, muon_rate=2e-3)
     port = str(29000 + os.getpid() % 3000)
     common = {"MASTER_ADDR": "127.0.0.1", "WORLD_SIZE": "2", "MASTER_PORT": port, "ACCELERATE_USE_CPU": "true"}
@@ -526,14 +547,14 @@ def test_two_processes_take_the_same_steps_as_one(tmp_path):
     assert people_of(tmp_path / "two") == [2 * CHUNK, 4 * CHUNK]
 
 
-def test_a_batch_that_cannot_be_shared_out_is_refused():
+def test_lanes_of_rejects_batch_not_divisible_by_processes():
     assert lanes_of(64, 1) == lanes_of(64, 2) == lanes_of(64, 8) == 8 and lanes_of(12, 4) == 4 and lanes_of(3) == 1
     for batch, ranks, fit in ((64, 3, "1, 2, 4, 8"), (64, 16, "1, 2, 4, 8"), (15, 2, "1")):
         with refused(f"a batch of {batch} can be shared out among {fit} processes, got {ranks}: change --batch"):
             lanes_of(batch, ranks)
 
 
-def test_the_card_s_command_is_as_it_was_typed(tmp_path, monkeypatch):
+def test_card_stores_command_as_typed(tmp_path, monkeypatch):
     motion = write_amass(tmp_path / "My Walk_poses.npz", *a_clip(40))
     monkeypatch.chdir(tmp_path)
     words = ["--batch", "2", "--workers", "0", "--scene", "paper", "--people", "2", "--motion", str(motion)]
@@ -543,23 +564,31 @@ def test_the_card_s_command_is_as_it_was_typed(tmp_path, monkeypatch):
     assert typed[typed.index("--motion") + 1] == motion.name and typed[typed.index("--subjects") + 1] == "My Walk"
 
 
-def test_a_run_s_rates_follow_its_schedule(monkeypatch, tmp_path):
-    rates, step = [], loop._Run._step
+def test_learning_rates_mean_weights_and_seeds_follow_steps(monkeypatch, tmp_path):
+    rates, seeds, means, step, average = [], [], [], loop._Run._step, loop.average
 
     def recorded(self, arrays, *of):
         terms = step(self, arrays, *of)
         rates.append([group["lr"] for optimizer in self.optimizers for group in optimizer.param_groups])
+        seeds.append(torch.initial_seed())
         return terms
 
+    def averaged(mean, network, step, ema):
+        means.append((step, ema))
+        average(mean, network, step, ema)
+
+    monkeypatch.setattr(loop, "average", averaged)
     monkeypatch.setattr(loop._Run, "_step", recorded)
     monkeypatch.setattr(setup, "VALIDATION", 0)
     loop.train(RECIPE, tmp_path / "run")
+    assert means == [(k, RECIPE.ema) for k in range(3 * BATCHES)]
+    assert seeds == [loop._seed(RECIPE.seed, loop.RandomStream.TRAINING_STEP, k, 0) for k in range(3 * BATCHES)]
     due = [rate_factor(k / (3 * BATCHES), RECIPE) for k in range(3 * BATCHES)]
     np.testing.assert_allclose(rates, np.outer(due, [RECIPE.rate, RECIPE.muon_rate]))
 
 
 @pytest.mark.long
-def test_the_best_validation_is_kept_across_a_resume(monkeypatch, tmp_path):
+def test_best_validation_is_kept_after_resume(monkeypatch, tmp_path):
     errors = [50.0, 40.0, 60.0, 45.0]
 
     def made(recipe, **settings):
@@ -580,7 +609,7 @@ def test_the_best_validation_is_kept_across_a_resume(monkeypatch, tmp_path):
 
 
 @pytest.mark.long
-def test_another_seed_begins_with_other_weights(tmp_path, monkeypatch):
+def test_seed_changes_initial_weights(tmp_path, monkeypatch):
     monkeypatch.setattr(setup, "VALIDATION", 0)
 
     def begun(seed):
@@ -601,7 +630,7 @@ def test_another_seed_begins_with_other_weights(tmp_path, monkeypatch):
         ("finetune", ["some", "--init", "random", "--size", "prn-small"], "prn", "adam"),
     ],
 )
-def test_a_size_alone_chooses_its_network_s_recipe(command, words, name, optimizer, monkeypatch):
+def test_size_selects_recipe_of_its_network(command, words, name, optimizer, monkeypatch):
     recipes = []
     monkeypatch.setattr("lidarpose.train.loop.train", lambda recipe, *_, **__: recipes.append(recipe) or "x")
     assert main([command, *words]) == 0 and main([command, *words, "--model", name]) == 0

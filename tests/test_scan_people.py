@@ -1,4 +1,4 @@
-"""People of whole scans as training shows them: who is in a crop, what is labeled, and how they join a run."""
+"""Training with people of whole scans: crops, labels, and the share in pre-training."""
 
 import pickle
 
@@ -24,7 +24,7 @@ PELVIS = BODY26.index("pelvis")
 
 @pytest.fixture(scope="module")
 def scan():
-    """One with people close together."""
+    """A scan with people close together."""
     scans = [scan_people.scan_people(SEED, number) for number in range(12)]
     return min((scan for scan in scans if len(scan.boxes) > 3), key=lambda scan: np.sort(scan.neighbors)[2])
 
@@ -34,7 +34,7 @@ def examples(scan, count):
     return [(k, person_example(scan, k, np.random.default_rng([9, i]))) for i, k in enumerate(people.tolist())]
 
 
-def test_the_people_of_a_scan_are_those_with_points_and_their_surroundings():
+def test_scan_people_have_points_and_surroundings():
     number = next(n for n in range(9) if len(detection_scene(SEED, n).boxes) > 4)
     scene, scan = scene_to_search(SEED, number, "train")[0], scan_people.scan_people(SEED, number)
     counts = np.bincount(scene.person[scene.person >= 0], minlength=len(scene.boxes))
@@ -47,12 +47,12 @@ def test_the_people_of_a_scan_are_those_with_points_and_their_surroundings():
     assert all(np.array_equal(a, b) for a, b in zip(scan.clouds, again.clouds, strict=True))
 
 
-def test_a_crop_shows_its_person_and_says_what_is_not_theirs(scan):
+def test_crop_labels_person_and_background(scan):
     second, mirrored = [], []
     for person, example in examples(scan, 120):
         assert (example.part == UNKNOWN_PART).sum() >= min(LEAST_POINTS, (scan.owners[person] == 1).sum()) > 0
         assert set(np.unique(example.part)) <= {UNKNOWN_PART, 0} and len(example.part) == len(example.points)
-        # a scale and nothing else changes the body
+        # the body changes only by a scale
         true = scan.joints[person].astype(float)
         lengths = [np.linalg.norm(joints[LEFT] - joints[RIGHT]) for joints in (true, example.joints)]
         assert lengths[1] == pytest.approx(lengths[0] * example.scale, rel=1e-5)
@@ -63,12 +63,12 @@ def test_a_crop_shows_its_person_and_says_what_is_not_theirs(scan):
         mirrored.append(np.sign(side[1]) != np.sign(turned[1]))
         assert example.person[0] == 1
         second.append(example.person[1])
-        # where the sensor is known it is known for what is shown
+        # the view direction is a unit vector if the sensor is known
         assert example.view[4] == 0 or np.linalg.norm(example.view[:3]) == pytest.approx(1)
     assert 0.3 < np.mean(mirrored) < 0.7 and np.nanmax(second) == 1
 
 
-def test_what_the_sensor_sees_is_mirrored_with_the_person(scan, monkeypatch):
+def test_mirroring_includes_sensor_and_visibility(scan, monkeypatch):
     monkeypatch.setattr(scan_people, "_NOISE", 0.0)
     monkeypatch.setattr(scan_people, "_SCALE", 0.0)
     num_mirrored = 0
@@ -89,7 +89,7 @@ def test_what_the_sensor_sees_is_mirrored_with_the_person(scan, monkeypatch):
     assert num_mirrored > 5
 
 
-def test_an_example_depends_on_its_number_alone():
+def test_example_depends_only_on_its_index():
     source = SceneSource(seed=SEED, uses=3, lag=2, load_scene=populated_scan, draw_example=draw_person)
     first = [source.example(index) for index in range(8)]
     alone = pickle.loads(pickle.dumps(source)).example(7)
@@ -97,7 +97,7 @@ def test_an_example_depends_on_its_number_alone():
     assert len({example.seed for example in first}) == 8
 
 
-def test_a_scan_without_anybody_is_skipped(monkeypatch, scan):
+def test_scan_without_people_is_skipped(monkeypatch, scan):
     empty = scan_people.ScanPeople(
         clouds=[], owners=[], boxes=[], joints=np.zeros((0, 26, 3)), neighbors=np.zeros(0), origin=None
     )
@@ -112,7 +112,7 @@ def test_a_scan_without_anybody_is_skipped(monkeypatch, scan):
     assert len(set(asked)) == 3 and asked[0] == 5
 
 
-def test_they_join_pretraining_as_a_share(monkeypatch):
+def test_whole_scans_are_a_share_of_pretraining(monkeypatch):
     setup = make_setup(Pretrain(whole_scans=0.25, people=64))
     assert isinstance(setup.source, MixedSource) and setup.source.share == 0.25
     assert setup.source.other.load_scene is populated_scan

@@ -37,12 +37,12 @@ def test_each_joint_has_one_group(name):
     assert list(groups)[-1] == "all" and len(groups["all"]) == len(SKELETONS[name])
     together = np.concatenate([index for group, index in groups.items() if group != "all"])
     assert sorted(together) == list(range(len(SKELETONS[name])))
-    # both sides or none
+    # a group has both sides of a joint or neither
     for index in groups.values():
         assert {SKELETONS[name].flip[j] for j in index} == set(index)
 
 
-def test_the_groups_of_the_paper():
+def test_joint_groups_of_waymo14_match_the_paper():
     groups = {name: [WAYMO14.joints[j] for j in index] for name, index in metrics.joint_groups(WAYMO14).items()}
     assert list(groups) == ["head", "shoulders", "elbows", "wrists", "hips", "knees", "ankles", "all"]
     assert set(groups["head"]) == {"nose", "head_center"} and groups["knees"] == ["left_knee", "right_knee"]
@@ -50,7 +50,7 @@ def test_the_groups_of_the_paper():
 
 @quick
 @given(seeds, st.sampled_from(metrics.AVERAGES))
-def test_by_group_against_a_loop(seed, average):
+def test_by_group_matches_loop(seed, average):
     table = drawn(seed, n=6, labeled=0.25)
     for name, score in metrics.by_group(table, "waymo14", average).items():
         part = table[:, metrics.joint_groups(WAYMO14)[name]]
@@ -59,7 +59,7 @@ def test_by_group_against_a_loop(seed, average):
         assert score.joints == (~np.isnan(part)).sum()
 
 
-def test_own_groups_and_groups_of_nobody():
+def test_by_group_with_empty_and_custom_groups():
     table = drawn(0, joints=15)
     table[:, [HUMAN15.index("left_wrist"), HUMAN15.index("right_wrist")]] = np.nan
     scores = metrics.by_group(table, HUMAN15)
@@ -93,7 +93,7 @@ def sliced(**change):
         (sliced(clusters=np.zeros(3)), r"clusters must be \(30,\)"),
     ],
 )
-def test_tables_and_options_are_checked(call, message):
+def test_scores_reject_invalid_tables_and_options(call, message):
     with pytest.raises(InputError, match=message):
         call()
 
@@ -103,7 +103,7 @@ def test_tables_and_options_are_checked(call, message):
 
 @quick
 @given(seeds, st.sampled_from(metrics.AVERAGES))
-def test_by_span_against_a_loop(seed, average):
+def test_by_span_matches_loop(seed, average):
     rng = np.random.default_rng(seed)
     table = drawn(seed, labeled=0.2)
     distance = np.round(rng.uniform(-2, 45, 30))
@@ -128,14 +128,14 @@ def test_by_span_against_a_loop(seed, average):
         (metrics.OCCLUSION_EDGES, [0, 0.05, 0.1, 0.6, 1.0], [2, 1, 0, 2]),
     ],
 )
-def test_the_edges_of_reports_hold_everybody(edges, values, people):
+def test_report_edges_cover_all_people(edges, values, people):
     slices = metrics.by_span(np.arange(5.0), values, edges)
     counts = {name: part.score.people for name, part in slices.items()}
     assert counts == people or list(counts.values()) == people
     assert all(np.isnan(part.score) == (part.score.people == 0) for part in slices.values())
 
 
-def test_slices_carry_intervals_of_their_own_people():
+def test_by_span_computes_interval_of_each_slice():
     table, distance, sequence = drawn(1), np.repeat([5.0, 15.0], 15), np.arange(30) // 5
     slices = metrics.by_span(table, distance, (0, 10, 20), rng=np.random.default_rng(0), clusters=sequence)
     assert slices["0 to 10"].interval == metrics.interval(table[:15], np.random.default_rng(0), clusters=sequence[:15])
@@ -147,7 +147,7 @@ def test_slices_carry_intervals_of_their_own_people():
 
 
 def slow_means(table, rng, average, clusters, repeats):
-    """As the bootstrap reads: draw whole clusters, put their people together, take the mean."""
+    """Direct bootstrap: draw whole clusters, join their people, take the mean."""
     rows = [row for row in range(len(table)) if not np.isnan(table[row]).all()]
     names = sorted({clusters[row] for row in rows})
     members = [[row for row in rows if clusters[row] == name] for name in names]
@@ -160,7 +160,7 @@ def slow_means(table, rng, average, clusters, repeats):
 
 @quick
 @given(seeds, st.sampled_from(metrics.AVERAGES), st.booleans())
-def test_draws_against_a_loop(seed, average, clustered):
+def test_bootstrap_means_match_loop(seed, average, clustered):
     table = drawn(seed, n=12, joints=3, labeled=0.4)
     table[0] = 1.0
     clusters = np.random.default_rng(seed).integers(4, size=12) if clustered else np.arange(12)
@@ -171,7 +171,7 @@ def test_draws_against_a_loop(seed, average, clustered):
     assert units == len({c for c, row in zip(clusters, table, strict=True) if not np.isnan(row).all()})
 
 
-def test_draws_do_not_depend_on_how_many_are_held_at_once(monkeypatch):
+def test_interval_does_not_depend_on_block_size(monkeypatch):
     table = drawn(2)
     whole = metrics.interval(table, np.random.default_rng(0))
     monkeypatch.setattr(aggregate, "_BLOCK", 100)
@@ -179,7 +179,7 @@ def test_draws_do_not_depend_on_how_many_are_held_at_once(monkeypatch):
     assert metrics.interval(table, np.random.default_rng(1)) != whole
 
 
-def test_intervals_are_as_wide_as_theory_says():
+def test_interval_width_matches_theory():
     values = np.random.default_rng(0).normal(100, 20, 400)
     found = metrics.interval(values, np.random.default_rng(0))
     half = 1.96 * values.std() / 20
@@ -192,8 +192,8 @@ def test_intervals_are_as_wide_as_theory_says():
 
 
 @pytest.mark.parametrize("units, least, most", [(2, 40, 60), (LEAST_UNITS, 80, 94), (20, 88, 97)])
-def test_how_often_intervals_of_few_hold_the_truth(units, least, most):
-    """Why few have none."""
+def test_interval_coverage_with_few_units(units, least, most):
+    """With few units the coverage is too low; therefore no interval is stated for them."""
     held = 0
     for seed in range(400):
         values = np.random.default_rng(seed).normal(100, 20, units)
@@ -202,7 +202,13 @@ def test_how_often_intervals_of_few_hold_the_truth(units, least, most):
     assert least < held / 4 < most
 
 
-def test_an_interval_without_width_is_not_stated():
+@pytest.mark.parametrize("units, is_stated", [(9, False), (10, True)])
+def test_interval_stated_requires_ten_units(units, is_stated):
+    found = metrics.interval(np.arange(float(units)), np.random.default_rng(0), repeats=100)
+    assert found.units == units and (found.stated == ((found.low, found.high) if is_stated else (None, None)))
+
+
+def test_interval_without_width_is_not_stated():
     for value in (0.0, 100.0):
         found = metrics.interval(np.full(30, value), np.random.default_rng(0))
         assert found.low == found.high == value and found.stated == (None, None)
@@ -210,20 +216,20 @@ def test_an_interval_without_width_is_not_stated():
     assert found.stated == (found.low, found.high)
 
 
-def test_sequences_make_intervals_wider():
+def test_clusters_widen_interval():
     rng = np.random.default_rng(0)
     sequence = np.repeat(np.arange(20), 50)
     values = rng.normal(100, 20, 20)[sequence] + rng.normal(0, 2, 1000)
     people = metrics.interval(values, np.random.default_rng(0))
     whole = metrics.interval(values, np.random.default_rng(0), clusters=sequence)
     assert whole.units == 20 and people.units == 1000
-    # 50 frames that say the same make it about sqrt(50) times as wide
+    # 50 strongly correlated frames per sequence make it about sqrt(50) times as wide
     assert 5 < (whole.high - whole.low) / (people.high - people.low) < 9
     names = np.array([f"seq{k}" for k in sequence])
     assert metrics.interval(values, np.random.default_rng(0), clusters=names).units == 20
 
 
-def test_what_is_hard_for_both_does_not_widen_a_comparison():
+def test_paired_interval_cancels_common_variation():
     first = np.random.default_rng(0).normal(100, 30, 300)
     second = first - 2 + np.random.default_rng(1).normal(0, 1, 300)
     found = metrics.paired_interval(first, second, np.random.default_rng(0))

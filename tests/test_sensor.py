@@ -16,7 +16,7 @@ ROWS = {
 }  # fmt: skip
 
 
-def test_presets_are_what_their_names_say():
+def test_presets_match_sensor_data():
     assert {name: s.rows for name, s in SENSORS.items() if isinstance(s, Sensor)} == ROWS
     for name, s in SENSORS.items():
         assert s.name == name and sensor(name) is s
@@ -28,16 +28,16 @@ def test_presets_are_what_their_names_say():
     assert sensor("dapt64").height == 0.5
     assert np.degrees(sensor("waymo-top").elevations[[0, -1]]) == pytest.approx([-17.6, 2.4])
     assert np.degrees(sensor("hdl-32e").elevations).round(2)[[0, 23, 31]].tolist() == [-30.67, 0, 10.67]
-    # two equal tables, one upside down
+    # two identical sensors, one of them upside down
     assert sensor("av2").elevations == pytest.approx(-sensor("av2").elevations[::-1])
 
 
-def test_unknown_name_lists_the_nearest():
+def test_unknown_sensor_suggests_nearest_name():
     with pytest.raises(InputError, match="unknown sensor 'vlp32c'.*did you mean vlp-32c"):
         sensor("vlp32c")
 
 
-def test_a_sensor_is_frozen():
+def test_sensor_is_frozen():
     s = sensor("vlp-16")
     with pytest.raises(dataclasses.FrozenInstanceError):
         s.height = 2.0
@@ -54,6 +54,7 @@ def test_a_sensor_is_frozen():
         ({"elevations": np.array([])}, "at least one ring"),
         ({"elevations": np.array([0.0, np.nan])}, "finite"),
         ({"azimuth_step": 0.1}, "divide 2 pi"),
+        ({"azimuth_step": 2 * np.pi / 360.05}, "divide 2 pi"),
         ({"azimuth_step": -np.pi}, "divide 2 pi"),
         ({"azimuth_offsets": np.zeros(3)}, "one per ring"),
         ({"origin_heights": np.zeros(3)}, "one per ring"),
@@ -69,14 +70,14 @@ def test_a_sensor_is_frozen():
         ({"azimuth_step": "x"}, "azimuth_step must be a finite number, got 'x'"),
     ],
 )
-def test_bad_sensors_say_what_is_wrong(change, message):
+def test_sensor_rejects_invalid_fields(change, message):
     good = {"name": "x", "elevations": np.array([-0.1, 0.1]), "azimuth_step": np.pi / 180}
     Sensor(**good)
     with pytest.raises(InputError, match=message):
         Sensor(**{**good, **change})
 
 
-def test_offsets_of_whole_columns_do_not_move_beams():
+def test_azimuth_offsets_of_whole_columns_do_not_shift_beams():
     s = dataclasses.replace(sensor("os1-128"), azimuth_offsets=np.radians(1.40625) * np.tile([3, 1, -1, -3], 32))
     assert len(s.shift_groups) == 1 and not s.azimuth_shifts.any()
 
@@ -90,7 +91,7 @@ def test_shift_groups_hold_each_ring_once():
         assert turned == pytest.approx(np.round(turned), abs=1e-3)
 
 
-def test_window_holds_the_beams_between_the_bounds_and_no_others():
+def test_window_contains_exactly_beams_between_bounds():
     s = sensor("vlp-32c")
     azimuths = s.azimuth_start + np.arange(s.columns) * s.azimuth_step
     inside = (azimuths >= 0.1) & (azimuths <= 0.2)
@@ -101,16 +102,37 @@ def test_window_holds_the_beams_between_the_bounds_and_no_others():
     assert s.azimuths(w)[:, 0] == pytest.approx(azimuths[inside])
 
 
-def test_window_over_the_seam_and_all_round():
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_window_matches_loop_for_shifted_rings(seed):
+    s, rng = sensor("pandar64"), np.random.default_rng(seed)
+    left, width = rng.uniform(-3, 2), rng.uniform(0, 0.1)
+    low, high = np.sort(rng.choice(s.elevations, 2))
+    w = s.window(left, left + width, low, high)
+    assert s.elevations[w.row0] == low and s.elevations[w.row0 + w.rows - 1] == high
+    columns = s.azimuth_start + np.arange(s.columns) * s.azimuth_step
+    azimuths = columns[:, None] + s.azimuth_shifts
+    inside = np.flatnonzero(((azimuths >= left) & (azimuths <= left + width)).any(1))
+    assert set(inside) <= set(range(w.column0, w.column0 + w.columns)) and w.columns <= len(inside) + 2
+    np.testing.assert_allclose(s.azimuths(w), azimuths[w.column0 :][: w.columns, w.row0 : w.row0 + w.rows])
+
+
+def test_origins_of_lags_start_at_smallest_lag():
+    s = Sensor(name="x", elevations=[-0.1, 0.0, 0.1], azimuth_step=np.pi / 180, ring_lags=[0.25, 0.75, 0.25])
+    assert s.lag == 0.5
+    assert [(share, rings.tolist()) for _, share, _, rings in s.origins] == [(0, [0, 2]), (1, [1])]
+
+
+def test_window_across_seam_and_full_turn():
     s = sensor("dapt64")
     w = s.window(np.pi - 0.01, np.pi + 0.01, -1, 1)
     # -pi and +pi are one column
     assert w.columns == 9 and w.column0 + 4 == s.columns and (w.row0, w.rows) == (0, 64)
     assert s.window(-4, 4, -1, 1) == Window(column0=0, columns=2649, row0=0, rows=64)
-    assert s.window(0, 1e-6, 0, 1e-6).columns in (0, 1) and s.window(0, 1, 0.5, 0.6).rows == 0
+    assert s.window(0, 1e-6, 0, 1e-6).columns == 0 and s.window(0, 1, 0.5, 0.6).rows == 0
 
 
-# --- the user's tables, and the list of those that ship
+# --- sensor files of the user, list of presets
 
 ANGLES = [15.0, 5.0, -5.0, -15.0]
 
@@ -133,7 +155,7 @@ CSV = "\ufeffLaser id,Elevation,Azimuth\n1,15,1.0\n2,5,2.0\n3,-5,3.0\n4,-15,4.0\
         ("csv", "15\n5\n-5\n-15\n", 1800, None),
         ("csv", "# made by hand\nelevation (deg)\n15\n5\n-5\n-15\n", 1800, None),
         *[("csv", CSV.replace("\n", end), 1800, [-4.0, -3.0, -2.0, -1.0]) for end in ("\n", "\r\n", "\r")],
-        # Ouster's, of all ages
+        # metadata of Ouster sensors in old and new formats
         ("json", OUSTER, 1024, [4.2, 1.4, -1.4, -4.2]),
         ("json", OUSTER | {"lidar_mode": "2048x10"}, 2048, [4.2, 1.4, -1.4, -4.2]),
         ("json", OUSTER | {"lidar_mode": "MODE_4096x5"}, 4096, [4.2, 1.4, -1.4, -4.2]),
@@ -142,7 +164,7 @@ CSV = "\ufeffLaser id,Elevation,Azimuth\n1,15,1.0\n2,5,2.0\n3,-5,3.0\n4,-15,4.0\
         ("json", OUSTER | {"lidar_mode": "?", "b": {"columns_per_frame": 512}}, 512, [4.2, 1.4, -1.4, -4.2]),
     ],
 )
-def test_tables_are_read_in_any_order_of_lasers(tmp_path, suffix, content, columns, offsets):
+def test_load_sensor_reads_json_and_csv_files(tmp_path, suffix, content, columns, offsets):
     path = written(tmp_path / f"mine.{suffix}", content)
     table = load_sensor(path)
     np.testing.assert_allclose(np.degrees(table.elevations), sorted(ANGLES))
@@ -151,7 +173,7 @@ def test_tables_are_read_in_any_order_of_lasers(tmp_path, suffix, content, colum
         assert table.azimuth_offsets is None
     else:
         np.testing.assert_allclose(np.degrees(table.azimuth_offsets), offsets)
-    # the same through the name, as on the command line
+    # `sensor` reads the file too, as on the command line
     np.testing.assert_array_equal(sensor(str(path)).elevations, table.elevations)
 
 
@@ -160,12 +182,12 @@ def test_tables_are_read_in_any_order_of_lasers(tmp_path, suffix, content, colum
     [("azimuth_offset", 1), ("azimuth_offset_deg", 1), ("Azimuth offsets (deg)", 1), ("azimuth-offsets-deg", 1)]
     + [("azimuth", -1), ("azimuth_deg", -1), ("Horizontal", -1)],
 )
-def test_offsets_of_a_csv_by_any_of_their_names(tmp_path, named, sign):
+def test_load_sensor_accepts_csv_names_of_offsets(tmp_path, named, sign):
     table = load_sensor(written(tmp_path / "a.csv", f"laser,elevation_deg,{named}\n1,-1,5\n2,0,3\n3,1,2\n"))
     np.testing.assert_allclose(np.degrees(table.azimuth_offsets), np.multiply(sign, [5, 3, 2]))
 
 
-def test_the_own_form_sets_every_field(tmp_path):
+def test_load_sensor_json_sets_all_fields(tmp_path):
     given = {
         "name": "mine", "elevations_deg": ANGLES, "azimuth_offsets_deg": [0, 1, 2, 3], "columns": 720,
         "range_min": 1.0, "range_max": 50.0, "range_sigma": 0.03, "dropout": 0.1, "height": 2.5, "tilt_deg": 20.0,
@@ -219,21 +241,21 @@ def test_the_own_form_sets_every_field(tmp_path):
         ],
     ],
 )
-def test_wrong_tables_are_told_in_one_line(tmp_path, name, content, message):
+def test_load_sensor_rejects_invalid_files(tmp_path, name, content, message):
     path = written(tmp_path / name, content)
     with pytest.raises(InputError, match=message) as caught:
         load_sensor(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_a_missing_table_is_named(tmp_path):
+def test_missing_sensor_file_raises(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         sensor(str(tmp_path / "none.json"))
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.binary(min_size=1, max_size=200), st.sampled_from([".json", ".csv"]))
-def test_no_bytes_make_it_fail_otherwise(tmp_path_factory, content, suffix):
+def test_load_sensor_raises_only_input_error(tmp_path_factory, content, suffix):
     path = tmp_path_factory.mktemp("t") / f"x{suffix}"
     path.write_bytes(content)
     try:
@@ -244,18 +266,18 @@ def test_no_bytes_make_it_fail_otherwise(tmp_path_factory, content, suffix):
         assert np.isfinite(table.elevations).all()
 
 
-def test_the_list_names_all_sensors():
+def test_listing_names_all_sensors():
     lines = listing()
     assert len(lines) == 1 + len(SENSORS) >= 13 and {line.split()[0] for line in lines[1:]} == set(SENSORS)
     assert all(len(line) < 100 for line in lines)
 
 
-def test_a_table_that_has_changed_is_read_again(tmp_path, monkeypatch):
+def test_changed_sensor_file_is_read_again(tmp_path, monkeypatch):
     path = written(tmp_path / "mine.json", ANGLES)
     assert sensor(path).rows == 4 and sensor(path) is sensor(path)
     written(path, [*ANGLES, 25.0])
     assert sensor(path).rows == 5
-    # of the same name in another folder
+    # a file of the same name in another folder
     (tmp_path / "other").mkdir()
     written(tmp_path / "other" / "mine.json", ANGLES[:3])
     for folder, rows in ((tmp_path, 5), (tmp_path / "other", 3)):

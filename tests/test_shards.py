@@ -1,4 +1,4 @@
-"""Parquet shards: what goes in comes out, for us and for pandas, and damage is told."""
+"""Parquet shards: round trips, reading with pandas, and errors for damaged files."""
 
 import json
 import sys
@@ -45,7 +45,7 @@ def refused(read, match):
     assert "\n" not in str(caught.value)
 
 
-def test_samples_come_back_as_they_were(folder, people):
+def test_samples_survive_round_trip(folder, people):
     dataset = open_dataset(folder)
     samples, rows = list(dataset), list(dataset.rows())
     assert len(samples) == 4 and dataset.card.shards == 2
@@ -62,7 +62,7 @@ def test_samples_come_back_as_they_were(folder, people):
     refused(lambda: list(dataset.samples("test")), "has synthetic people, which have no split 'test'")
 
 
-def test_pandas_reads_them(folder, people):
+def test_pandas_reads_shards(folder, people):
     table = pd.concat([pd.read_parquet(path) for path in sorted(folder.glob("*.parquet"))])
     assert list(table.columns) == list(TABLES["people"])
     np.testing.assert_array_equal(table["points"].iloc[3].reshape(-1, 3), people[3].points)
@@ -71,7 +71,7 @@ def test_pandas_reads_them(folder, people):
     assert card["joints"] == list(BODY26.joints) and card["unit"] == "m" and card["schema"] == 1
 
 
-def test_whole_turns_come_back(tmp_path):
+def test_frames_survive_round_trip(tmp_path):
     rng = np.random.default_rng(1)
     row = {
         "index": 5, "frame": 2, "sensor": "av2", "points": rng.normal(size=30).astype(np.float32),
@@ -95,12 +95,12 @@ def test_whole_turns_come_back(tmp_path):
         refused(lambda: list(read_rows(path, "frames")), f"f.parquet: {problem}")
 
 
-def test_damaged_and_missing_shards_are_named(folder):
+def test_damaged_or_missing_shard_error_names_file(folder):
     path = folder / "people-00001.parquet"
     whole = path.read_bytes()
     assert shards.rows_of_shard(path) == 1
     flipped = bytearray(whole)
-    # among the points
+    # a bit within the points
     flipped[len(whole) // 3] ^= 4
     for broken in (b"", b"PAR1", whole[: len(whole) // 2], b"\0" * len(whole), flipped):
         path.write_bytes(broken)
@@ -124,14 +124,14 @@ def test_damaged_and_missing_shards_are_named(folder):
         ({"skeleton": "cat"}, "unknown skeleton"),
     ],
 )
-def test_a_wrong_card_is_told(folder, change, message):
+def test_open_dataset_rejects_invalid_card(folder, change, message):
     path = folder / "dataset.json"
     content = json.dumps(json.loads(path.read_text()) | change) if isinstance(change, dict) else change
     path.unlink() if content is None else path.write_text(content)
     refused(lambda: open_dataset(folder), message)
 
 
-def test_settings_that_differ_are_named(folder):
+def test_check_settings_names_differences(folder):
     card = read_card(folder)
     check_settings(folder, card, card)
     other = replace(card, count=9, settings=card.settings | {"seed": 3})
@@ -139,7 +139,7 @@ def test_settings_that_differ_are_named(folder):
     refused(lambda: check_settings(folder, card, other), problem)
 
 
-def test_rows_that_come_one_by_one_are_written_in_groups(tmp_path, people, monkeypatch):
+def test_write_shard_streams_rows_in_groups(tmp_path, people, monkeypatch):
     monkeypatch.setattr(shards, "_ROW_GROUP", {"people": 2, "frames": 2})
     path = tmp_path / "people-00000.parquet"
     written = []
@@ -150,7 +150,7 @@ def test_rows_that_come_one_by_one_are_written_in_groups(tmp_path, people, monke
             yield person_row(people[3], index=k)
 
     write_shard(path, "people", rows())
-    # what was given is on the disk long before the last row comes: memory does not grow with the shard
+    # rows are on the disk before the last one is produced: memory does not grow with the shard
     assert written[5] > written[3] > written[1] and list(tmp_path.iterdir()) == [path]
     with parquet.ParquetFile(path) as file:
         assert [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)] == [2, 2, 2, 1]
@@ -160,14 +160,14 @@ def test_rows_that_come_one_by_one_are_written_in_groups(tmp_path, people, monke
     assert (tmp_path / "again").read_bytes() == path.read_bytes()
 
 
-def test_an_error_between_rows_leaves_no_file(tmp_path, people):
+def test_shard_writer_leaves_no_file_after_error(tmp_path, people):
     with pytest.raises(KeyError), shards.shard_writer(tmp_path / "a.parquet", "people") as add:
         add(person_row(people[0], index=0))
         raise KeyError("no more")
     assert not list(tmp_path.iterdir())
 
 
-def test_every_fact_is_a_column_and_older_shards_may_lack_one(tmp_path, people):
+def test_person_info_fields_are_optional_columns(tmp_path, people):
     path = tmp_path / "a.parquet"
     write_shard(path, "people", [person_row(people[0], index=0, info=FACTS)])
     row = next(read_rows(path, "people"))
@@ -196,7 +196,7 @@ def with_column(path, column, values):
         ("part", [[None] * 30, [], [None]], "column part has nulls in its lists, expected uint8"),
     ],
 )
-def test_a_column_of_another_type_is_one_line(folder, column, values, message):
+def test_column_of_wrong_type_raises(folder, column, values, message):
     with_column(folder / "people-00000.parquet", column, values)
     refused(lambda: list(open_dataset(folder)), f"people-00000.parquet: {message}")
 
@@ -219,7 +219,7 @@ def test_a_column_of_another_type_is_one_line(folder, column, values, message):
         ("box_yaw", None, "columns box_center, box_size, box_yaw: some are null"),
     ],
 )
-def test_a_null_or_a_short_list_is_one_line(folder, column, value, message):
+def test_null_or_invalid_list_raises(folder, column, value, message):
     path = folder / "people-00000.parquet"
     table = parquet.read_table(path)
     with_column(path, column, pa.array([value, *table[column].to_pylist()[1:]], table[column].type))
@@ -229,7 +229,7 @@ def test_a_null_or_a_short_list_is_one_line(folder, column, value, message):
     )
 
 
-def test_damaged_columns_are_one_line_wherever_shards_are_read(folder, capsys, monkeypatch):
+def test_commands_report_damaged_column_in_one_line(folder, capsys, monkeypatch):
     monkeypatch.chdir(folder)
     with_column(folder / "people-00000.parquet", "points", [None] * 3)
     for words in (["view", "."], ["view", ".", "--html"], ["pretrain", "--shards", "."]):
@@ -239,15 +239,15 @@ def test_damaged_columns_are_one_line_wherever_shards_are_read(folder, capsys, m
         assert captured.err.count("\n") == 1
 
 
-def test_a_count_of_a_billion_is_no_reason_to_look_for_them(folder):
+def test_written_does_not_enumerate_missing_shards(folder):
     card = read_card(folder)
     write_card(folder, replace(card, count=10**9, per_shard=1))
     (folder / "people-99999999999999999999.parquet").write_bytes(b"")
-    # would never end
+    # looking for all shards would not finish
     assert open_dataset(folder).written() == [0, 1]
 
 
-def test_without_pyarrow_the_extra_is_named(folder, monkeypatch):
+def test_missing_pyarrow_error_names_extra(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingExtra, match="^reading and writing Parquet needs an optional dependency: .*synth"):
         open_dataset(folder)

@@ -1,4 +1,4 @@
-"""`lidarpose view`: people of a dataset on a sheet and on a page, streets from above; scans from above in general."""
+"""`lidarpose view`: contact sheets and pages of datasets, streets from above; drawings of scans from above."""
 
 import io
 import json
@@ -49,22 +49,22 @@ def dataset(written, tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_a_sheet_and_a_page_in_the_current_folder(dataset, capsys):
-    for _ in range(2):  # a sheet that is there is replaced
+def test_view_writes_sheet_and_page(dataset, capsys):
+    for _ in range(2):  # an existing sheet is replaced
         assert main(["view", "streetlife", "-n", "6"]) == 0
         assert capsys.readouterr().out.strip() == "streetlife.png"
     assert (dataset / "streetlife.png").read_bytes().startswith(PNG)
     assert main(["view", "streetlife", "-n", "40", "--html", "--out", "x/page.html"]) == 0
     page = (dataset / "x" / "page.html").read_text()
     assert "streetlife: 20 people, scene wild" in page
-    # the table and the cards tell the same distance
+    # the table and the cards show the same distances
     number = r"<td class=\"number\">"
     table = re.findall(rf"<tr><td>#\d+ os1-64</td>{number}\d+</td><td>\w+</td>{number}([\d.]+)</td>", page)
     cards = re.findall(r"points · ([\d.]+) m<", page)
     assert len(cards) == 20 and cards == table
 
 
-def test_people_are_spread_over_the_dataset(dataset):
+def test_spread_selects_people_of_whole_dataset(dataset):
     people = open_dataset("streetlife")
     index = [row["index"] for (row,) in _spread(people, "people", 6)]
     assert len(index) == 6 == len(set(index)) and {k // 8 for k in index} == {0, 1, 2}
@@ -75,20 +75,20 @@ def test_people_are_spread_over_the_dataset(dataset):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["none"], "is not a dataset: dataset.json is missing"),
+        (["none"], "is not a dataset: there is no such folder"),
         (["streetlife", "-n", "0"], "expected 1 to"),
         (["streetlife", "--out", "streetlife/dataset.json/x.png"], "is a file"),
         (["streetlife", "--out", "sheet.jpg"], "sheet.jpg: is written as PNG: give a name that ends in .png"),
         (["streetlife", "--html", "--out", "page.png"], "page.png: is written as HTML: give a name that ends in .html"),
     ],
 )
-def test_what_cannot_be_drawn_is_told_in_one_line(dataset, capsys, arguments, message):
+def test_view_rejects_invalid_arguments(dataset, capsys, arguments, message):
     assert main(["view", *arguments]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
 
 
-def test_an_unfinished_dataset_is_drawn_as_far_as_it_is(dataset, capsys):
+def test_view_draws_unfinished_dataset(dataset, capsys):
     (dataset / "streetlife" / "people-00000.parquet").unlink()
     assert main(["view", "streetlife", "-n", "40", "--html"]) == 0
     page = (dataset / "streetlife.html").read_text()
@@ -100,13 +100,13 @@ def test_an_unfinished_dataset_is_drawn_as_far_as_it_is(dataset, capsys):
     assert "holds no shard yet" in capsys.readouterr().err
 
 
-def test_one_person_is_not_people(tmp_path):
+def test_page_title_is_singular_for_one_person(tmp_path):
     write_dataset(SynthesisJob(what="people", count=1, sensors=("os1-64",)), tmp_path / "alone")
     page = draw_dataset(tmp_path / "alone", html=True, out=tmp_path / "page.html").read_text()
     assert "alone: 1 person, scene wild" in page
 
 
-def test_labeled_people_are_drawn_on_a_sheet_and_on_a_page(tmp_path, monkeypatch):
+def test_view_draws_prepared_dataset(tmp_path, monkeypatch):
     smpl = files.write_smpl(tmp_path / "SMPL_NEUTRAL.npz")
     files.write_sloper4d(tmp_path / "raw", smpl)
     prepare("sloper4d", tmp_path / "raw", tmp_path / "walks", smpl=smpl)
@@ -120,14 +120,14 @@ def test_labeled_people_are_drawn_on_a_sheet_and_on_a_page(tmp_path, monkeypatch
         draw_dataset("walks")
 
 
-def test_a_sheet_never_replaces_the_dataset(dataset):
+def test_draw_dataset_does_not_overwrite_dataset(dataset):
     folder = dataset / "streetlife"
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     for name in before:
         with pytest.raises(InputError, match="is also an input file"):
             draw_dataset(folder, out=folder / name)
     assert before == {path.name: path.read_bytes() for path in folder.iterdir()}
-    # a sheet beside them, and again
+    # another file in the folder is written, and replaced the second time
     for _ in range(2):
         draw_dataset(folder, count=1, out=folder / "people.png")
 
@@ -154,10 +154,10 @@ def pixels(png):
     return imread(io.BytesIO(png))[..., :3]
 
 
-def test_a_scan_is_drawn_with_its_people(tmp_path):
+def test_draw_scans_shows_boxes_poses_and_tracks(tmp_path):
     png = draw_scans([panel()], tmp_path / "scan.png", title="one")
     assert (tmp_path / "scan.png").read_bytes() == png
-    # what a box, a skeleton and a track add is red, blue and orange
+    # boxes are red, skeletons blue, tracks orange
     bare = pixels(draw_scans([panel(boxes=(), poses=None, tracks=())], title="one"))
     added = pixels(png)
     assert bare.shape == added.shape
@@ -169,7 +169,7 @@ def test_a_scan_is_drawn_with_its_people(tmp_path):
 
 
 @pytest.mark.long
-def test_nothing_and_too_much_are_drawn_too():
+def test_draw_scans_accepts_no_and_too_many_panels():
     empty = ScanPanel(points=np.zeros((0, 3)), sensor=None)
     broken = ScanPanel(points=np.full((9, 3), np.nan), label="$x")
     one, many = (pixels(draw_scans(panels)).shape for panels in ([], [empty, broken] * MAX_SCANS))
@@ -177,7 +177,7 @@ def test_nothing_and_too_much_are_drawn_too():
 
 
 @pytest.mark.parametrize("size", [(7, 7), (11, 7)])
-def test_everybody_is_inside_the_window_and_the_sensor_too(size):
+def test_window_contains_people_and_sensor(size):
     size = np.array(size, float)
     center, scale = _window(panel(), POINTS, size)
     for place in ((12, -7), (0, 0)):
@@ -187,7 +187,7 @@ def test_everybody_is_inside_the_window_and_the_sensor_too(size):
 
 
 @pytest.mark.long
-def test_a_scan_is_as_wide_as_the_cards_below_it():
+def test_scan_is_as_wide_as_cards_below():
     for count in (0, 1, 4, 5):
         cards = [Panel(points=POINTS[:9]) for _ in range(count)]
         image = pixels(draw_scan_and_people(panel(), cards))
@@ -196,7 +196,7 @@ def test_a_scan_is_as_wide_as_the_cards_below_it():
 
 
 @pytest.mark.long
-def test_view_of_streets_shows_them_from_above(tmp_path, monkeypatch):
+def test_view_draws_streets_from_above(tmp_path, monkeypatch):
     monkeypatch.setattr(shard_job, "STREET_FRAMES", 2)
     monkeypatch.setattr(shard_job, "PER_SHARD", {"streets": 2})
     write_dataset(SynthesisJob(what="streets", count=3, seed=4, sensors=("vlp-16",)), tmp_path / "s")
@@ -212,7 +212,7 @@ def test_view_of_streets_shows_them_from_above(tmp_path, monkeypatch):
         assert [box.id for box in shown.boxes] == [box.id for box in frames[0].boxes]
         ways = np.array([[box.center[:2] for box in frame.boxes] for frame in frames])
         np.testing.assert_allclose(np.stack(shown.tracks, 1), ways, atol=1e-5)
-    # a page shows them too, with the true poses, and then their people
+    # the page shows the scans with the true poses first, and then the people
     page = draw_dataset(tmp_path / "s", html=True, out=tmp_path / "s.html").read_text()
     data = json.loads(re.search(r'id="data">(.*?)</script>', page)[1])
     assert [len(scan["poses"]) for scan in data["scans"]] == [len(shown.poses.joints) for shown in panels]
@@ -225,14 +225,14 @@ def test_view_of_streets_shows_them_from_above(tmp_path, monkeypatch):
         draw_dataset(tmp_path / "s", out=tmp_path / "s.png")
 
 
-def test_numbers_of_people_who_stand_together_do_not_cover_each_other():
+def test_label_offsets_avoid_overlap():
     rng = np.random.default_rng(0)
     centers = np.concatenate([[[0.0, 0.0], [900.0, 0.0]], 300 + rng.uniform(-25, 25, (6, 2))])
     tips = centers[1:2] + 20.0
     offsets = label_offsets(centers, np.zeros((0, 2)))
-    # nor the arrow that shows the facing
+    # labels avoid the tip of the heading arrow, too
     assert np.linalg.norm(centers[1] + label_offsets(centers, tips)[1] - tips[0]) > 15
-    # who is alone has it to the upper right, near
+    # the label of an isolated person is close, to the upper right
     assert (offsets[:2] > 0).all() and (np.linalg.norm(offsets[:2], axis=1) < 16).all()
     places = centers + offsets
     apart = np.linalg.norm(places[:, None] - places, axis=-1) + 99 * np.eye(len(places))

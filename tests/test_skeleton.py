@@ -6,7 +6,7 @@ import pytest
 from lidarpose.errors import InputError
 from lidarpose.skeleton import BODY26, HUMAN15, SKELETONS, SMPL24, WAYMO14, Skeleton, skeleton
 
-# written out here a second time on purpose: a changed order would silently exchange joints in every file
+# repeated here on purpose: a changed order would silently exchange joints in every file
 SMPL = (
     "pelvis left_hip right_hip spine1 left_knee right_knee spine2 left_ankle right_ankle spine3 left_foot right_foot "
     "neck left_collar right_collar head left_shoulder right_shoulder left_elbow right_elbow left_wrist right_wrist "
@@ -26,7 +26,7 @@ WAYMO = (
 named = pytest.mark.parametrize("tree", SKELETONS.values(), ids=lambda s: s.name)
 
 
-def test_the_published_orders():
+def test_skeletons_match_published_joint_orders():
     assert list(SMPL24.joints) == SMPL and SMPL24.parents == SMPL_PARENTS
     assert list(BODY26.joints) == [*SMPL, "nose", "head_center"]
     assert BODY26.parents == (*SMPL_PARENTS, 15, 15)
@@ -37,30 +37,30 @@ def test_the_published_orders():
 
 
 @named
-def test_the_tree_is_one_tree_whose_mirror_is_itself(tree):
+def test_skeleton_is_a_mirror_symmetric_tree(tree):
     assert [tree.flip[tree.flip[j]] for j in range(len(tree))] == list(range(len(tree)))
     for j, name in enumerate(tree.joints):
         swap = {"left": "right", "right": "left"}
         assert tree.joints[tree.flip[j]] == "_".join(swap.get(word, word) for word in name.split("_"))
     assert tree.parents[0] == -1
     assert all(0 <= p < j for j, p in enumerate(tree.parents) if j)
-    # waymo14's trunk is drawn from side to side, and its tree hangs both sides on the nose
+    # waymo14 has bones across the trunk, and joints of both sides have the nose as parent
     order = sorted if tree is WAYMO14 else tuple
     mirrored = {tuple(order((tree.flip[a], tree.flip[b]))) for a, b in tree.bones}
     assert mirrored == {tuple(order(bone)) for bone in tree.bones}
     assert len(tree.bones) == len(tree) - 1 + len(tree.extra_bones)
     for a, b in tree.bones:
-        # bones cross from side to side nowhere but at the trunk
+        # only extra bones connect left and right joints
         sides = {tree.joints[j].split("_")[0] for j in (a, b)}
         assert not {"left", "right"} <= sides or (a, b) in tree.extra_bones
 
 
 @named
-def test_body26_speaks_every_skeleton_by_name(tree):
+def test_body26_maps_to_every_skeleton(tree):
     assert [BODY26.joints[j] for j in BODY26.map_to(tree)] == list(tree.joints)
 
 
-def test_a_map_goes_both_ways_and_names_the_joints_that_lack():
+def test_map_to_matches_names_and_reports_missing_joints():
     a = Skeleton(name="a", joints=("root", "left_x", "right_x"), parents=(-1, 0, 0))
     b = Skeleton(name="b", joints=("right_x", "root", "left_x"), parents=(-1, 0, 1))
     assert a.map_to(b).tolist() == [2, 0, 1] and b.map_to(a).tolist() == [1, 2, 0]
@@ -87,12 +87,12 @@ def test_a_map_goes_both_ways_and_names_the_joints_that_lack():
         ((1, 2), (-1, 0), (), "joint names must be text"),
     ],
 )
-def test_what_is_no_tree_is_refused(joints, parents, extra, message):
+def test_skeleton_rejects_invalid_trees(joints, parents, extra, message):
     with pytest.raises(InputError, match=message):
         Skeleton(name="bad", joints=joints, parents=parents, extra_bones=extra)
 
 
-def test_unknown_names_offer_the_nearest():
+def test_unknown_joint_and_skeleton_suggest_nearest_name():
     with pytest.raises(InputError, match="did you mean left_knee"):
         SMPL24.index("left_kne")
     with pytest.raises(InputError, match="did you mean smpl24"):
@@ -100,19 +100,19 @@ def test_unknown_names_offer_the_nearest():
     assert skeleton("waymo14") is WAYMO14
 
 
-def test_a_tree_of_lists_is_one_of_tuples():
+def test_skeleton_accepts_lists():
     made = Skeleton(name="v", joints=["a", "b", "c"], parents=[-1, 0, 0], extra_bones=[[1, 2]])
     assert made == Skeleton(name="v", joints=("a", "b", "c"), parents=(-1, 0, 0), extra_bones=((1, 2),))
     assert len(made.bones) == 3 and hash(made)
 
 
 @pytest.mark.parametrize("name", [["smpl24"], None, 24, np.zeros(2), {"smpl24"}])
-def test_what_is_no_name_is_an_unknown_one(name):
+def test_skeleton_lookup_rejects_non_string_names(name):
     with pytest.raises(InputError, match="unknown skeleton .*known are smpl24"):
         skeleton(name)
 
 
-def test_a_side_without_its_other_side_has_no_flip():
+def test_flip_rejects_joint_without_counterpart():
     lame = Skeleton(name="lame", joints=("root", "left_leg"), parents=(-1, 0))
     with pytest.raises(InputError, match="right_leg"):
         _ = lame.flip

@@ -1,4 +1,4 @@
-"""Poses steady over a track: the smoother, the live filter, and clips of one person."""
+"""Smoothing of poses over time: the smoother, the live filter, and clips of one person."""
 
 import json
 from dataclasses import replace
@@ -14,8 +14,14 @@ from lidarpose.skeleton import SKELETONS, SMPL24
 from lidarpose.tracking.bones import rigid_bones
 from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.live import LiveFilter, filter_track
-from lidarpose.tracking.motion_model import smooth_joints
-from lidarpose.tracking.smoothing import smooth
+from lidarpose.tracking.motion_model import (
+    SCALES,
+    KalmanState,
+    learn_process_noise,
+    pooled,
+    smooth_joints,
+)
+from lidarpose.tracking.smoothing import likely_hit, smooth, with_facing_corrected
 
 
 def rest_pose(skeleton):
@@ -30,7 +36,7 @@ def rest_pose(skeleton):
 
 @pytest.fixture(scope="module")
 def walker():
-    """(skeleton, seed) -> true joints of somebody who walks in a curve, and a track of noisy poses of them."""
+    """Function that returns true joints of a person who walks along a curve, and a track of noisy poses."""
 
     def made(skeleton=SMPL24, frames=40, noise=0.05, seed=0):
         rng = np.random.default_rng(seed)
@@ -50,7 +56,7 @@ def walker():
 
 @pytest.fixture(scope="module")
 def people_in_motion():
-    """True joints and noisy tracks of 40 synthesized clips, half of whose error all frames of a clip have in common."""
+    """True joints and noisy tracks of 40 synthesized clips; half of the error is the same in all frames of a clip."""
     from lidarpose.synth.generator import Generator
 
     generator, rng, clips = Generator(scene="wild", measure=False), np.random.default_rng(3), []
@@ -64,8 +70,8 @@ def people_in_motion():
     return clips
 
 
-def test_paths_are_those_of_one_dense_solve(walker):
-    """The filter forth and back finds the least squares' solution, whatever the steps."""
+def test_smooth_joints_matches_dense_solve(walker):
+    """Forward-backward filtering gives the least-squares solution for any time steps."""
     from reference.smoothing_reference import smooth_joints_reference
 
     rng = np.random.default_rng(1)
@@ -88,7 +94,7 @@ def error(joints, true):
 
 
 @pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=SKELETONS)
-def test_steady_is_nearer_and_smoother(walker, skeleton):
+def test_smoothing_reduces_error_and_jitter(walker, skeleton):
     true, track = walker(skeleton)
     before, steady = error(track.joints, true), error(smooth(track).joints, true)
     assert steady[0] < 0.7 * before[0] and steady[1] < 0.15 * before[1]
@@ -97,8 +103,8 @@ def test_steady_is_nearer_and_smoother(walker, skeleton):
 
 
 @pytest.mark.parametrize("speed", [10.0, -25.0])
-def test_a_sensor_that_moves(walker, speed):
-    """In coordinates that drive along and brake, steady poses are still where the person is."""
+def test_smoothing_works_for_moving_sensor(walker, speed):
+    """In the coordinates of a sensor that drives and brakes, smoothed poses are still at the person."""
     true, track = walker()
     way = np.outer(speed * track.times - 0.5 * np.sign(speed) * 2.5 * track.times**2, [1, 0, 0])[:, None]
     moved = replace(track, joints=track.joints + way)
@@ -110,7 +116,7 @@ def test_a_sensor_that_moves(walker, speed):
 
 
 @pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=SKELETONS)
-def test_frames_turned_round_are_turned_back(walker, skeleton):
+def test_smoothing_corrects_left_right_swaps(walker, skeleton):
     true, track = walker(skeleton)
     joints, spread, confidence = track.joints.copy(), track.spread.copy(), track.confidence.copy()
     turned = [3, 4, 5, 12, 20, 21, 22, 23, 24, 39]
@@ -122,7 +128,7 @@ def test_frames_turned_round_are_turned_back(walker, skeleton):
 
 
 @pytest.mark.parametrize("gap", [1.0, 3600.0])
-def test_people_may_turn_about_in_a_gap(gap):
+def test_smoothing_allows_turn_within_gap(gap):
     rng, standing = np.random.default_rng(0), rest_pose(SMPL24)
     facing = np.array([1.0] * 8 + [-1.0] * 4)
     times = np.concatenate([np.arange(8) / 10, 0.7 + gap + np.arange(4) / 10])
@@ -132,7 +138,7 @@ def test_people_may_turn_about_in_a_gap(gap):
     assert np.linalg.norm(smooth(track).joints - true, axis=-1).mean() < 0.03
 
 
-def test_somebody_who_hops_is_not_held_still():
+def test_smoothing_follows_hopping_person():
     rng, times = np.random.default_rng(0), np.arange(60) / 10
     true = rest_pose(SMPL24) + np.stack([0 * times, 0 * times, 0.1 * np.sin(2 * np.pi * 1.5 * times)], 1)[:, None]
     joints = true + rng.normal(0, 0.03 / 1.6, true.shape)
@@ -142,7 +148,7 @@ def test_somebody_who_hops_is_not_held_still():
 
 
 @pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=SKELETONS)
-def test_bones_keep_their_length(walker, skeleton):
+def test_smoothing_keeps_bone_lengths(walker, skeleton):
     true, track = walker(skeleton)
     bones = rigid_bones(skeleton)
     names = {tuple(skeleton.joints[end] for end in bone) for bone in bones}
@@ -152,17 +158,17 @@ def test_bones_keep_their_length(walker, skeleton):
     assert np.abs(lengths - lengths.mean(0)).max() < 0.005 and np.abs(lengths - exact).mean() < 0.02
 
 
-def test_unseen_frames_are_filled_and_say_so(walker):
+def test_smoothing_fills_and_marks_unseen_frames(walker):
     true, track = walker(frames=60)
     joints = track.joints.copy()
-    # 0.8 s, 2.9 s, and the end
+    # gaps of 0.8 s, 2.9 s, and at the end
     for gap in (slice(5, 13), slice(20, 49), slice(54, 60)):
         joints[gap] = np.nan
     given = TrackPoses(
         times=track.times, joints=joints, spread=track.spread, visible=track.visible, skeleton=track.skeleton
     )
     steady = smooth(given)
-    # the long gap only half a second from its ends
+    # the long gap is filled only within half a second of its ends
     far = [25 <= i < 44 or i == 59 for i in range(60)]
     assert [pose is None for pose in steady.poses()] == far
     assert steady.filled.tolist() == [bool(np.isnan(joints[i]).any()) and not far[i] for i in range(60)]
@@ -172,12 +178,116 @@ def test_unseen_frames_are_filled_and_say_so(walker):
     live = filter_track(given)
     assert live[12] is not None and live[20] is not None and live[48] is None and live[49] is not None
     assert live[10].spread.mean() > 2 * live[4].spread.mean()
+    assert (live[10].visible == 0).all()
+    np.testing.assert_allclose(live[10].confidence, likely_hit(live[10].spread))
+    # confidence of filled frames follows from their spread; that of other frames is unchanged
+    steady = smooth(replace(given, confidence=track.confidence))
+    np.testing.assert_allclose(steady.confidence[5:13], likely_hit(steady.spread[5:13]))
+    assert (steady.confidence[:5] == 0.8).all()
+
+
+@pytest.mark.parametrize(("gap", "is_filled"), [(19, True), (20, False)])
+def test_smooth_fills_gaps_up_to_max_gap(walker, gap, is_filled):
+    _, track = walker(frames=60)
+    joints = track.joints.copy()
+    joints[20 : 20 + gap] = np.nan
+    # frame 29 is 0.9 s or more from both ends of the gap
+    assert smooth(replace(track, joints=joints)).filled[29] == is_filled
+
+
+def test_likely_hit_matches_sampled_distances():
+    rng = np.random.default_rng(0)
+    for spread in (0.05, 0.12):
+        distance = np.linalg.norm(rng.normal(size=(200_000, 2)), axis=1)
+        share = (distance * spread / distance.mean() < 0.1).mean()
+        assert likely_hit(np.array(spread)) == pytest.approx(share, abs=0.005)
+
+
+def test_smoothing_is_robust_to_outlier_frame(walker):
+    true, track = walker()
+    joints = track.joints.copy()
+    joints[20] += [1.0, 0, 0]
+    off = replace(track, joints=joints)
+    assert error(smooth(off).joints, true)[0] < 1.1 * error(smooth(track).joints, true)[0]
+    live = np.stack([pose.joints for pose in filter_track(off)])
+    assert np.linalg.norm(live[20] - true[20], axis=-1).mean() < 0.2
+
+
+def test_smoothed_spread_keeps_common_error():
+    times = np.arange(100) / 10
+    joints = np.broadcast_to(rest_pose(SMPL24), (100, 24, 3))
+    steady = smooth(TrackPoses(times=times, joints=joints, skeleton=SMPL24, spread=np.full((100, 24), 0.05)))
+    assert 0.8 * 0.05 < steady.spread[50].min() and steady.spread[50].max() < 0.05
+
+
+def test_smoothing_limits_tiny_spread():
+    rng, times = np.random.default_rng(0), np.arange(10) / 10
+    joints = rest_pose(SMPL24) + rng.normal(0, 0.01, (10, 24, 3))
+    for spread in (0.0, 1e-9):
+        track = TrackPoses(times=times, joints=joints, skeleton=SMPL24, spread=np.full((10, 24), spread))
+        steady = smooth(track)
+        assert np.linalg.norm(steady.joints - joints, axis=-1).max() < 0.1 and (steady.spread > 1e-3).all()
+        assert all(np.isfinite(pose.joints).all() for pose in filter_track(track))
+
+
+def test_live_filter_keeps_bone_lengths(walker):
+    _, track = walker(frames=60)
+    bones = rigid_bones(track.skeleton)
+    before, live = track.joints[30:], np.stack([pose.joints for pose in filter_track(track)[30:]])
+    before, live = (
+        np.linalg.norm(j[:, bones[:, 0]] - j[:, bones[:, 1]], axis=-1).std(0).mean() for j in (before, live)
+    )
+    assert live < 0.15 * before
+
+
+def test_learn_process_noise_matches_enumeration():
+    """The enumeration sums over all sequences of scales."""
+    rng = np.random.default_rng(0)
+    times, usual = np.array([0.0, 0.2, 3.0, 3.4]), np.array([0.04, 0.4])
+    joints = np.cumsum(rng.normal(0, 0.3, (4, 2, 3)), 0)
+    precision = rng.uniform(200, 800, (4, 2))
+    state, steps, likelihood = KalmanState.unknown((len(SCALES), 2)), np.diff(times, prepend=0.0), np.empty((4, 9, 2))
+    for row, step in enumerate(steps):
+        state, likelihood[row] = state.predicted(step, SCALES[:, None] * usual).updated(joints[row], precision[row])
+    likelihood = np.exp(pooled(likelihood) - pooled(likelihood).max(1, keepdims=True))
+    expected = np.empty((4, 2))
+    for j in range(2):
+        course = likelihood[0, :, j] / 9
+        for row in range(1, 4):
+            stay = np.exp(-steps[row] / 20)
+            change = stay * np.eye(9) + (1 - stay) / 9
+            course = course[..., None] * change * likelihood[row, :, j]
+        for row in range(4):
+            share = course.sum(tuple(k for k in range(4) if k != row))
+            expected[row, j] = np.log(SCALES) @ share / share.sum()
+    np.testing.assert_allclose(learn_process_noise(times, joints, precision, usual), usual * np.exp(expected))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_facing_correction_follows_walking_direction(walker, sign):
+    true, track = walker()
+    flip = list(track.skeleton.flip)
+    # the same walk forward or backward in time
+    track = replace(track, joints=track.joints[::sign].copy(), confidence=np.zeros(track.spread.shape))
+    joints = with_facing_corrected(track).joints
+    np.testing.assert_array_equal(joints, track.joints if sign > 0 else track.joints[:, flip])
+
+
+def test_facing_correction_follows_confident_frames():
+    joints = np.broadcast_to(rest_pose(SMPL24), (10, 24, 3)).copy()
+    confidence = np.full((10, 24), 0.1)
+    confidence[:3] = 0.9
+    joints[:3] = joints[:3, list(SMPL24.flip)]
+    track = TrackPoses(
+        times=np.arange(10) / 10, joints=joints, skeleton=SMPL24, spread=np.full((10, 24), 0.05), confidence=confidence
+    )
+    np.testing.assert_array_equal(with_facing_corrected(track).joints, np.broadcast_to(joints[0], joints.shape))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("gap", [4, 8, 12])
-def test_filled_joints_are_as_far_off_as_their_spread_says(people_in_motion, gap):
-    """By the number of frames to the nearest one that was seen; a hand that moves fast must not be said to be near."""
+def test_spread_of_filled_joints_matches_error(people_in_motion, gap):
+    """Grouped by the number of frames to the nearest seen frame. Spread must be large enough for fast hands, too."""
     first = (16 - gap) // 2
     spread, error = ([[] for _ in range(gap // 2)] for _ in range(2))
     for true, track in people_in_motion:
@@ -191,11 +301,11 @@ def test_filled_joints_are_as_far_off_as_their_spread_says(people_in_motion, gap
             error[min(k, gap - 1 - k)].append(off[first + k])
     for stated, actual in zip(spread, error, strict=True):
         assert 0.95 < np.mean(stated) / np.mean(actual) < 1.4
-        # not on the mean alone
+        # also for single joints, not only on average
         assert 0.5 < (np.array(actual) < np.array(stated)).mean() < 0.9
 
 
-def test_the_past_alone_and_a_state_that_goes_on(walker):
+def test_live_filter_resumes_from_state(walker):
     _, track = walker()
     whole, poses = filter_track(track), track.poses()
     begun = LiveFilter(track.skeleton)
@@ -206,19 +316,19 @@ def test_the_past_alone_and_a_state_that_goes_on(walker):
         np.testing.assert_array_equal(again.update(track.times[t], poses[t]).joints, whole[t].joints)
 
 
-def test_tracks_without_or_with_one_frame(walker):
+def test_smoothing_of_one_and_of_no_pose(walker):
     _, track = walker(frames=1)
     assert np.abs(smooth(track).joints - track.joints).max() < 1e-3
     nobody = TrackPoses.of_poses(np.arange(3.0), [None] * 3, SMPL24)
     assert smooth(nobody).poses() == filter_track(nobody) == [None] * 3
 
 
-def test_times_must_increase():
+def test_track_poses_rejects_times_that_do_not_increase():
     with pytest.raises(InputError, match="later than the one before"):
         TrackPoses.of_poses(np.array([0.0, 0.0]), [None, None], SMPL24)
 
 
-# ---- of clouds
+# ---- clips of clouds
 
 
 @pytest.fixture(scope="module")
@@ -229,7 +339,7 @@ def clouds():
     return [person.sample.points for person in people]
 
 
-def test_a_clip_of_clouds(clouds):
+def test_predict_clip_smooths_poses_of_clouds(clouds):
     model = load("tiny", tta=1)
     given = [*clouds[:4], np.zeros((0, 3)), *clouds[5:]]
     steady = model.predict_clip(given, sensor_origin=(0, 0, 0), skeleton="human15")
@@ -240,7 +350,7 @@ def test_a_clip_of_clouds(clouds):
     assert not np.allclose(steady[3].joints, each[3].joints)
     first = model.predict_clip(given[:3], sensor_origin=(0, 0, 0), live=True)
     same = model.predict_clip(given, sensor_origin=(0, 0, 0), live=True)
-    # looked at as a whole the track is smoothed, live it is filtered, by the times that are given
+    # the track is smoothed, or filtered if live, with the given times
     own = [person.pose for person in each]
     for seconds in (None, np.cumsum([0.0, 0.1, 0.4, 0.1, 0.1, 0.3, 0.1, 0.1])):
         times = np.arange(8) / 10 if seconds is None else seconds
@@ -250,13 +360,13 @@ def test_a_clip_of_clouds(clouds):
             np.testing.assert_allclose(clip.to_numpy(), [pose.joints for pose in wanted], atol=1e-5)
     with pytest.raises(InputError, match="times: expected 8 finite numbers"):
         model.predict_clip(given, np.zeros(8), sensor_origin=(0, 0, 0))
-    # what comes later changes nothing but the rounding of a batch of another size
+    # later clouds change only the rounding, because of another batch size
     np.testing.assert_allclose(first.to_numpy(), same.to_numpy()[:3], rtol=0, atol=1e-6)
     assert len(model.predict_clip([])) == 0
 
 
 @pytest.mark.parametrize("live", [False, True])
-def test_a_clip_says_of_each_frame_whether_a_person_is_there(clouds, live):
+def test_predict_clip_keeps_person_probabilities(clouds, live):
     model = load("small")
     given = [*clouds[:3], np.zeros((0, 3)), *clouds[4:6]]
     each = model.predict(given, sensor_origin=(0, 0, 0))
@@ -266,7 +376,7 @@ def test_a_clip_says_of_each_frame_whether_a_person_is_there(clouds, live):
         assert (person.person is None) == (k == 3) and person.has_pose
 
 
-def test_times_that_are_none():
+def test_clip_times_defaults_and_rejects_invalid_times():
     assert clip_times(None, 3).tolist() == [0, 0.1, 0.2] and clip_times((0, 0.5, 7), 3).tolist() == [0, 0.5, 7]
     dates = [np.arange(3).astype(kind) for kind in ("M8[ms]", "m8[s]")]
     dates.append(pandas.Series(pandas.date_range("2024", periods=3, tz="UTC")))
@@ -275,7 +385,7 @@ def test_times_that_are_none():
             clip_times(times, 3)
 
 
-def test_a_gap_of_days_parts_what_is_made_steady(walker):
+def test_smoothing_splits_track_at_long_gap(walker):
     _, track = walker(frames=24)
     later = replace(track, times=track.times + np.where(np.arange(24) < 12, 0, 86_400.0))
     halves = [
@@ -283,7 +393,7 @@ def test_a_gap_of_days_parts_what_is_made_steady(walker):
         for rows in (slice(12), slice(12, 24))
     ]
     apart = np.concatenate([half.joints for half in halves])
-    # bones are measured in all frames
+    # bone lengths are estimated from all frames
     assert np.abs(smooth(later).joints - apart).max() < 0.06
     minute = replace(track, times=track.times + np.where(np.arange(24) < 12, 0, 60.0))
     np.testing.assert_allclose(smooth(later).joints, smooth(minute).joints, atol=1e-3)

@@ -1,4 +1,4 @@
-"""SMPL files: the published equations on a synthetic model file, frames, part labels, and what is refused."""
+"""SMPL models: the published equations on a synthetic model, coordinate frames, part labels, and invalid files."""
 
 import json
 import pickle
@@ -20,7 +20,7 @@ from lidarpose.synth.shard_job import SynthesisJob
 J = BODY26.index
 R_LEVEL_SMPL = UP_AXES["y"]
 HEAD, LEFT_WRIST, RIGHT_WRIST = (J(name) for name in ("head", "left_wrist", "right_wrist"))
-# the joints beyond SMPL's 22: of SMPL-H 15 a hand, of SMPL-X jaw and eyes before them
+# parents of the joints after SMPL's first 22: 15 per hand in SMPL-H; in SMPL-X jaw and eyes come before them
 _HANDS = [LEFT_WRIST, 22, 23, LEFT_WRIST, 25, 26, LEFT_WRIST, 28, 29, LEFT_WRIST, 31, 32, LEFT_WRIST, 34, 35]
 
 
@@ -34,7 +34,7 @@ def tree(joints: int) -> list[int]:
 
 
 def synthetic(joints: int = 24, shapes: int = 10, seed: int = 0) -> dict:
-    """A model in SMPL's layout and frame: the shipped body's mesh, everything else drawn at random."""
+    """A model in SMPL's layout and frame: mesh and weights of the shipped body, random shapes."""
     rng, rig = np.random.default_rng(seed), load_rig()
     template = rig.template.astype(float) @ R_LEVEL_SMPL + [0, 0.1, 0]
     count = len(template)
@@ -48,7 +48,7 @@ def synthetic(joints: int = 24, shapes: int = 10, seed: int = 0) -> dict:
             weights[:, face] += 0.02 * weights[:, HEAD]
         weights[:, HEAD] *= 0.94
     weights /= weights.sum(1, keepdims=True)
-    # joints: means of the vertices they move, so within the body
+    # joints are means of the vertices that they move, so they lie within the body
     regressor = np.where(weights > 0.2, weights, 0) + 1e-6 * weights
     regressor /= regressor.sum(0)
     parents = np.array(tree(joints), np.int64)
@@ -103,7 +103,7 @@ def published(model, betas, rotations, translation):
 
 @settings(max_examples=8, deadline=None)
 @given(st.sampled_from([24, 52, 55]), st.integers(0, 10**6), st.integers(0, 10))
-def test_poses_are_those_of_the_published_equations(bodies, joints, seed, coefficients):
+def test_smpl_pose_matches_published_equations(bodies, joints, seed, coefficients):
     body, model = bodies[joints]
     rng = np.random.default_rng(seed)
     betas, turns = rng.normal(size=(2, coefficients)), rng.normal(0, 0.7, (2, joints, 3))
@@ -117,14 +117,14 @@ def test_poses_are_those_of_the_published_equations(bodies, joints, seed, coeffi
         np.testing.assert_allclose(places[i], expected[1], atol=1e-6)
 
 
-def test_expressions_are_no_shapes(bodies):
-    # half of an old SMPL-X's coefficients are of the face's expression
+def test_shape_count_excludes_expressions(bodies):
+    # half of the coefficients of an old SMPL-X model are expressions of the face
     assert [bodies[j][0].shape_count for j in (24, 52, 55)] == [10, 16, 10]
     assert not bodies[24][0].weights.flags.writeable
 
 
-def test_24_rotations_pose_the_larger_models(bodies):
-    """The hands' rotations turn all fingers at their bases; fingers, jaw and eyes rest otherwise."""
+def test_24_rotations_pose_larger_smpl_models(bodies):
+    """Rotations of the hands turn all fingers at their bases; fingers, jaw and eyes are otherwise at rest."""
     rng = np.random.default_rng(3)
     turns = rng.normal(0, 0.5, (2, 24, 3))
     for joints in (52, 55):
@@ -137,7 +137,7 @@ def test_24_rotations_pose_the_larger_models(bodies):
             np.testing.assert_array_equal(a, b)
 
 
-def test_level_frame(bodies):
+def test_pose_level_converts_to_level_frame(bodies):
     rng = np.random.default_rng(4)
     turns, move = axis_angle_to_matrix(rng.normal(0, 0.5, (3, 24, 3))), rng.normal(0, 3, (3, 3))
     at_rest, origin = np.broadcast_to(np.eye(3), (3, 24, 3, 3)), np.zeros((3, 3))
@@ -151,7 +151,7 @@ def test_level_frame(bodies):
         level = [(points - own[1][:, :1]) @ R_LEVEL_SMPL.T + move[:, None] for points in own]
         np.testing.assert_allclose(vertices, level[0], atol=1e-5)
         np.testing.assert_allclose(joints26[:, :22], level[1][:, :22], atol=1e-5)
-        # nose and middle of the head ride on the head
+        # nose and head center move rigidly with the head
         still, rest = body.pose_level(betas, at_rest, origin)
         apart = [np.linalg.norm(j[:, J("nose")] - j[:, J("head_center")], axis=-1) for j in (rest, joints26)]
         np.testing.assert_allclose(*apart, atol=1e-5)
@@ -159,19 +159,19 @@ def test_level_frame(bodies):
         assert (rest[:, J("left_hand"), 1] > 0.4).all() and (rest[:, J("left_foot"), 2] < -0.6).all()
         _, mean = body.pose_level(np.zeros((1, 0)), at_rest[:1], origin[:1])
         assert abs(mean[0, J("head_center"), 1]) < 0.01
-    # facing +x, the left at +y, the head up
+    # facing +x, left at +y, head up
     turn, turns = rotation_about("z", np.pi / 2), at_rest[:1].copy()
     turns[0, 0] = turn
     np.testing.assert_allclose(body.pose_level(betas[:1], turns, origin[:1])[0][0], still[0] @ turn.T, atol=1e-5)
 
 
-def test_part_labels(bodies):
+def test_face_part_matches_shipped_body(bodies):
     for body, _ in bodies.values():
-        # the shipped body's are from its weights before they were rounded and its mesh made smaller
+        # labels of the shipped body are from weights before rounding and a mesh before decimation
         assert (body.face_part == load_rig().face_part).mean() > 0.94 and body.face_part.dtype == np.uint8
 
 
-def test_a_pickle_gives_the_same_body(tmp_path, body):
+def test_load_body_reads_pickle(tmp_path, body):
     model = synthetic()
     path = tmp_path / "model.pkl"
     path.write_bytes(pickle.dumps(model, 2))
@@ -201,7 +201,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("change", "line"), WRONG, ids=[f"{next(iter(c))}-{i}" for i, (c, _) in enumerate(WRONG)])
-def test_wrong_models_are_explained_in_one_line(tmp_path, change, line):
+def test_load_body_rejects_invalid_models(tmp_path, change, line):
     model = {key: value for key, value in (synthetic() | change).items() if value is not None}
     np.savez(tmp_path / "m.npz", **model)
     (tmp_path / "m.pkl").write_bytes(pickle.dumps(model))
@@ -211,7 +211,7 @@ def test_wrong_models_are_explained_in_one_line(tmp_path, change, line):
         assert "\n" not in str(caught.value) and name in str(caught.value)
 
 
-def test_weights_sizes_and_files_must_be_a_person_s(tmp_path):
+def test_load_body_rejects_invalid_weights_sizes_and_files(tmp_path):
     model = synthetic()
     weights = model["weights"]
     headless = np.where(np.arange(24) == HEAD, 0, weights)
@@ -251,7 +251,7 @@ EYE = np.broadcast_to(np.eye(3), (2, 24, 3, 3))
         (np.zeros((2, 3)), EYE, np.zeros(3), r"translation must be \(2, 3\)"),
     ],
 )
-def test_wrong_calls(body, betas, rotations, translation, message):
+def test_smpl_pose_rejects_invalid_arguments(body, betas, rotations, translation, message):
     with pytest.raises(InputError, match=message):
         body.pose(betas, rotations, translation)
     if isinstance(rotations, np.ndarray) and rotations.ndim == 4:
@@ -259,14 +259,14 @@ def test_wrong_calls(body, betas, rotations, translation, message):
             body.pose_house(betas, rotations, np.zeros((2, 3)) if translation is None else translation)
 
 
-# ---- as the body of synthesis
+# ---- SMPL as the body of synthesis
 
 
 @pytest.mark.parametrize("joints", [24, 52])
-def test_a_rig_poses_as_the_model_does_but_for_shapes_that_follow_the_pose(tmp_path, joints):
+def test_rig_matches_smpl_without_pose_shapes(tmp_path, joints):
     model = synthetic(joints)
     model["posedirs"] *= 0
-    # no vertex of the published files has more
+    # vertices of the published files have at most four weights
     assert (np.count_nonzero(model["weights"][:, :22], axis=1) <= 4).all()
     np.savez(tmp_path / "body.npz", **model)
     body, rng = load_body(tmp_path / "body.npz"), np.random.default_rng(5)
@@ -281,7 +281,7 @@ def test_a_rig_poses_as_the_model_does_but_for_shapes_that_follow_the_pose(tmp_p
     assert set(np.unique(rig.face_part)) == set(range(1, 25)) or joints == 52
 
 
-def test_people_are_synthesized_of_a_file_of_the_user_with_the_shapes_of_the_motion(tmp_path):
+def test_synthesis_uses_body_of_user_and_shapes_of_motion(tmp_path):
     np.savez(tmp_path / "body.npz", **synthetic())
     poses = tmp_path / "pose" / "7"
     poses.mkdir(parents=True)
@@ -301,7 +301,7 @@ def test_people_are_synthesized_of_a_file_of_the_user_with_the_shapes_of_the_mot
     assert np.abs(lengths - bones[0]).min() < 1e-4 and np.abs(lengths - bones[1]).min() > 1e-4
 
 
-def test_motion_without_shapes_leaves_them_to_chance(tmp_path):
+def test_motion_without_shapes_gives_random_shapes(tmp_path):
     np.savez(tmp_path / "body.npz", **synthetic())
     np.savez(tmp_path / "motion.npz", poses=np.zeros((4, 72)), trans=np.zeros((4, 3)), betas=["a"])
     assert load_betas(tmp_path / "motion.npz").shape == (0, 10)

@@ -1,4 +1,4 @@
-"""Folders, patterns and files as frames: their order, times, and what becomes of damaged ones."""
+"""Folders, patterns and files as sources of frames: order, times, datasets, and damaged files."""
 
 import json
 import os
@@ -22,7 +22,7 @@ POINTS = np.arange(1, 13, dtype=np.float32).reshape(4, 3)
 
 
 def saved(folder, *names):
-    """A .npy file of each name, the k-th with POINTS times k + 1."""
+    """Writes a .npy file for each name; the k-th contains POINTS * (k + 1)."""
     folder.mkdir(parents=True, exist_ok=True)
     for k, name in enumerate(names):
         with open(folder / name, "wb") as file:
@@ -35,7 +35,7 @@ def ids(source):
 
 
 def numbered(count, times=None, damaged=()):
-    """A recording of `count` frames, of which some cannot be decoded."""
+    """A recording of `count` frames; the frames `damaged` cannot be decoded."""
 
     def read(i):
         if i in damaged:
@@ -45,7 +45,7 @@ def numbered(count, times=None, damaged=()):
     return IndexedRecording(name="made", ids=[f"{i:03}" for i in range(count)], times=times, read=read)
 
 
-def test_a_folder_is_read_by_the_numbers_of_its_names(tmp_path):
+def test_folder_is_sorted_by_number(tmp_path):
     saved(tmp_path, "frame_10.npy", "frame_2.npy", "Frame_1.npy", ".hidden.npy", "._frame_3.npy")
     (tmp_path / "frame_3.npy").mkdir()
     source = lidarpose.open_source(tmp_path)
@@ -69,7 +69,7 @@ def test_a_folder_is_read_by_the_numbers_of_its_names(tmp_path):
     st.booleans(),
 )
 @settings(max_examples=60, deadline=None)
-def test_the_frames_chosen_are_those_of_a_plain_filter(first, rate, damaged, every, start, end, has_times):
+def test_frame_selection_matches_plain_filter(first, rate, damaged, every, start, end, has_times):
     times = np.cumsum(np.linspace(0.05, 0.2, 25)) + 1e9 if has_times else np.arange(25) / rate
     recording = numbered(25, times if has_times else None, damaged)
     source = FrameSource(recording, rate=rate, start=start, end=end, every=every)
@@ -86,7 +86,7 @@ def test_the_frames_chosen_are_those_of_a_plain_filter(first, rate, damaged, eve
     assert source.count == len(list(source))
 
 
-def test_ends_of_an_epoch_time_are_not_lost_to_rounding():
+def test_start_and_end_are_exact_for_epoch_times():
     source = FrameSource(numbered(5, times=list(1_700_000_000 + np.arange(5) / 10)), start=0.1, end=0.2)
     assert [frame.index for frame in source] == [1, 2]
 
@@ -95,7 +95,7 @@ def test_ends_of_an_epoch_time_are_not_lost_to_rounding():
 
 
 @given(st.lists(st.integers(0, 10**12), min_size=1, max_size=30, unique=True), st.sampled_from(["", "frame_", "a1-"]))
-def test_names_sort_by_number(numbers, prefix):
+def test_in_order_sorts_names_by_number(numbers, prefix):
     ordered, _ = in_order([Path(f"{prefix}{number}.pcd") for number in numbers])
     assert [path.stem for path in ordered] == [f"{prefix}{number}" for number in sorted(numbers)]
 
@@ -119,7 +119,7 @@ def test_names_sort_by_number(numbers, prefix):
         "not all": (["1700000000", "1700000001", "readme"], None),
     }.values(),
 )
-def test_names_that_are_plainly_times_tell_them(tmp_path, names, times):
+def test_in_order_reads_times_from_names(tmp_path, names, times):
     saved(tmp_path, *(f"{name}.bin" for name in names))
     assert in_order(list(tmp_path.iterdir()))[1] == times
 
@@ -127,7 +127,7 @@ def test_names_that_are_plainly_times_tell_them(tmp_path, names, times):
 # ---- folders, patterns, files
 
 
-def test_a_damaged_file_costs_its_frame(tmp_path):
+def test_damaged_file_gives_damaged_frame(tmp_path):
     saved(tmp_path, *(f"{k}.npy" for k in range(6)))
     (tmp_path / "2.npy").write_bytes(b"")
     (tmp_path / "4.npy").write_bytes((tmp_path / "4.npy").read_bytes()[:-7])
@@ -137,7 +137,7 @@ def test_a_damaged_file_costs_its_frame(tmp_path):
     assert "2.npy: is empty" in frames[2].error and "4.npy" in frames[4].error
 
 
-def test_which_files_of_a_folder_of_many_kinds_are_read(tmp_path):
+def test_folder_of_mixed_files_selects_format(tmp_path):
     saved(tmp_path, "1.npy", "2.npy", "10.NPY")
     for name in ("4.xyz", "poses.txt", "times.txt", "a.csv", "b.csv", "c.csv", "d.csv", "picture.png", "a.mcap"):
         (tmp_path / name).write_text("1 2 3\n")
@@ -147,7 +147,7 @@ def test_which_files_of_a_folder_of_many_kinds_are_read(tmp_path):
     )
     (tmp_path / "a.mcap").unlink()
     assert open_source(tmp_path, rate=10).warnings == ()
-    # what is named is read, whatever it is
+    # files given by name are always read
     named = open_source([tmp_path / "1.npy", tmp_path / "poses.txt"])
     assert ids(named) == ["1", "poses"] and "mixes .npy, .txt files" in named.warnings[0]
     np.savez(tmp_path / "3.npz", POINTS)
@@ -164,12 +164,12 @@ def test_which_files_of_a_folder_of_many_kinds_are_read(tmp_path):
     assert ids(source) == ["a", "b", "c", "d"] and "4 .csv" in source.warnings[0]
 
 
-def test_rows_of_raw_floats_are_as_wide_as_those_of_the_first_file(tmp_path):
+def test_raw_float_columns_follow_first_file(tmp_path):
     rows = np.random.default_rng(0).normal(0, 9, (40, 5)).astype(np.float32)
     rows[:, 4] = np.arange(40) % 16
     for k in range(4):
         (tmp_path / f"{k}.bin").write_bytes(rows.tobytes())
-    # 4 and 5 values would do for this one, which has no beams
+    # this file has no ring numbers, so 4 and 5 columns are both possible
     (tmp_path / "2.bin").write_bytes((rows + 0.25).tobytes())
     source = open_source(tmp_path, rate=10)
     assert [len(frame.points) for frame in source] == [40] * 4
@@ -178,7 +178,7 @@ def test_rows_of_raw_floats_are_as_wide_as_those_of_the_first_file(tmp_path):
     assert [len(frame.points) for frame in open_source(tmp_path, columns=4)] == [50] * 4
 
 
-def test_rows_that_are_no_returns_are_left_out():
+def test_invalid_rows_are_dropped():
     points = np.array([[0, 0, 0], [1, 2, 3], [np.nan, 1, 1], [0, 0, 1], [np.inf, 0, 0]])
     recording = IndexedRecording(
         name="a", ids=["0"], times=None, read=lambda i: Sweep(points=points, ring=np.arange(5))
@@ -187,7 +187,7 @@ def test_rows_that_are_no_returns_are_left_out():
     assert frame.points.tolist() == [[1, 2, 3], [0, 0, 1]] and frame.ring.tolist() == [1, 3]
 
 
-def test_patterns_lists_and_recursion(tmp_path, monkeypatch):
+def test_open_source_accepts_patterns_lists_and_recursion(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     saved(tmp_path / "day" / "a", "f_10.npy", "f_2.npy")
     saved(tmp_path / "day" / "b", "f_2.npy")
@@ -199,7 +199,7 @@ def test_patterns_lists_and_recursion(tmp_path, monkeypatch):
     assert folders.count == 3 and [frame.index for frame in folders.frames(2)] == [2]
 
 
-def test_one_plain_file_is_a_single_scan(tmp_path):
+def test_is_single_scan_for_one_plain_file(tmp_path):
     saved(tmp_path, "a.npy", "b[1].npy")
     for single in ("a.npy", "b[1].npy", "missing.pcd", "a.laz"):
         assert is_single_scan(tmp_path / single) and is_single_scan([str(tmp_path / single)])
@@ -224,7 +224,7 @@ def test_one_plain_file_is_a_single_scan(tmp_path):
         "hidden": (lambda folder: (folder / ".a.pcd").touch() or folder, ["an empty folder"]),
     }.values(),
 )
-def test_sources_without_points_say_what_is_there(tmp_path, make, words):
+def test_source_without_points_error_lists_contents(tmp_path, make, words):
     refusal(open_source, make(tmp_path), words=words)
 
 
@@ -238,21 +238,21 @@ def test_sources_without_points_say_what_is_there(tmp_path, make, words):
         ({"columns": 2}, ["columns", "at least 3"]),
     ],
 )
-def test_options_that_make_no_sense(tmp_path, options, words):
+def test_open_source_rejects_invalid_options(tmp_path, options, words):
     refusal(open_source, saved(tmp_path, "a.npy"), words=words, **options)
 
 
 # ---- recordings
 
 
-def test_time_that_jumps_back_is_counted_and_the_order_stays():
+def test_times_that_jump_back_are_counted_and_order_is_kept():
     source = FrameSource(numbered(6, times=[5.0, 5.1, 4.0, 4.1, 3.0, 5.2]))
     for _ in range(2):
         assert ids(source) == [f"{i:03}" for i in range(6)]
         assert source.warnings == ("time jumps back 2 times: the order of the recording is kept",)
 
 
-def test_a_recording_that_breaks_off_keeps_what_was_read():
+def test_truncated_recording_keeps_frames_before_error():
     class Cut(IndexedRecording):
         def lazy_frames(self, first=0):
             for i, frame in enumerate(super().lazy_frames(first), first):
@@ -266,7 +266,7 @@ def test_a_recording_that_breaks_off_keeps_what_was_read():
 
 
 @given(st.lists(st.integers(0, 4), min_size=1, max_size=4), st.integers(0, 12), st.booleans())
-def test_a_chain_is_its_parts_one_after_the_other(lengths, first, counted):
+def test_chained_recording_concatenates_parts(lengths, first, counted):
     class Uncounted(IndexedRecording):
         count = None
 
@@ -278,7 +278,7 @@ def test_a_chain_is_its_parts_one_after_the_other(lengths, first, counted):
     assert chain.count == (sum(lengths) if counted else None)
 
 
-def test_recordings_that_are_damaged_cost_no_other(tmp_path):
+def test_damaged_recording_does_not_affect_others(tmp_path):
     saved(tmp_path / "a", "0.npy", "1.npy")
     (tmp_path / "b").mkdir()
     saved(tmp_path / "c", "0.npy")
@@ -304,7 +304,7 @@ def test_recordings_that_are_damaged_cost_no_other(tmp_path):
     assert [frame.index for frame in chain.frames(3)] == [3, 4]
 
 
-def test_a_part_without_a_single_frame_takes_nobodys_times():
+def test_unreadable_part_does_not_use_times_of_next_part():
     def refused(first=0):
         raise InputError("a.bag: is damaged")
 
@@ -316,13 +316,13 @@ def test_a_part_without_a_single_frame_takes_nobodys_times():
 
 
 @pytest.mark.parametrize("wrong", [5, b"drive", None])
-def test_what_is_no_path_is_said(wrong):
+def test_open_source_and_background_reject_non_paths(wrong):
     for read in (open_source, learn_background):
         with pytest.raises(InputError, match="expected"):
             read(wrong)
 
 
-def test_background_is_learned_of_any_source(tmp_path, monkeypatch):
+def test_background_is_learned_from_any_source(tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
     wall = rng.uniform((5, -3, 0), (5.01, 3, 3), (4000, 3))
     for k in range(12):
@@ -330,13 +330,13 @@ def test_background_is_learned_of_any_source(tmp_path, monkeypatch):
     expected = learn_background([tmp_path / f"{k}.npy" for k in range(12)])
     for source in (tmp_path, str(tmp_path / "*.npy"), [tmp_path]):
         assert np.array_equal(read_background(source), expected)
-    # of many frames some are read, from the first to the last
+    # of many frames, a subset from the first to the last is read
     monkeypatch.setattr("lidarpose.inference.background._MOST_SCANS", 4)
     some = learn_background([tmp_path / f"{k}.npy" for k in (0, 4, 7, 11)])
     assert np.array_equal(read_background(tmp_path), some) and not np.array_equal(some, expected)
 
 
-def test_a_background_is_learned_without_what_is_damaged(tmp_path, monkeypatch):
+def test_background_skips_damaged_scans(tmp_path, monkeypatch):
     wall = np.random.default_rng(0).uniform((5, -3, 0), (5.01, 3, 3), (4000, 3))
     for k in range(5):
         np.save(tmp_path / f"{k}.npy", wall)
@@ -381,7 +381,7 @@ def drive(count=5):
 
 
 def seen(T_world_sensor, width):
-    """LANDMARKS as a sensor sees them, float32 rows."""
+    """LANDMARKS in the frame of a sensor, as bytes of float32 rows."""
     rows = np.zeros((len(LANDMARKS), width), np.float32)
     rows[:, :3] = (LANDMARKS - T_world_sensor[:3, 3]) @ T_world_sensor[:3, :3]
     rows[:, width - 1] = np.arange(len(rows)) % 32
@@ -401,7 +401,7 @@ RADIUS = 6378137.0
 
 
 def write_raw_drive(folder, poses, *, missing=(), latitude=49.0, oxts_rate=1):
-    """A raw drive of KITTI, of which some scans are missing."""
+    """Writes a raw drive of KITTI, without the scans `missing`."""
     drive = folder / "2011_09_26" / "2011_09_26_drive_0001_sync"
     scans, oxts = drive / "velodyne_points" / "data", drive / "oxts" / "data"
     scans.mkdir(parents=True)
@@ -429,7 +429,7 @@ def write_raw_drive(folder, poses, *, missing=(), latitude=49.0, oxts_rate=1):
 
 
 @pytest.mark.parametrize("named, oxts_rate", [(".", 1), ("velodyne_points", 1), ("velodyne_points/data", 10)])
-def test_a_raw_drive_of_kitti_has_times_and_poses(tmp_path, named, oxts_rate):
+def test_kitti_raw_drive_has_times_and_poses(tmp_path, named, oxts_rate):
     poses = drive()
     folder = write_raw_drive(tmp_path, poses, missing=(2,), oxts_rate=oxts_rate)
     source = open_source(folder / named)
@@ -441,7 +441,7 @@ def test_a_raw_drive_of_kitti_has_times_and_poses(tmp_path, named, oxts_rate):
         assert np.array_equal(frame.origin, np.zeros(3)) and frame.warnings == ()
 
 
-def test_a_raw_drive_with_damaged_tables_keeps_its_scans(tmp_path):
+def test_kitti_raw_drive_with_damaged_tables_keeps_scans(tmp_path):
     folder = write_raw_drive(tmp_path, drive())
     (folder / "oxts" / "data" / f"{3:010}.txt").write_text("1 2 3")
     frames = list(open_source(folder))
@@ -455,7 +455,7 @@ def test_a_raw_drive_with_damaged_tables_keeps_its_scans(tmp_path):
 
 
 def write_sequence(folder, T_world_velo, *, semantic=False):
-    """A sequence of KITTI's odometry, or of SemanticKITTI, whose cameras look forward."""
+    """Writes a sequence of KITTI odometry or SemanticKITTI, with cameras that look forward."""
     T_cam_velo = np.array([[0.01, -1, 0, 0.02], [0, 0, -1, -0.06], [1, 0.01, 0, -0.33], [0, 0, 0, 1.0]])
     T_cam_velo[:3, :3] = np.linalg.svd(T_cam_velo[:3, :3])[0] @ np.linalg.svd(T_cam_velo[:3, :3])[2]
     sequence = folder / "sequences" / "07"
@@ -474,7 +474,7 @@ def write_sequence(folder, T_world_velo, *, semantic=False):
 
 
 @pytest.mark.parametrize("semantic", [False, True])
-def test_a_sequence_of_kitti_has_times_and_poses_in_its_first_frame(tmp_path, semantic):
+def test_kitti_sequence_has_times_and_poses_in_first_frame(tmp_path, semantic):
     poses = drive()
     sequence = write_sequence(tmp_path, poses, semantic=semantic)
     for folder in (sequence, sequence / "velodyne"):
@@ -495,8 +495,11 @@ def quaternion(R):
     return [w, *(np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (4 * w))]
 
 
-def write_nuscenes(root, scenes=("scene-0061", "scene-0103"), version="v1.0-mini"):
-    """Tables and sweeps of nuScenes: five frames a scene, of a LiDAR, the second of which is between key frames."""
+def write_nuscenes(root, scenes=("scene-0061", "scene-0103"), version="v1.0-mini", apart=10**9):
+    """Writes nuScenes tables and LiDAR sweeps: five frames per scene, of which the second is not a key frame.
+
+    apart: us between the starts of scenes.
+    """
     T_ego_sensor = rigid(-1.57, 0.02, 0.01, (0.94, 0, 1.84))
     tables = {name: [] for name in ("sample_data", "sample", "scene", "ego_pose", "calibrated_sensor", "sensor")}
     for channel in ("CAM_FRONT", "LIDAR_TOP"):
@@ -513,7 +516,7 @@ def write_nuscenes(root, scenes=("scene-0061", "scene-0103"), version="v1.0-mini
         tables["scene"].append({"token": f"token {scene}", "name": scene})
         tables["sample"].append({"token": f"sample {scene}", "scene_token": f"token {scene}"})
         # the later scene comes first in the tables
-        begin = 1533151603547590 + (len(scenes) - number) * 10**9
+        begin = 1533151603547590 + (len(scenes) - number) * apart
         for k, T_world_ego in reversed(list(enumerate(drive()))):
             stamp = begin + 50_000 * k
             T = {"translation": T_world_ego[:3, 3].tolist(), "rotation": quaternion(T_world_ego[:3, :3])}
@@ -539,7 +542,7 @@ def write_nuscenes(root, scenes=("scene-0061", "scene-0103"), version="v1.0-mini
     return root
 
 
-def test_nuscenes_is_read_scene_by_scene_with_poses(tmp_path):
+def test_nuscenes_is_read_by_scene_with_poses(tmp_path):
     root = write_nuscenes(tmp_path)
     for folder in (root, root / "v1.0-mini"):
         source = open_source(folder)
@@ -555,8 +558,13 @@ def test_nuscenes_is_read_scene_by_scene_with_poses(tmp_path):
     refusal(open_source, root, topic="scene-0062", words=["unknown scene", "scene-0061"])
 
 
+def test_nuscenes_keeps_overlapping_scenes_apart(tmp_path):
+    frames = list(open_source(write_nuscenes(tmp_path, apart=25_000)))
+    assert [frame.id.split("/")[0] for frame in frames] == ["scene-0103"] * 5 + ["scene-0061"] * 5
+
+
 @pytest.mark.parametrize("damage", [None, {}, {"rotation": [0, 0, 0, 0]}, {"translation": [1, float("nan"), 0]}])
-def test_a_damaged_pose_of_nuscenes_costs_its_frame(tmp_path, damage):
+def test_nuscenes_damaged_pose_gives_damaged_frame(tmp_path, damage):
     root = write_nuscenes(tmp_path)
     path = root / "v1.0-mini" / "ego_pose.json"
     rows = json.loads(path.read_text())
@@ -568,7 +576,7 @@ def test_a_damaged_pose_of_nuscenes_costs_its_frame(tmp_path, damage):
     assert "pose in the tables is damaged" in frames[0].error
 
 
-def test_of_nuscenes_what_is_on_the_disk_is_read(tmp_path):
+def test_nuscenes_reads_only_sweeps_on_disk(tmp_path):
     root = write_nuscenes(tmp_path)
     for path in (root / "sweeps" / "LIDAR_TOP").iterdir():
         path.unlink()

@@ -1,4 +1,4 @@
-"""Switches that the paper's tables need: random weights, fields of the scene, recorded places, corpora as motion."""
+"""Options for the paper's tables: fields of the scene, recorded positions, random weights, corpora as motion."""
 
 import pickle
 import shutil
@@ -31,7 +31,7 @@ _SHORT = ["--workers", "0", "--pictures", "0", "--validate", "1000", "--batch", 
 # --- the scene's fields
 
 
-def test_fields_of_the_scene_by_name():
+def test_scene_fields_are_changed_by_name():
     scene = scene_config("wild")
     changed = scene.changed(("slope=0", "distance=4:12", "noise.clutter=0.5", "clutter=0.25", "most_clutter=30"))
     noise = replace(scene.noise, clutter=0.5, most_clutter=30)
@@ -58,12 +58,12 @@ def test_fields_of_the_scene_by_name():
         ("distance=9:4", "LOW:HIGH"),
     ],
 )
-def test_what_is_no_field_or_no_value_is_refused(setting, told):
+def test_scene_rejects_unknown_fields_and_invalid_values(setting, told):
     with pytest.raises(InputError, match=told):
         scene_config("paper").changed((setting,))
 
 
-def test_the_mask_of_pretrain_and_synth_is_the_scene_s(tmp_path, monkeypatch):
+def test_keep_option_sets_mask_of_scene(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert not main(["synth", "--out", "people", "-n", "4", "--scene", "paper", "--keep", "1", "--set", "slope=0"])
     assert read_card(tmp_path / "people").settings["set"] == ["keep=1", "slope=0"]
@@ -79,7 +79,7 @@ def test_the_mask_of_pretrain_and_synth_is_the_scene_s(tmp_path, monkeypatch):
     assert main(["pretrain", "other", "--keep", "2", *_SHORT]) == 2 and not (tmp_path / "other").exists()
 
 
-# --- places as recorded
+# --- recorded positions
 
 
 def _bank(offset):
@@ -98,8 +98,8 @@ def load_motion_of(rotations, way, *, names=("a",)):
 
 
 @pytest.mark.parametrize("offset", [(14.0, 5.0, 0.0), (0.0, 0.0, 0.0), (400.0, 0.0, 0.0)])
-def test_captured_people_stay_where_they_were_recorded(offset):
-    """A LiDAR's recording as it is; one of a room or a far walk about a place 12 m ahead."""
+def test_captured_people_keep_recorded_positions(offset):
+    """LiDAR recordings keep their positions; recordings of a room or far away are centered 12 m ahead."""
     bank, motion = _bank(np.array(offset))
     scene = scene_config("paper").changed(("recorded=1", "keep=1"))
     generator = Generator(scene=scene, bank=bank, captured=1.0, measure=False)
@@ -109,7 +109,7 @@ def test_captured_people_stay_where_they_were_recorded(offset):
     for index in range(6):
         joints = generator.person(3, index).sample.pose.joints
         pelvis = joints[BODY26.index("pelvis"), :2]
-        # the body's origin is not its pelvis, and poses vary a little
+        # the origin of the body is not its pelvis, and poses vary slightly
         nearest = np.linalg.norm(places - pelvis, axis=1).argmin()
         assert np.linalg.norm(places[nearest] - pelvis) < 0.35
         left = (joints[BODY26.index("left_hip")] - joints[BODY26.index("right_hip")])[:2]
@@ -117,7 +117,7 @@ def test_captured_people_stay_where_they_were_recorded(offset):
         assert np.abs((away + np.pi) % (2 * np.pi) - np.pi).min() < 0.6
 
 
-def test_recorded_places_need_motion_and_single_people(tmp_path):
+def test_recorded_positions_need_motion_and_single_frames(tmp_path):
     scene = scene_config("paper").changed(("recorded=1",))
     with pytest.raises(InputError, match="--motion"):
         Generator(scene=scene)
@@ -143,7 +143,7 @@ def people(tmp_path_factory):
 
 @pytest.mark.long
 @pytest.mark.parametrize("size, recipe", [("tiny", "default"), ("paper-tiny", "paper")])
-def test_fine_tuning_begins_at_random(people, tmp_path, monkeypatch, size, recipe):
+def test_finetune_starts_from_random_weights(people, tmp_path, monkeypatch, size, recipe):
     monkeypatch.chdir(tmp_path)
     words = ["finetune", str(people), "--out", "run", "--init", "random", "--size", size, "--recipe", recipe]
     assert not main([*words, "--split", "all", "--epochs", "2", "--mix", "0", *_SHORT])
@@ -156,12 +156,12 @@ def test_fine_tuning_begins_at_random(people, tmp_path, monkeypatch, size, recip
 
 
 @pytest.mark.parametrize("changes", [{"init": "random"}, {"size": "tiny"}])
-def test_random_weights_need_a_size_and_others_have_theirs(changes):
+def test_random_init_and_size_require_each_other(changes):
     with pytest.raises(InputError, match="--init random --size NAME"):
         Finetune(data=("x",), **changes)
 
 
-def test_an_unknown_size_is_refused(people):
+def test_finetune_rejects_unknown_size(people):
     with pytest.raises(InputError, match="unknown network size 'huge'"):
         make_setup(Finetune(data=(str(people),), split="all", init="random", size="huge"))
 
@@ -169,7 +169,7 @@ def test_an_unknown_size_is_refused(people):
 # --- corpora
 
 
-def test_a_corpus_without_parts_is_pointed_out(people, tmp_path):
+def test_pretrain_warns_about_corpus_without_parts(people, tmp_path):
     dataset_files.write_lipd(tmp_path / "raw", dataset_files.write_smpl(tmp_path / "SMPL_NEUTRAL.npz"))
     prepare("lipd", tmp_path / "raw", tmp_path / "corpus", progress=False)
     warnings = make_setup(Pretrain(shards=(str(tmp_path / "corpus"),))).warnings
@@ -186,7 +186,7 @@ def _written(folder, entries):
 
 
 @pytest.mark.parametrize("which, up", [("freemotion", "y"), ("noisemotion", "z")])
-def test_poses_of_a_corpus_are_motion(tmp_path, which, up):
+def test_corpus_poses_are_loaded_as_motion(tmp_path, which, up):
     rotations, way = files.a_clip(10)
     poses = files.to_smpl(rotations, up)
     entries = []
@@ -200,7 +200,7 @@ def test_poses_of_a_corpus_are_motion(tmp_path, which, up):
     np.testing.assert_allclose(motion.translation, way, atol=1e-4)
 
 
-def test_lipd_s_joints_are_motion_where_there_are_no_poses(tmp_path):
+def test_lipd_joints_without_poses_are_loaded_as_motion(tmp_path):
     rotations, way = files.a_clip(6)
     joints = files.joints_of(rotations)
     entries = [{"seq_path": "s", "gt_joint": j, "trans": w} for j, w in zip(joints, way, strict=True)]
@@ -210,7 +210,7 @@ def test_lipd_s_joints_are_motion_where_there_are_no_poses(tmp_path):
     assert np.linalg.norm(again - joints, axis=-1)[:, files.MAIN].max() < 0.03
 
 
-def test_joints_among_poses_are_left_out(tmp_path):
+def test_load_motion_skips_joints_among_poses(tmp_path):
     rotations, way = files.a_clip(5)
     poses, joints = files.to_smpl(rotations, "z"), files.joints_of(rotations)
     entries = [{"motion_id": "a", "gt": pose, "T_1": place} for pose, place in zip(poses, way, strict=True)]
@@ -220,6 +220,6 @@ def test_joints_among_poses_are_left_out(tmp_path):
     np.testing.assert_allclose(motion.rotations, np.delete(rotations, 2, 0), atol=1e-4)
 
 
-def test_a_list_without_poses_is_no_motion(tmp_path):
+def test_load_motion_rejects_list_without_poses(tmp_path):
     with pytest.raises(InputError, match="gt_joint"):
         load_motion(_written(tmp_path, [{"pc": 3}, 4]))

@@ -1,4 +1,4 @@
-"""`lidarpose synth` and its datasets in torch: the same bytes and the same people however they are made."""
+"""`lidarpose synth` and torch datasets: same bytes and people for any number of workers and after interruptions."""
 
 import os
 import shutil
@@ -51,7 +51,7 @@ def dataset(tmp_path_factory):
     return folder
 
 
-def test_a_dataset_holds_the_generators_people(dataset):
+def test_dataset_contains_people_of_generator(dataset):
     scene = scene_config("wild")
     assert sorted(content(dataset)) == ["dataset.json", *(f"people-{k:05d}.parquet" for k in range(6))]
     rows = list(open_dataset(dataset).rows())
@@ -68,10 +68,10 @@ def command(out, *words):
 
 @pytest.mark.long
 @pytest.mark.parametrize("workers", ["1", "2"])
-def test_killed_at_any_time_the_same_command_goes_on(dataset, tmp_path, workers):
+def test_killed_synth_command_resumes(dataset, tmp_path, workers):
     out = tmp_path / "killed"
     child = command(out, "--workers", workers)
-    # some but not all: killed as soon as the first shard is there
+    # killed as soon as the first shard exists, before all are written
     until = time.monotonic() + 60
     while not list(out.glob("people-*.parquet")) and child.poll() is None and time.monotonic() < until:
         time.sleep(0.002)
@@ -79,20 +79,20 @@ def test_killed_at_any_time_the_same_command_goes_on(dataset, tmp_path, workers)
     child.communicate()
     left = content(out)
     assert "dataset.json" in left and len([name for name in left if name.startswith("people")]) < 6
-    # what a writer leaves that is killed in the middle of a shard; no process has so high a number
+    # leftovers of a writer that was killed within a shard; no process has such a high id
     (out / ".99999999-3-people-00004.parquet").write_bytes(b"PAR1")
     (out / "people-00002.parquet").write_bytes(b"PAR1 half a shard")
     assert synth(out, *WORDS) == 0
     until = time.monotonic() + 10
     while content(out) != content(dataset) and time.monotonic() < until:
-        # the killed one's worker may have been in the middle of a file
+        # a worker of the killed process may still write a file
         time.sleep(0.2)
         assert synth(out, *WORDS) == 0
     assert content(out) == content(dataset)
 
 
 @pytest.mark.long
-def test_workers_give_the_same_bytes(dataset, tmp_path, capsys):
+def test_workers_write_same_bytes(dataset, tmp_path, capsys):
     assert synth(tmp_path / "two", *WORDS, "--workers", 2) == 0
     assert content(tmp_path / "two") == content(dataset)
     assert "60 people made -> " in capsys.readouterr().err
@@ -101,7 +101,7 @@ def test_workers_give_the_same_bytes(dataset, tmp_path, capsys):
 
 
 @pytest.mark.long
-def test_a_second_command_leaves_the_first_one_s_files_alone(tmp_path, capsys):
+def test_second_synth_command_is_refused_during_first(tmp_path, capsys):
     out = tmp_path / "out"
     first = command(out)
     until = time.monotonic() + 60
@@ -110,14 +110,14 @@ def test_a_second_command_leaves_the_first_one_s_files_alone(tmp_path, capsys):
     assert synth(out, *WORDS) == 2
     assert "another process writes this dataset: wait for its end" in one_line(capsys)
     assert "Traceback" not in first.communicate()[1] and first.returncode == 0
-    # nor is anything left of the lock
+    # the lock is removed
     assert synth(out, *WORDS) == 0 and sorted(content(out))[0] == "dataset.json"
 
 
-def test_a_shard_of_too_few_people_is_made_again(dataset, tmp_path):
+def test_incomplete_shard_is_written_again(dataset, tmp_path):
     out = tmp_path / "short"
     shutil.copytree(dataset, out)
-    # a whole file that lacks one of them
+    # a valid file that lacks one person
     write_shard(out / "people-00003.parquet", "people", list(read_rows(out / "people-00003.parquet", "people"))[:-1])
     assert content(out) != content(dataset)
     told = []
@@ -127,13 +127,13 @@ def test_a_shard_of_too_few_people_is_made_again(dataset, tmp_path):
 
 
 def job(**settings):
-    """That of `WORDS`."""
+    """The job of `WORDS`."""
     return SynthesisJob(
         what="people", count=COUNT, per_shard=PER_SHARD, sensors=("os1-64", "vlp-16"), seed=5, **settings
     )
 
 
-def test_other_settings_are_refused_by_name(dataset, capsys):
+def test_synth_refuses_other_settings_by_name(dataset, capsys):
     before = content(dataset)
     words = [*WORDS[:-2], "--seed", "6", "--hard", "0.5"]
     assert synth(dataset, *words) == 2
@@ -142,7 +142,7 @@ def test_other_settings_are_refused_by_name(dataset, capsys):
     assert content(dataset) == before
 
 
-def test_clips_have_frames(tmp_path):
+def test_clips_contain_frames(tmp_path):
     assert synth(tmp_path / "clips", "-n", 2, "--clips", "--sensor", "os1-64") == 0
     rows = list(open_dataset(tmp_path / "clips").rows())
     assert [(row["index"], row["frame"]) for row in rows] == [(clip, frame) for clip in (0, 1) for frame in range(16)]
@@ -180,7 +180,7 @@ BAD = {
 
 @pytest.mark.parametrize("case", BAD)
 @pytest.mark.parametrize("out", ["out", "."], ids=["new folder", "empty folder"])
-def test_a_bad_command_is_one_line_and_leaves_nothing(tmp_path, capsys, monkeypatch, case, out):
+def test_synth_rejects_invalid_options_and_writes_nothing(tmp_path, capsys, monkeypatch, case, out):
     words, message = BAD[case]
     (tmp_path / "broken.npz").write_bytes(b"PK no motion")
     (tmp_path / "near.json").write_text('{"elevations_deg": [-2, -1, 0], "range_max": 1.2}')
@@ -196,7 +196,7 @@ def test_a_bad_command_is_one_line_and_leaves_nothing(tmp_path, capsys, monkeypa
     assert not list(here.iterdir())
 
 
-def test_a_folder_that_is_none_or_another_ones_is_refused(tmp_path, capsys):
+def test_synth_rejects_unusable_folders(tmp_path, capsys):
     file = tmp_path / "file"
     file.write_text("mine")
     for out, message in ((file, "is a file"), (file / "deep", "is a file"), (tmp_path, "holds other files")):
@@ -208,7 +208,7 @@ def test_a_folder_that_is_none_or_another_ones_is_refused(tmp_path, capsys):
 
 
 @pytest.mark.long
-def test_a_full_disk_is_one_line_and_leaves_no_half_shard(tmp_path):
+def test_full_disk_error_leaves_no_partial_shard(tmp_path):
     resource = pytest.importorskip("resource")
     limit = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (20000, {resource.RLIM_INFINITY}))"
     code = f"{limit}; from lidarpose.cli import main; raise SystemExit(main())"
@@ -217,24 +217,24 @@ def test_a_full_disk_is_one_line_and_leaves_no_half_shard(tmp_path):
     assert done.returncode == 2, done.stderr
     assert done.stderr.startswith("lidarpose: error: ") and done.stderr.count("\n") == 1, done.stderr
     assert "people-00000.parquet" in done.stderr
-    # nor a folder, since nothing was made
+    # no folder either, since nothing was written
     assert not (tmp_path / "full").exists()
 
 
-def test_a_sensor_s_file_counts_by_content(tmp_path, capsys):
+def test_sensor_file_is_compared_by_content(tmp_path, capsys):
     for place in ("a", "b"):
         (tmp_path / place).mkdir()
         (tmp_path / place / "mine.json").write_text("[-10, -5, 0, 5, 10]")
     words = ["-n", 3, "--sensor"]
     assert synth(tmp_path / "d", *words, tmp_path / "a" / "mine.json") == 0
     assert str(tmp_path) not in (tmp_path / "d" / "dataset.json").read_text()
-    # moved elsewhere it is the same sensor, changed it is another one
+    # a moved file is the same sensor, a changed file another one
     assert synth(tmp_path / "d", *words, tmp_path / "b" / "mine.json") == 0
     capsys.readouterr()
     (tmp_path / "b" / "mine.json").write_text("[-10, -5, 0, 5, 11]")
     assert synth(tmp_path / "d", *words, tmp_path / "b" / "mine.json") == 2
     assert "tables" in one_line(capsys)
-    # the same where the scene is changed to it
+    # the same if the sensor is set as a field of the scene
     file = tmp_path / "a" / "mine.json"
     assert synth(tmp_path / "s", "-n", 3, "--set", f"sensors={file}") == 0
     settings = open_dataset(tmp_path / "s").card.settings
@@ -246,7 +246,7 @@ def test_a_sensor_s_file_counts_by_content(tmp_path, capsys):
     assert "tables" in one_line(capsys)
 
 
-def test_streets_hold_everybody_of_a_turn(tmp_path, monkeypatch, capsys):
+def test_streets_contain_all_people_of_frames(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(shard_job, "STREET_FRAMES", 2)
     assert synth(tmp_path / "s", "-n", 1, "--scenes", "--sensor", "vlp-16") == 0
     assert "1 street made -> " in capsys.readouterr().err
@@ -262,26 +262,26 @@ def test_streets_hold_everybody_of_a_turn(tmp_path, monkeypatch, capsys):
         assert sample.box.id == row["track"] and sample.box.id in frame["track"]
         joints = frame["joints"].reshape(len(frame["track"]), -1, 3)[sample.box.id]
         np.testing.assert_array_equal(joints, sample.pose.joints)
-        # the label's box, not the one with a detector's errors, holds the whole person
+        # the labeled box, unlike the sample's box with errors of a detector, contains the whole person
         center, size = np.split(frame["box"].reshape(-1, 7)[sample.box.id][:6], 2)
         assert np.linalg.norm(center - sample.box.center) < 0.5 and (size > 0.2).all()
         own = frame["points"].reshape(-1, 3)[frame["person"] == sample.box.id]
         assert np.linalg.norm(own.mean(0) - center) < 0.6
 
 
-def test_sensors_are_listed(capsys):
+def test_sensors_command_lists_sensors(capsys):
     assert main(["sensors"]) == 0
     assert capsys.readouterr().out.splitlines() == listing()
 
 
 @pytest.mark.long
-def test_synth_needs_no_torch(tmp_path):
+def test_synth_does_not_import_torch(tmp_path):
     code = "import sys; from lidarpose.cli import main; main(); raise SystemExit('torch' in sys.modules)"
     words = ["synth", "--out", str(tmp_path / "a"), "-n", "2"]
     assert subprocess.run([sys.executable, "-c", code, *words], capture_output=True).returncode == 0
 
 
-# ---- people for torch
+# ---- torch datasets
 
 SCENE = scene_config("wild").eased(0.5)
 
@@ -293,7 +293,7 @@ def clouds(data, **settings):
 @pytest.mark.long
 @pytest.mark.parametrize("workers", [2, 3])
 @pytest.mark.parametrize("batch", [1, 4])
-def test_people_are_the_same_in_any_number_of_workers(workers, batch):
+def test_people_are_the_same_for_any_number_of_workers(workers, batch):
     data = SyntheticPeople(scene=SCENE, seed=2, start=60, stop=70, batch=batch)
     alone = [sample.points for sample in data]
     assert len(alone) == 10
@@ -303,7 +303,7 @@ def test_people_are_the_same_in_any_number_of_workers(workers, batch):
         np.testing.assert_array_equal(a, b)
 
 
-def test_people_go_on_without_end_and_settings_are_checked():
+def test_synthetic_people_are_endless_and_check_settings():
     people = iter(SyntheticPeople(scene=SCENE, seed=2))
     assert len([next(people) for _ in range(3)]) == 3
     for wrong in ({"seed": -1}, {"start": 5, "stop": 2}, {"batch": 0}, {"hard": 3.0}, {"captured": 0.5}):
@@ -311,7 +311,7 @@ def test_people_go_on_without_end_and_settings_are_checked():
             SyntheticPeople(**{"scene": SCENE, "seed": 0} | wrong)
 
 
-def test_difficulty_asked_for_is_the_people_s(tmp_path):
+def test_hard_sets_difficulty_of_people(tmp_path):
     scene = replace(scene_config("wild"), sensors=("os1-64",))
     (sample,) = SyntheticPeople(scene=scene, seed=2, start=1, stop=2, hard=0.0)
     wanted = Generator(scene=scene, measure=False).person(2, 1, hard=0.0).sample
@@ -320,7 +320,7 @@ def test_difficulty_asked_for_is_the_people_s(tmp_path):
     np.testing.assert_array_equal(list(open_dataset(tmp_path / "d"))[1].points, wanted.points)
 
 
-def test_streets_take_turns_with_the_sensors(monkeypatch, tmp_path):
+def test_streets_alternate_between_sensors(monkeypatch, tmp_path):
     asked = []
 
     def made(seed, index, *, sensor, frames):
@@ -335,7 +335,7 @@ def test_streets_take_turns_with_the_sensors(monkeypatch, tmp_path):
     assert asked == [(k, ("os1-64", "vlp-16")[k % 2]) for k in range(5)]
 
 
-def test_a_job_s_scene_and_share_are_the_generator_s(tmp_path):
+def test_job_passes_scene_and_captured_share_to_generator(tmp_path):
     rotations, way = a_clip(40)
     path = write_amass(tmp_path / "walk_01.npz", rotations, way, fps=10.0)
     for settings, share in ((dict(), 0.0), (dict(motion=str(path)), 0.5), (dict(motion=str(path), captured=0.2), 0.2)):

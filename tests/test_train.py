@@ -49,7 +49,7 @@ OBJECTIVE = PoseNetObjective(config=TINY)
 WINDOW = REACH["window"]
 BINS = round(2 * WINDOW / BIN)
 EXACT = torch.randn(3, 26, 3, generator=torch.Generator().manual_seed(0)) * 0.4
-# votes whose errors are on both sides of ten centimeters
+# votes with errors below and above ten centimeters
 SPREAD_OUT = torch.randn(40, 26, 3, generator=torch.Generator().manual_seed(0)) * 0.4
 ASTRAY = SPREAD_OUT + torch.randn(40, 26, 3, generator=torch.Generator().manual_seed(1)) * 0.07
 
@@ -78,7 +78,7 @@ def targets(joints, **more):
 
 
 def gradient(name, value, vote=ASTRAY, aims=None):
-    """Of the loss term `name`, or of them all, by an output."""
+    """Gradient of the loss term `name`, or of the total, with respect to an output."""
     field, value = value if isinstance(value, tuple) else (name, value)
     value = value.clone().requires_grad_()
     terms = losses(outputs(**{"vote": vote, field: value}), aims or targets(SPREAD_OUT))
@@ -86,11 +86,11 @@ def gradient(name, value, vote=ASTRAY, aims=None):
     return value.grad
 
 
-def test_every_term_costs_its_distance():
-    """Not its square, as in the released code; exact joints cost nothing, and their gradient is finite."""
+def test_losses_are_distances():
+    """The released code squares distances. Exact joints have no loss and a finite gradient."""
     exact = losses(outputs(EXACT), targets(EXACT))
     assert exact["vote"] == 0 and exact["level"] == 0
-    # the heatmap has no bin at zero: what is left of its decoding is half a millimeter an axis
+    # the heatmap has no bin at zero: decoding leaves an error of half a millimeter per axis
     assert exact["mpjpe"] < 2e-3
     assert total(exact).item() == pytest.approx(sum(v.item() for n, v in exact.items() if n != "mpjpe"), rel=1e-5)
     assert gradient("total", ("vote", EXACT), aims=targets(EXACT)).isfinite().all()
@@ -99,10 +99,10 @@ def test_every_term_costs_its_distance():
         assert shifted[name].item() == pytest.approx(weight * 0.5, rel=within)
 
 
-def test_the_heatmap_is_learned_about_the_vote_and_only_within_reach():
+def test_heatmap_loss_is_relative_to_vote_and_within_window():
     far = EXACT.clone()
     far[0] += WINDOW + 0.1
-    # the right heatmap is the optimum, and one out of reach is not pulled at all
+    # the true heatmap is the optimum; joints outside the window have no gradient
     right = encode(torch.zeros(3, 26, 3), SIGMA, BINS).log()
     assert gradient("heatmap", right, far, targets(EXACT)).abs().max() < 1e-6
     wrong = gradient("heatmap", torch.zeros(3, 26, 3, BINS), far, targets(EXACT))
@@ -112,8 +112,8 @@ def test_the_heatmap_is_learned_about_the_vote_and_only_within_reach():
     assert best.item() == pytest.approx(HEATMAP * entropy.item(), rel=1e-4)
 
 
-def test_confidence_and_spread_are_best_at_what_they_mean():
-    """The probability of a hit, and the expected distance; neither ever pulls at the joints."""
+def test_confidence_and_spread_losses_have_correct_optimum():
+    """Probability of an error below 10 cm, and expected distance. Both losses have no gradient for the joints."""
     error = (outputs(ASTRAY).joints() - SPREAD_OUT).norm(dim=-1)
     rate = (error < 0.1).float().mean()
     assert 0.1 < rate < 0.9
@@ -132,14 +132,14 @@ def test_confidence_and_spread_are_best_at_what_they_mean():
     assert terms["vote"].requires_grad and terms["joints"].requires_grad
 
 
-def test_padding_has_no_part():
+def test_padding_has_no_part_loss():
     part = torch.zeros(3, 4, 25)
     part[:, 3, 7] = 50.0
     a, b = (losses(outputs(EXACT, part=p), targets(EXACT))["part"] for p in (torch.zeros(3, 4, 25), part))
     assert a == b
 
 
-def test_joints_whose_truth_is_unknown_teach_nothing():
+def test_unlabeled_joints_have_no_loss_and_no_gradient():
     known = targets(SPREAD_OUT).known.clone()
     known[:, 5] = False
     known[3] = False
@@ -155,20 +155,20 @@ def test_joints_whose_truth_is_unknown_teach_nothing():
     assert torch.isfinite(pull).all() and not pull[~known].any() and pull[known].any()
 
 
-def test_visibility_is_learned():
+def test_visibility_loss_follows_labels():
     aims = targets(EXACT, visible=(torch.arange(26) % 2 == 0).float().expand(3, 26))
     pull = gradient("visible", torch.zeros(3, 26), EXACT, aims)
     assert (pull[:, ::2] < 0).all() and (pull[:, 1::2] > 0).all()
 
 
-def test_lengths_of_bones_and_their_symmetry():
+def test_bone_and_symmetry_losses():
     exact = losses(outputs(EXACT), targets(EXACT), bone=2.0, symmetry=3.0)
-    # what the heatmap has no bin for is half a millimeter an axis
+    # decoding the heatmap leaves an error of half a millimeter per axis
     assert exact["bone"] < 2 * 3e-3 and exact["symmetry"] > 0.1
     stretched = losses(outputs(EXACT * 1.1), targets(EXACT), bone=2.0)
     lengths = torch.stack([(EXACT[:, a] - EXACT[:, b]).norm(dim=-1) for a, b in BODY26.bones])
     assert stretched["bone"].item() == pytest.approx(2.0 * 0.1 * lengths.mean().item(), abs=4e-3)
-    # a body and its mirror image have even sides together
+    # a mirror-symmetric body has no symmetry loss
     even = EXACT.clone()
     left = [j for j, name in enumerate(BODY26.joints) if "left" in name]
     even[:, [BODY26.flip[j] for j in left]] = even[:, left] * torch.tensor([-1.0, 1, 1])
@@ -179,7 +179,7 @@ def test_lengths_of_bones_and_their_symmetry():
 # --- schedule and optimizers
 
 
-def test_the_rate_rises_stays_and_falls_to_nothing():
+def test_rate_factor_warms_up_and_cools_down_to_zero():
     done = np.linspace(0, 1, 2001)
     factor = np.array([rate_factor(d, RECIPE) for d in done])
     assert (factor >= 0).all() and (factor <= 1).all() and factor[0] > 0 and factor[-1] == rate_factor(1.5, RECIPE) == 0
@@ -189,28 +189,28 @@ def test_the_rate_rises_stays_and_falls_to_nothing():
     assert np.abs(np.diff(factor)).max() < 0.03
 
 
-def test_a_rate_is_reduced_where_two_epochs_gain_too_little():
+def test_plateau_factor_is_reduced_after_two_bad_epochs():
     assert optim.plateau_factor([], 1e-4) == optim.plateau_factor([1.0, 0.98, 0.975], 1e-4) == 1
-    # the second of two bad ones; then counted anew; a gain of more than 1 % over the best clears the count
+    # reduced after two bad epochs, then the count restarts; a gain of more than 1 % restarts it, too
     assert optim.plateau_factor([1.0, 0.995, 0.995], 1e-4) == pytest.approx(0.9)
     assert optim.plateau_factor([1.0, 1, 1, 1], 1e-4) == pytest.approx(0.9)
     assert optim.plateau_factor([1.0, 1, 0.9, 0.9, 0.9], 1e-4) == pytest.approx(0.9)
-    # torch leaves off where a step is under 1e-8
-    assert 3e-8 < optim.plateau_factor([1.0] * 400, 1e-4) * 1e-4 < 1e-7
+    # torch makes no reductions of less than 1e-8
+    assert 9e-8 < optim.plateau_factor([1.0] * 400, 1e-4) * 1e-4 < 1e-7 and optim.plateau_factor([1.0] * 99, 2e-8) == 1
     with pytest.raises(InputError, match="only fine-tuning has epochs"):
         recipe(Pretrain, schedule="reduce-on-plateau")
 
 
-def test_the_released_schedule():
+def test_paper_recipe_has_released_cosine_schedule():
     cosine = recipe(Pretrain, "paper")
-    # half of the way down, half of the rate
+    # half of the rate in the middle of the decay
     middle = cosine.warmup + (1 - cosine.warmup) / 2
     for done, factor in ((0, 0.1), (cosine.warmup, 1), (middle, (1 + 1e-3) / 2), (1, 1e-3)):
         assert rate_factor(done, cosine) == pytest.approx(factor)
     assert (np.diff([rate_factor(d, cosine) for d in np.linspace(cosine.warmup, 1, 500)]) < 0).all()
 
 
-def test_every_weight_is_learned_once_and_decays():
+def test_optimizers_cover_all_parameters_with_decay():
     network = PoseNet(TINY)
     made, (alone,) = optimizers(network, RECIPE), optimizers(network, replace(RECIPE, muon_rate=0.0))
     groups = [group for optimizer in made for group in optimizer.param_groups]
@@ -223,7 +223,7 @@ def test_every_weight_is_learned_once_and_decays():
     assert all(value.ndim == 2 for name, value in network.named_parameters() if name in names)
 
 
-def test_the_mean_of_the_weights_follows_them():
+def test_average_follows_weights():
     network = torch.nn.Linear(1, 1)
     mean = {name: torch.zeros_like(value) for name, value in network.named_parameters()}
     average(mean, network, 0, 0.999)
@@ -255,36 +255,38 @@ def whole():
 
 
 @pytest.mark.long
-def test_chunks_are_the_same_from_any_start_by_any_number_of_workers(whole, monkeypatch):
+def test_chunks_do_not_depend_on_start_and_workers(whole, monkeypatch):
     assert len(whole) == 3 and all(len(batches) == BATCHES for batches in whole)
     joints = np.concatenate([b["joints"] for batches in whole for b in batches])
     assert len(np.unique(joints[:, 5], axis=0)) == len(joints) == RECIPE.people
     for start in (1, 2):
         assert_same_chunks(whole[start:], chunks(RECIPE, start=start))
     for workers, shared in ((1, 0), (2, 0), (1, 2**60)):
-        # without enough shared memory they come through a pipe
+        # without enough shared memory, chunks are sent through a pipe
         monkeypatch.setattr(data_loader, "_SHARED_OF_WORKER", shared)
         assert data_loader._has_shared_memory(workers) == (not shared and data_loader._SHARED_MEMORY.is_dir())
         assert_same_chunks(whole, chunks(RECIPE, workers))
-    # the last one may be short
+    # the last chunk may be short
     short = list(chunks(RECIPE, steps=BATCHES + 3))
     assert [len(batches) for batches in short] == [BATCHES, 3]
     assert_same_chunks(whole[:1], short[:1])
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_workers_go_on_when_their_whole_group_is_told_to_stop(whole, number):
-    """The run needs them for the batches that it finishes before it saves."""
-    made = []
+def test_workers_ignore_stop_signals(whole, number):
+    """The run needs them for the batches that it finishes before saving."""
+    made, signaled = [], 0
     for batches in chunks(RECIPE, 1):
         for worker in multiprocessing.active_children():
             os.kill(worker.pid, number)
+            signaled += 1
         made.append(batches)
+    assert signaled
     assert_same_chunks(made, whole)
 
 
-def test_processes_share_every_batch_out():
-    """Together they show the people of one process, batch by batch, and nobody twice."""
+def test_processes_share_each_batch():
+    """Their batches together contain the people of a single process's batch, each once."""
     settings = {"batch": 8, "steps": BATCHES + 1}
     alone = list(chunks(RECIPE, **settings))
     for ranks in (2, 4):
@@ -299,7 +301,7 @@ def test_processes_share_every_batch_out():
 
 @pytest.fixture
 def asked(monkeypatch):
-    """(index, hard) of everybody who is made."""
+    """(index, hard) of each generated person."""
     made, original = [], Generator.person
 
     def person(self, seed, index, *, hard):
@@ -310,20 +312,20 @@ def asked(monkeypatch):
     return made
 
 
-def test_difficulty_rises_over_the_first_share_of_the_run(asked):
+def test_difficulty_rises_over_easy_share_of_run(asked):
     list(chunks(replace(RECIPE, scene="wild", easy=0.5, batch=4, people=96)))
-    # lane by lane
+    # people are generated lane by lane
     index, hard = np.array(sorted(asked)).T
     np.testing.assert_array_equal(index, np.arange(96))
     ceiling = np.minimum(index / 48, 1)
     assert hard[0] == 0 and (hard <= ceiling).all()
-    # below the ceiling every difficulty goes on being seen, the harder ones more often: its mean is two thirds
+    # all difficulties below the ceiling occur, harder ones more often: the mean is two thirds of it
     assert (hard[1:] / ceiling[1:]).mean() == pytest.approx(2 / 3, abs=0.08) and hard[48:].min() < 0.35
 
 
 @pytest.mark.parametrize("scene", ["paper", "reference"])
-def test_the_paper_s_people_are_all_as_hard_as_the_paper_s(asked, scene):
-    """Everybody masked: `hard` would take the mask away."""
+def test_paper_scenes_have_full_difficulty(asked, scene):
+    """All people are masked; a lower difficulty would remove the mask."""
     list(chunks(replace(recipe(Pretrain, "paper"), size="tiny", scene=scene, batch=4, people=32)))
     assert {hard for _, hard in asked} == {1.0}
     asked.clear()
@@ -332,23 +334,23 @@ def test_the_paper_s_people_are_all_as_hard_as_the_paper_s(asked, scene):
 
 
 @pytest.mark.parametrize("hard", [0.0, 0.4])
-def test_the_difficulty_of_the_scene_is_the_highest(asked, hard):
+def test_difficulty_of_scene_is_the_maximum(asked, hard):
     list(chunks(replace(RECIPE, scene="wild", set=(f"hard={hard}",), easy=0.0, batch=4, people=32)))
     difficulties = np.array([difficulty for _, difficulty in asked])
     assert difficulties.max() <= hard and difficulties.mean() == pytest.approx(2 / 3 * hard, abs=0.1)
 
 
-def test_easier_people_are_seen_better():
+def test_easier_people_are_more_visible():
     generator = Generator(scene=SCENES["wild"])
     easy, full = (np.mean([generator.person(1, k, hard=h).facts.visible for k in range(64)]) for h in (0.0, 1.0))
     assert easy > full + 0.03
 
 
-def test_sources_go_to_processes_that_do_not_fork(tmp_path):
+def test_sources_can_be_pickled(tmp_path):
     motion = write_amass(tmp_path / "walk_poses.npz", *a_clip(40))
     source = SyntheticSource(scene="wild", seed=3, motion=str(motion), captured=0.5)
     want = source.example(1)
-    # what is remembered stays behind
+    # cached data is not pickled
     sent = pickle.dumps(Chunks(source=source, objective=OBJECTIVE, batch=2, seed=3, start=0, steps=8))
     assert len(sent) < 20_000
     np.testing.assert_array_equal(pickle.loads(sent).source.example(1).points, want.points)
@@ -357,7 +359,7 @@ def test_sources_go_to_processes_that_do_not_fork(tmp_path):
     np.testing.assert_array_equal(there.person(1, 2).sample.points, generator.person(1, 2).sample.points)
 
 
-def test_disturbed_people_have_their_joints_and_more_or_other_points():
+def test_add_disturbances_changes_points_only():
     sample = Generator(scene=SCENES["wild"], measure=False).person(2, 0).sample
     before, count = sample.points.copy(), len(sample.points)
 
@@ -373,6 +375,10 @@ def test_disturbed_people_have_their_joints_and_more_or_other_points():
         assert (other.part[count:] == 0).all() and len(other.part) == len(other.points) and other.pose is sample.pose
         np.testing.assert_array_equal(other.center, center_of(other.points))
     assert max(len(other.points) for other in cluttered) > count + 50
+    # the center is kept in a crop of two people
+    crowded = replace(sample, source="synth/wide/os1-64/inverted+crowded", center=sample.center + np.float32(0.3))
+    moved = add_disturbances(crowded, strays=1.0, noise=1.0, rng=np.random.default_rng(0))
+    assert len(moved.points) != count and np.array_equal(moved.center, crowded.center)
     blurred = changed(0.0, 1.0)
     assert all(other.points.dtype == np.float32 and np.array_equal(other.part, sample.part) for other in blurred)
     steps = [(other.points - sample.points).std() for other in blurred]
@@ -384,7 +390,7 @@ def test_disturbed_people_have_their_joints_and_more_or_other_points():
 # --- settings
 
 
-def test_numbers_of_numpy_paths_and_one_name_alone_are_settings_too():
+def test_recipes_accept_numpy_numbers_paths_and_single_names():
     plain = Pretrain(people=64, rate=0.5, motion="walks", subjects=("002",), shards=("a",))
     other = Pretrain(people=np.int64(64), rate=np.float32(0.5), motion=Path("walks"), subjects="002", shards=Path("a"))
     assert other == plain and json.loads(json.dumps(other.to_dict())) == json.loads(json.dumps(plain.to_dict()))
@@ -404,14 +410,14 @@ def test_numbers_of_numpy_paths_and_one_name_alone_are_settings_too():
         ({"rate": None}, "rate must be a number, got None"),
         ({"scene": 3}, "scene must be text, got 3"),
         ({"shards": [3]}, r"shards must be a list of texts, got \[3\]"),
-        # without a file they would choose nobody
+        # subjects need a motion file
         ({"subjects": ("a",)}, "subjects select captured clips: give their file by motion too"),
         ({"head": "arms"}, "unknown head 'arms': .*"),
         ({"drop_path": "much"}, "drop_path must be a number, got 'much'"),
         *(({"keep_anchors": value}, "keep_anchors must be true or false, got .*") for value in ("false", 0, None)),
     ],
 )
-def test_a_recipe_refuses_what_is_no_such_setting(change, message):
+def test_recipe_rejects_invalid_settings(change, message):
     with pytest.raises(InputError, match=f"^{message}$"):
         recipe(Finetune, data="a", **change) if "keep_anchors" in change else Pretrain(**change)
 
@@ -426,12 +432,12 @@ def test_a_recipe_refuses_what_is_no_such_setting(change, message):
         (Finetune, {"data": "a", "neck": "prn"}, "a checkpoint has its own neck: omit --neck"),
     ],
 )
-def test_switches_of_the_papers_network_are_checked(kind, change, message):
+def test_setup_checks_options_of_paper_network(kind, change, message):
     with pytest.raises(InputError, match=message):
         make_setup(kind(**change))
 
 
-def test_named_recipes():
+def test_named_recipes_match_the_paper():
     assert recipe(Pretrain) == Pretrain()
     paper = recipe(Pretrain, "paper", people=5)
     # Paper: AdamW, cosine, batch 64, 3e-4 and 5e-4, 50 epochs
@@ -441,17 +447,17 @@ def test_named_recipes():
     assert (fine.rate, fine.epochs, fine.mix, fine.augment, fine.keep_anchors) == (5e-4, 50, 0, "paper", False)
     one = make_setup(recipe(Pretrain, "paper-one-stage", people=64)).objective
     assert one.stage == "finetune" and one.config.bins and one.config.drop_path == 0.05 and one.config.neck == "mde"
-    # the paper's figures are of networks that learned from every training sequence
+    # the paper's networks are trained on all training sequences
     assert fine.hold_out == 0
 
 
-def test_a_setup_by_its_old_names():
+def test_setup_accepts_old_names():
     new = make_setup(RECIPE)
     old = Job(task=new.task, **{name: value for name, value in vars(new).items() if name != "objective"})
     assert old == new and new.task is new.objective
 
 
-def test_a_validation_is_the_mean_error_in_mm():
+def test_validate_returns_mean_error_in_mm():
     joints = np.random.default_rng(0).normal(size=(3, 26, 3))
     joints[0, 4] = np.nan
 

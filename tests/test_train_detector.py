@@ -1,4 +1,4 @@
-"""The detector's network: its file, what it learns from, its runs, and what its scores mean."""
+"""Training the detector: leveled scans, the exported file, labels, runs, and validation."""
 
 import json
 from dataclasses import replace
@@ -50,7 +50,7 @@ RECIPE = TrainDetector(scenes=BATCHES * 2, uses=2, batch=2, workers=0, seed=3, v
 
 
 def some_candidates(rng, is_person, *, centers=None, yaw=0.0):
-    """Points of a person's height, or of a low box, 60 for each entry of is_person."""
+    """Candidates with 60 points each: as high as a person where is_person, else a low box."""
     count = len(is_person)
     points = [rng.normal(0, (0.15, 0.2, 0.0), (60, 3)) for _ in is_person]
     for own, tall in zip(points, is_person, strict=True):
@@ -69,7 +69,7 @@ def some_candidates(rng, is_person, *, centers=None, yaw=0.0):
 
 
 def an_example(number, *, count=10):
-    """A scan of people and boxes in turn."""
+    """A scan with alternating people and boxes."""
     rng = np.random.default_rng(number)
     is_person = np.arange(count) % 2 == 0
     labels = Labels(
@@ -85,7 +85,7 @@ def an_example(number, *, count=10):
 
 @pytest.fixture
 def quick_scans(monkeypatch):
-    """Scans that take no time, and a small network."""
+    """Replaces scans by random candidates and the network by a small one."""
 
     def scan(seed, number, *, family="train"):
         return an_example(number + 1000 * (family == "heldout"))
@@ -99,12 +99,12 @@ def quick_scans(monkeypatch):
 # ---- candidates
 
 
-def test_tilted_scans_are_leveled_before_training_as_before_detection(monkeypatch):
+def test_tilted_scans_are_leveled_before_training(monkeypatch):
     scene = detection_scene(3, 12)
     assert estimate_up(scene.points, scene.origin) is None
     R = axis_angle_to_matrix(np.array([0.25, -0.3, 0.0]))
     joints = (scene.joints @ R.T).astype(np.float32)
-    # as tight as they were, but upright in the tilted frame
+    # as tight as before, but upright in the tilted frame
     grown = np.ptp(joints[..., 2], 1) - np.ptp(scene.joints[..., 2], 1)
     boxes = tuple(
         replace(box, center=R @ box.center, size=box.size + [0, 0, more])
@@ -135,7 +135,7 @@ def random_inputs(candidates, config=CONFIG, seed=0):
     return {name: rng.normal(size=shape).astype(np.float32) for name, shape in config.shapes(candidates).items()}
 
 
-def test_a_candidate_s_answer_is_its_own():
+def test_network_output_does_not_depend_on_other_candidates():
     torch.manual_seed(0)
     network = DetectorNet(CONFIG).eval()
     assert 2e5 < sum(value.numel() for value in network.parameters()) < 4.5e5
@@ -148,7 +148,7 @@ def test_a_candidate_s_answer_is_its_own():
 
 
 @pytest.mark.long
-def test_the_file_gives_what_the_network_gives(tmp_path):
+def test_exported_detector_matches_network(tmp_path):
     torch.manual_seed(0)
     network, path = DetectorNet(CONFIG), tmp_path / "detector.onnx"
     card = {"calibration": [[-1.0, 1.0], [0.1, 0.9]], "default_score": 0.5}
@@ -170,7 +170,7 @@ def test_the_file_gives_what_the_network_gives(tmp_path):
 
 
 @pytest.mark.long
-def test_a_pose_network_is_no_detector_and_a_detector_poses_nobody(tmp_path):
+def test_detector_and_pose_network_are_not_interchangeable(tmp_path):
     with refused("expected a detector, got a network of the kind pose"):
         open_detector(bundled_path("tiny", ".onnx"))
     path = tmp_path / "detector.safetensors"
@@ -183,14 +183,14 @@ def test_a_pose_network_is_no_detector_and_a_detector_poses_nobody(tmp_path):
 # ---- labels
 
 
-def test_who_is_whose_candidate():
+def test_labels_of_assigns_candidates_to_people():
     boxes = tuple(
         Box(center=np.array([x, 0.0, 0.9]), size=np.array([0.6, 0.6, 1.9]), yaw=0.0, id=str(k))
         for k, x in enumerate((5.0, 10.0, 20.0))
     )
     person = np.repeat(np.array([0, 1, 2, -1], np.int16), [40, 40, 3, 10])
     scene = SimpleNamespace(boxes=boxes, person=person, mounted=np.array([False, True, False]))
-    # the person's; between; nobody's; of somebody of whom 3 points are seen; the nearest of somebody's, if far away
+    # on a person; between; on no person; on a person with 3 points; the nearest one of a person, though far away
     places = [(5.2, 0.2), (5.0, -0.45), (5.0, 0.6), (20.0, 0.1), (10.4, 0.0)]
     rng = np.random.default_rng(0)
     candidates = some_candidates(rng, [True] * 5, centers=[(x, y, -0.1) for x, y in places], yaw=np.pi / 2)
@@ -202,7 +202,7 @@ def test_who_is_whose_candidate():
     assert labels.mounted.tolist() == [False, False, False, False, True]
 
 
-def test_labels_move_with_the_points():
+def test_transform_labels_matches_augmentation():
     labels = replace(an_example(0, count=1).labels, center=np.array([[0.3, 0.1]], np.float32))
     change = CandidateAugmentation(turn=np.pi / 2, mirror=True, scale=1.05, shift=(0.02, -0.04))
     after = transform_labels(labels, change)
@@ -214,14 +214,14 @@ def test_labels_move_with_the_points():
 # ---- learning
 
 
-def test_each_scan_is_shown_so_often_whoever_makes_it(quick_scans, monkeypatch):
+def test_scene_source_shows_each_scan_equally_often(quick_scans, monkeypatch):
     shown = []
     real = SceneSource._scan
     monkeypatch.setattr(SceneSource, "_scan", lambda self, n, newest: shown.append(n) or real(self, n, newest))
     source = replace(setup.make_setup(replace(RECIPE, uses=3)).source, lag=4)
     examples = [source.example(index) for index in range(60)]
     assert all(shown.count(number) == 3 for number in range(8, 12)) and len(source._kept) <= 3 * 4 + 1
-    # another process begins in the middle
+    # another process starts in the middle
     again = replace(source).example(37)
     objective = DetectorObjective(config=SMALL)
     for name, array in objective.collate([examples[37]]).items():
@@ -230,7 +230,7 @@ def test_each_scan_is_shown_so_often_whoever_makes_it(quick_scans, monkeypatch):
     assert shown[36] == shown[49] and not np.array_equal(*fine)
 
 
-def test_the_hardest_of_nobody_are_learned_from():
+def test_training_rows_include_hardest_negatives():
     logit = torch.arange(200.0)
     person = torch.full((200,), NOBODY)
     person[:4], person[199] = torch.arange(4), IGNORE
@@ -239,14 +239,14 @@ def test_the_hardest_of_nobody_are_learned_from():
     assert set(range(189, 199)) < set(rows) and len(rows) < 60
 
 
-def test_average_precision_is_the_mean_precision_of_true_ones():
+def test_average_precision_is_mean_precision_of_positives():
     logit, truth = torch.tensor([4.0, 3.0, 2.0, 1.0]), torch.tensor([True, False, True, False])
     assert average_precision(logit, truth) == pytest.approx((1 + 2 / 3) / 2)
     assert average_precision(logit, torch.zeros(4, dtype=torch.bool)) == 0
 
 
 @pytest.mark.long
-def test_a_handful_of_candidates_is_learned_by_heart():
+def test_detector_overfits_a_few_candidates():
     torch.manual_seed(0)
     objective = DetectorObjective(config=SMALL)
     arrays = objective.collate([an_example(0, count=16), an_example(1, count=16)])
@@ -270,7 +270,7 @@ def log_of(folder):
 
 
 @pytest.mark.long
-def test_a_killed_run_goes_on_to_the_same_losses(quick_scans, tmp_path):
+def test_killed_run_resumes_to_same_losses(quick_scans, tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     loop.train(RECIPE, whole)
     train_until_killed(RECIPE, killed, "_step", BATCHES + 2)
@@ -284,7 +284,7 @@ def test_a_killed_run_goes_on_to_the_same_losses(quick_scans, tmp_path):
     assert json.loads((killed / run_dir.CONFIG).read_text())["kind"] == "train-detector"
 
 
-def test_the_command_trains(quick_scans, tmp_path, capsys):
+def test_train_detector_command_trains_and_checks_options(quick_scans, tmp_path, capsys):
     folder = tmp_path / "run"
     words = ["--scenes", "8", "--uses", "2", "--batch", "2", "--workers", "0", "--seed", "3"]
     assert main(["train-detector", str(folder), *words]) == 0
@@ -302,23 +302,23 @@ def test_the_command_trains(quick_scans, tmp_path, capsys):
     assert "resume it with that command" in capsys.readouterr().err
 
 
-def test_people_missed_at_one_false_person_a_scan(quick_scans):
+def test_missed_people_at_one_false_positive_per_scan(quick_scans):
     examples = candidate_source.validation_scans(0)
     logits = iter([np.array(values) for values in ([9.0, 8, 7, 6, 5, 4, 3, 2, 1, 0],) * 3])
     objective = SimpleNamespace(
         collate=lambda examples: None, scores=lambda *args, **kwargs: np.pad(next(logits)[:, None], ((0, 0), (0, 5)))
     )
-    # of people 9, 7, 5, 3, 1 and others 8, 6, ... in each of 3 scans the fourth false one, 6, lets 9 and 7 pass
+    # people have 9, 7, 5, 3, 1 and others 8, 6, ... in each of 3 scans; false positive 4 has 6, so 9 and 7 pass
     missed, joints = missed_people(objective, torch.nn.Linear(1, 1), examples, 1)
     assert missed == pytest.approx(60) and joints is None
-    # all moved to one place are one person: the strongest
+    # at one position only the strongest candidate counts
     together = [replace(one, candidates=replace(one.candidates, centers=np.zeros((10, 3)))) for one in examples]
     logits = iter([np.arange(10.0)] * 3)
     assert missed_people(objective, torch.nn.Linear(1, 1), together, 1)[0] == 100
 
 
-def test_a_run_begins_with_the_bundled_detector(tmp_path):
-    """Which is what the exported file of that name computes, to float16's precision."""
+def test_init_detector_loads_bundled_weights(tmp_path):
+    """Its output matches the exported file up to the precision of float16."""
     begun = setup.make_setup(replace(RECIPE, init="detector")).network()
     session, _ = open_network(detector_path())
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Test-time augmentation: estimates are brought back to where the person is, and averaged."""
+"""Test-time augmentation: transforms, their inverses, and averages of estimates."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -23,12 +23,12 @@ RIGHT = np.array([name.startswith("right_") for name in HUMAN15.joints])
 
 
 def answer(about, features):
-    """A network that is right by construction: joints about the points' mean, left ones to the left of who faces the
-    sensor, each a little higher than the one before of its side."""
+    """A network that is exact by construction: joints about the mean of the points, left joints to the left of a person
+    who faces the sensor, each pair of joints at its own height."""
     mean = np.stack([points.mean(0) for points in about])
     aside = np.cross([0, 0, 1.0], features[:, :3]) * 0.2
     side = LEFT.astype(float) - RIGHT
-    # what has a twin must not depend on which of the two is named first
+    # left and right joint of a pair have the same height
     height = np.array([0.05 * min(j, HUMAN15.flip[j]) for j in range(len(HUMAN15))])
     joints = mean[:, None] + side[:, None] * aside[:, None] + height[:, None] * [0, 0, 1]
     confidence = np.broadcast_to(0.5 + 0.3 * LEFT, joints.shape[:2])
@@ -42,18 +42,18 @@ def answer(about, features):
     shift=st.tuples(*[st.floats(-0.1, 0.1)] * 3),
     seed=st.integers(0, 1000),
 )
-def test_estimates_are_brought_back(turns, mirrored, shift, seed):
+def test_invert_undoes_apply(turns, mirrored, shift, seed):
     rng = np.random.default_rng(seed)
     centers = rng.normal(0, 5, (3, 3)) + [20, 0, 0]
     clouds = [center + rng.normal(0, 0.4, (30, 3)) for center in centers]
 
     def seen_by(transform):
-        # from a sensor so far away that a shift turns nothing
+        # the sensor is so far away that shifts do not change the view direction
         return invert(answer(*apply(transform, clouds, centers, np.array([1e7, 3e6, 0]))), transform)
 
     plain, other = seen_by(TTATransform()), seen_by(TTATransform(turns, mirrored, shift))
     np.testing.assert_allclose(other.joints, plain.joints, atol=1e-5)
-    # a mirrored left hand is the right one's
+    # mirroring swaps left and right joints
     flip = np.array(HUMAN15.flip) if mirrored else np.arange(len(HUMAN15))
     np.testing.assert_array_equal(other.confidence, plain.confidence[:, flip])
     np.testing.assert_array_equal(other.in_range, plain.in_range[:, flip])
@@ -65,23 +65,39 @@ def estimate(value, confidence, people=2):
     return Pose(joints=np.full((people, 15, 3), float(value)), skeleton=HUMAN15, confidence=each, spread=each)
 
 
-def test_the_surer_estimate_counts_more():
+def test_average_weights_estimates_by_confidence():
     joints = average([estimate(0.0, 0.9), estimate(1.0, 0.45)]).joints
     assert 0 < joints.max() < 0.01
-    # without confidence, or where all are as sure, all count alike
+    # without confidence, or with equal confidence, all estimates have the same weight
     for confidence in (0.5, None):
         assert (average([estimate(0.0, confidence), estimate(1.0, confidence)]).joints == 0.5).all()
-    # a person whom no estimate is sure of has the plain mean too, and is no harm to others
+    # a person with zero confidence gets the plain mean, and other people are not affected
     sure, unsure = estimate(0.0, 0.5), estimate(1.0, 0.5)
     unsure.confidence[1] = sure.confidence[1] = 0.0
     assert (average([sure, unsure]).joints == 0.5).all()
     assert average([sure]) is sure
 
 
-def test_transforms_are_different_and_the_first_is_the_identity():
+def test_average_in_range_is_majority_vote():
+    joints, in_range = np.zeros((1, 15, 3)), np.zeros((3, 1, 15), bool)
+    in_range[:1, 0, 0] = in_range[:2, 0, 1] = in_range[:, 0, 2] = True
+    found = average([Pose(joints=joints, skeleton=HUMAN15, in_range=own) for own in in_range])
+    assert found.in_range[0, :4].tolist() == [False, True, True, False]
+
+
+def test_apply_shifts_then_rotates_then_mirrors():
+    np.testing.assert_array_equal(TTATransform(1, True).R_view_person @ [1, 2, 3], [-2, -1, 3])
+    # a sensor two meters ahead and one to the left of the shifted center
+    transform, center = TTATransform(1, True, (0.05, 0.1, 0.0)), np.array([[4.0, 5.0, 1.0]])
+    (points,), view = apply(transform, [np.array([[5.05, 7.1, 4.0]])], center, np.array([6.05, 6.1, 1.0]))
+    np.testing.assert_allclose(points, [[-2, -1, 3]], atol=1e-9)
+    np.testing.assert_allclose(view[0, :3] * np.exp(view[0, 3]), [-1, -2, 0], atol=1e-6)
+
+
+def test_tta_transforms_are_distinct_and_start_with_identity():
     assert tta_transforms(1) == (TTATransform(),) and tta_transforms(np.int64(3)) == tta_transforms(3)
     assert len(set(TRANSFORMS)) == len(TRANSFORMS) == len(tta_transforms(8))
-    # no two put the fine grid in the same place
+    # no two transforms shift the fine grid to the same position
     assert len({tuple(np.round(np.mod(each.shift, 0.06), 6)) for each in TRANSFORMS}) == len(TRANSFORMS)
     for tta in (0, 9, -1, 1.5, True, "four"):
         with pytest.raises(InputError, match="tta must be a whole number from 1 to 8"):
@@ -89,7 +105,7 @@ def test_transforms_are_different_and_the_first_is_the_identity():
 
 
 def people(count):
-    # sensors to which people stand still: `tiny` was trained when poses of others were those of a frame's beginning
+    # only sensors without motion in a frame: for others `tiny` was trained with poses at the start of the frame
     sensors = ("os1-128", "hdl-64e", "vlp-32c", "pandar64")
     generator = Generator(scene=replace(scene_config("wild"), sensors=sensors), measure=False)
     samples = [generator.person(4711, k).sample for k in range(count)]
@@ -102,8 +118,8 @@ def error(model, clouds, truth):
 
 
 @pytest.mark.long
-def test_more_passes_are_better_than_one_and_results_say_how_many():
-    """The pass that finds the pelvis counts too; alone is the one after it."""
+def test_more_passes_reduce_error_and_are_recorded():
+    """The pass that finds the pelvis is averaged, too; `alone` uses only the pass after it."""
     clouds, truth = people(64)
     alone = lidarpose.load("tiny")
     alone._averaged, alone._first = False, IDENTITY
@@ -116,22 +132,22 @@ def test_more_passes_are_better_than_one_and_results_say_how_many():
     np.testing.assert_allclose(joints[1], one.joints, atol=1e-5)
 
 
-def test_who_is_meant_of_two_is_the_one_at_the_middle_of_the_box():
-    """Asked only where the network sees two people; a lone person's pose is the same in any box."""
+def test_box_center_selects_one_of_two_people():
+    """The box matters only if the network sees two people; the pose of a single person is the same in any box."""
     rng = np.random.default_rng(0)
     clouds = [rng.normal((5, 0, 0), (0.2, 0.2, 0.5), (300, 3)), rng.normal((9, 0, 0), (0.2, 0.2, 0.5), (200, 3))]
     boxes = np.array([[5.3, 0.3, 0.0], [9.2, 0.1, 0.1]])
     estimator = PoseEstimator(TwoPeople(sure=(True, False)))
     asked = estimator.poses(clouds, np.zeros(3), box_centers=boxes)
     plain = estimator.poses(clouds, np.zeros(3))
-    # the answer is always the middle of what it is shown
+    # the fake backend always returns the middle of the crop
     np.testing.assert_allclose(asked[0].joints, np.broadcast_to([5.3, 0.3, 0.0], (15, 3)), atol=0.011)
     np.testing.assert_array_equal(asked[1].joints, plain[1].joints)
     assert np.linalg.norm(plain[0].joints[0] - boxes[0]) > 0.2
 
 
 class TwoPeople:
-    """A backend that puts everybody at the middle of the crop, and sees two people in the first cloud."""
+    """Fake backend: joints at the middle of the crop; two people in the clouds where `sure` is True."""
 
     name, batch = "fake", 64
     header = SimpleNamespace(skeleton=HUMAN15, network="pose")

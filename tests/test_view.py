@@ -1,4 +1,4 @@
-"""Pictures and reports: what is where, who is seen from where, and files that stand alone."""
+"""Pictures and reports: view directions, colors, contents, and self-contained pages."""
 
 import io
 import json
@@ -58,7 +58,7 @@ EMPTY = Panel(points=NOTHING)
 
 
 def report(*people):
-    """The page of people, and its data."""
+    """The page of people and the data embedded in it."""
     text = render_report(list(people), title="t", summary=[])
     return text, Reader(text).data()
 
@@ -71,14 +71,14 @@ def decoded(png):
 
 
 def pixels(image, color):
-    """(k, 2) rows and columns of the pixels of nearly that color."""
+    """(k, 2) rows and columns of the pixels close to a color."""
     return np.argwhere(np.abs(image - color).max(-1) <= 12)
 
 
-def test_facing_needs_one_known_pair_of_joints_that_is_not_upright():
+def test_facing_needs_one_known_pair_of_joints_not_vertical():
     pose = t_pose(yaw=1.0)
     assert facing(None) is None
-    # on the side
+    # lying on the side
     assert facing(replace(pose, joints=t_pose().joints @ rotation_about("x", np.pi / 2).T)) is None
     assert facing(replace(pose, joints=np.full((26, 3), np.nan))) is None
     joints = pose.joints.copy()
@@ -87,7 +87,7 @@ def test_facing_needs_one_known_pair_of_joints_that_is_not_upright():
 
 
 @given(yaw=st.floats(-np.pi, np.pi), seed=st.integers(0, 99))
-def test_front_view_is_face_to_face_and_the_side_view_looks_right(yaw, seed):
+def test_view_directions_are_front_and_right_side(yaw, seed):
     pose = t_pose(yaw=yaw)
     for skeleton in (SMPL24, HUMAN15, WAYMO14, BODY26):
         forward = facing(t_pose(yaw=yaw, skeleton=skeleton))
@@ -100,14 +100,14 @@ def test_front_view_is_face_to_face_and_the_side_view_looks_right(yaw, seed):
     seen = {name: project(at, seen_from=from_right) for name, at in joint.items()}
     assert seen["nose"][0] > seen["head"][0] + 0.05
     assert seen["right_wrist"][2] > seen["left_wrist"][2] + 1
-    # a projection is rigid and keeps what is up
+    # a projection is rigid and keeps the up axis
     points = np.random.default_rng(seed).normal(size=(5, 3))
     moved = project(points, seen_from=front)
     np.testing.assert_allclose(np.linalg.norm(moved, axis=1), np.linalg.norm(points, axis=1))
     np.testing.assert_allclose(moved[:, 1], points[:, 2])
 
 
-def test_sides_of_bones():
+def test_bone_sides_are_left_right_and_center():
     named = dict(zip(WAYMO14.bones, bone_sides(WAYMO14), strict=True))
     at = WAYMO14.index
     assert named[at("nose"), at("left_shoulder")] == "left"
@@ -115,8 +115,8 @@ def test_sides_of_bones():
     assert named[at("left_hip"), at("right_hip")] == "center"
 
 
-def test_picture_has_left_in_blue_on_the_right_of_the_front_view(tmp_path):
-    # the person looks at the frame's +y; points are left out so that only the skeleton has colors
+def test_front_view_shows_left_side_in_blue_on_the_right(tmp_path):
+    # the person faces +y of the frame; without points only the skeleton has colors
     panel = Panel(points=NOTHING, pose=t_pose(yaw=np.pi / 2, confidence=1.0), label="a")
     png = draw_people([panel], tmp_path / "sheet.png")
     assert (tmp_path / "sheet.png").read_bytes() == png
@@ -130,7 +130,7 @@ def test_picture_has_left_in_blue_on_the_right_of_the_front_view(tmp_path):
     assert (orange[:, 1] > half).sum() > (blue[:, 1] > half).sum()
 
 
-def test_an_unsure_pose_is_fainter():
+def test_pose_of_low_confidence_is_fainter():
     def ink(confidence):
         panel = Panel(points=NOTHING, pose=t_pose(confidence=confidence))
         return (255 - decoded(draw_people([panel]))[70:]).sum()
@@ -138,7 +138,7 @@ def test_an_unsure_pose_is_fainter():
     assert ink(0.05) < 0.7 * ink(1.0)
 
 
-def test_points_have_the_colors_of_their_parts_else_of_their_depth():
+def test_points_are_colored_by_part_or_else_by_depth():
     def shown(points, **settings):
         return decoded(draw_people([Panel(points=points, **settings)]))[70:]
 
@@ -171,12 +171,12 @@ def test_points_have_the_colors_of_their_parts_else_of_their_depth():
         Panel(points=cloud(t_pose(skeleton=WAYMO14)), pose=t_pose(skeleton=WAYMO14), truth=t_pose(skeleton=HUMAN15)),
     ],
 )
-def test_odd_people_are_drawn(panel):
+def test_draw_people_accepts_unusual_panels(panel):
     image = decoded(draw_people([panel], title="odd"))
     assert (image < 128).any()
 
 
-def test_a_person_beside_a_wall_is_in_the_picture():
+def test_person_beside_wall_is_drawn_large_enough():
     pose = t_pose(confidence=1.0)
     wall = np.random.default_rng(0).uniform((13, 4, -1), (13.1, 12, 2), (3000, 3))
     alone, beside = (
@@ -186,10 +186,10 @@ def test_a_person_beside_a_wall_is_in_the_picture():
     assert len(beside) > 0.15 * len(alone)
 
 
-def test_what_is_said_under_a_person():
+def test_describe_gives_points_distance_and_confidence():
     panel = Panel(points=np.tile([3.0, 4, 0], (1500, 1)))
     assert describe(panel) == "1,500 points · 5.0 m"
-    # where the person is, not most of the points
+    # the distance of the pose, not of most points
     assert describe(replace(panel, pose=t_pose(at=(6, 8, -1), confidence=0.5))) == (
         "1,500 points · 10.0 m · confidence 0.50"
     )
@@ -197,32 +197,32 @@ def test_what_is_said_under_a_person():
     assert describe(EMPTY) == "0 points"
 
 
-def test_names_and_titles_of_any_length_and_script(recwarn):
+def test_labels_and_titles_of_any_length_and_script(recwarn):
     name = "0aa51a7c-6c2d-4c0e-9d5e-7f1b2a3c4d5e"
     assert shortened(name, 36) == name and shortened(name, 11) == "0aa51…c4d5e"
     image = decoded(draw_people([EMPTY], title="0123456789abcdef" * 4 + ".npy"))
     assert (image[:, -8:] == 255).all()
-    # what the font lacks is no warning
+    # characters missing in the font give no warning
     draw_people([Panel(points=np.zeros((3, 3)), label="人")], title="点云.pcd")
     assert not recwarn.list
 
 
-def test_only_so_many_people_fit(monkeypatch):
+def test_draw_people_limits_number_of_people(monkeypatch):
     monkeypatch.setattr(draw, "MAX_PEOPLE", 6)
     people = [Panel(points=np.ones((1, 3)) * i, label=str(i)) for i in range(7)]
     full, over = decoded(draw_people(people[:-1], title="t")), decoded(draw_people(people, title="t"))
     assert over.shape == full.shape
-    assert (over[60:] == full[60:]).all() and (over[:60] != full[:60]).any()  # they differ by the note
+    assert (over[60:] == full[60:]).all() and (over[:60] != full[:60]).any()  # they differ only by the note
     assert decoded(draw_people([])).shape[1] > 200
 
 
-def test_picture_is_the_same_each_time_and_changes_nothing():
+def test_draw_people_is_deterministic_and_keeps_input():
     from matplotlib import rc_context
 
     panel = person(count=60)
     before = panel.points.copy(), panel.pose.joints.copy()
     png = draw_people([panel], title="a")
-    # whatever the user's settings
+    # independent of the user's settings of matplotlib
     with rc_context({"savefig.bbox": "tight", "savefig.dpi": 50, "font.size": 30, "figure.facecolor": "black"}):
         assert draw_people([panel], title="a") == png
     np.testing.assert_array_equal(before[0], panel.points)
@@ -238,7 +238,7 @@ def test_picture_is_the_same_each_time_and_changes_nothing():
         ({"part": np.zeros(4, int)}, r"part must be \(5,\)"),
     ],
 )
-def test_wrong_shapes_are_refused(settings, message):
+def test_panel_rejects_wrong_shapes(settings, message):
     with pytest.raises(InputError, match=message):
         Panel(**{"points": np.zeros((5, 3))} | settings)
 
@@ -247,7 +247,7 @@ VOID = {"meta", "input", "br", "link", "img"}
 
 
 class Reader(HTMLParser):
-    """Reads a page strictly: tags nest, and what matters is kept."""
+    """Parses a page strictly: tags must nest. Collects tags, attributes and texts."""
 
     def __init__(self, text):
         super().__init__(convert_charrefs=True)
@@ -282,7 +282,7 @@ def evil_report():
     return render_report(people, title=EVIL, summary=[{EVIL: EVIL}])
 
 
-def test_report_escapes_what_callers_say():
+def test_report_escapes_text_of_callers():
     page = Reader(evil_report())
     assert page.tags.count("script") == 2
     assert page.tags.count("canvas") == 2
@@ -292,20 +292,20 @@ def test_report_escapes_what_callers_say():
     assert ("canvas", "aria-label", f"3D view of {EVIL}") in page.attributes
 
 
-def test_report_data_cannot_end_its_element():
+def test_report_data_cannot_end_script_element():
     name = "</script><!--<script>"
     pose = Pose(joints=np.zeros((1, 3)), skeleton=Skeleton(name=name, joints=(name,), parents=(-1,)))
     _, data = report(Panel(label="", points=np.ones((9, 3)), pose=pose))
     assert data["skeletons"][name]["joints"] == [name]
 
 
-def test_report_loads_nothing():
+def test_report_loads_no_external_resources():
     text = evil_report()
     assert not re.search(r"https?:|//\w+\.|@import|url\(|\bsrc=|<link|fetch\(|XMLHttpRequest|import\(", text)
     assert "default-src 'none'" in text
 
 
-def test_report_holds_the_data():
+def test_report_contains_data_of_people():
     given = person(yaw=1.25)
     joints = given.pose.joints.copy()
     joints[3] = np.nan
@@ -323,8 +323,8 @@ def test_report_holds_the_data():
     assert {s for *_, s in skeleton["bones"]} == set(skeleton["sides"]) == set("lrc")
 
 
-def test_report_shows_a_scan_about_its_people():
-    """All points near people, a choice of the others, none far away; everybody's joints where they are."""
+def test_report_scan_keeps_points_near_people():
+    """All points near people, a subset of the others, no distant points, and joints at their positions."""
     rng = np.random.default_rng(2)
     joints = np.stack([person().pose.joints + at for at in ([5.0, 0, 0], [9.0, 3, 0])])
     joints[1, 4] = np.nan
@@ -346,7 +346,7 @@ def test_report_shows_a_scan_about_its_people():
     assert "canvas" in Reader(render_report([], title="", summary=[], scans=[nobody])).tags
 
 
-def test_report_is_small_and_thins_what_is_too_much():
+def test_report_is_small_and_subsamples_points():
     people = [person(count=1000, label=str(i), yaw=i) for i in range(12)]
     text, data = report(*people)
     assert len(text.encode()) < 500_000 and text == report(*people)[0]
@@ -354,14 +354,14 @@ def test_report_is_small_and_thins_what_is_too_much():
     text, _ = report(*[person(count=MAX_POINTS)] * 2)
     assert len(text.encode()) < 1_500_000
     assert "30,000 of 60,000 points drawn" in text
-    # points that are nowhere are not drawn, and not counted as drawn
+    # points without a valid position are not drawn, and not counted as drawn
     odd = person(count=100)
     odd.points[:90], odd.points[90] = np.nan, 1e30
     text, data = report(odd)
     assert "9 of 100 points drawn" in text and len(data["people"][0]["points"]) == 27
 
 
-def test_report_of_odd_people():
+def test_report_accepts_people_without_pose():
     nothing = Pose(joints=np.full((26, 3), np.nan), skeleton=BODY26)
     text, data = report(
         Panel(label="none", points=NOTHING),
@@ -375,7 +375,7 @@ def test_report_of_odd_people():
     assert "no people" in report()[0]
 
 
-def test_summary_table():
+def test_report_formats_summary_table():
     rows = [
         {"set": "near", "people": 1873, "MPJPE mm": 63.412, "PCK": np.float32(0.5), "ok": True, "a": 8.6, "b": 3.0},
         {"set": "far", "people": np.int64(2), "MPJPE mm": 103.25, "extra": "x", "a": 20.0, "b": 4.0, "c": 12.5},
@@ -394,13 +394,13 @@ def test_summary_table():
 
 @settings(max_examples=20, deadline=None)
 @given(label=st.text(max_size=40))
-def test_any_label_is_readable_again(label):
+def test_report_label_survives_round_trip(label):
     page = Reader(report(Panel(label=label, points=np.ones((1, 3))))[0])
     shown = "".join(page.texts.get("strong", []))
     assert shown == label or any(not c.isprintable() for c in label)
 
 
-def test_files_and_labels_from_strange_file_names(tmp_path):
+def test_undecodable_labels_are_written(tmp_path):
     path = tmp_path / "report.html"
     write_report(path, [person()], title="t", summary=[{"a": 1}])
     assert path.read_text(encoding="utf-8") == render_report([person()], title="t", summary=[{"a": 1}])
@@ -410,7 +410,7 @@ def test_files_and_labels_from_strange_file_names(tmp_path):
     assert "a?" in path.read_text(encoding="utf-8")
 
 
-def test_a_report_says_the_side_of_every_joint_and_point():
+def test_report_has_side_of_every_joint_and_point():
     part = np.array([0, 1, 1 + BODY26.index("left_knee"), 1 + BODY26.index("right_hand"), 24], np.uint8)
     points = np.arange(15.0).reshape(5, 3)
     points[1] = np.nan

@@ -1,4 +1,4 @@
-"""Voxels, levels and padding against a twin of dictionaries."""
+"""Voxels, levels and padding, compared with a reference implementation based on dictionaries."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def crowd(seed, lengths, spread=0.5, dtype=np.float32):
     """Points of people, some of them outside the window."""
     rng = np.random.default_rng(seed)
     points = rng.normal(0, spread, (sum(lengths), 3))
-    # as a scan of a surface: many points share a voxel
+    # as in a scan of a surface, many points share a voxel
     points = np.where(rng.random(len(points))[:, None] < 0.5, np.round(points, 1), points)
     return (points + rng.normal(0, 0.01, points.shape)).astype(dtype), np.array(lengths, int)
 
@@ -26,7 +26,7 @@ def crowd(seed, lengths, spread=0.5, dtype=np.float32):
 def assert_pyramids_agree(a, b):
     left, right = ({"point_voxel": p.point_voxel} | p.arrays() for p in (a, b))
     assert left.keys() == right.keys()
-    # deviation is a difference of squares: the root of its rounding is what is left at one point a voxel
+    # deviation is the root of a difference of squares: for one point per voxel only rounding errors remain
     tolerance = {"deviation": 1e-6, "offset": 1e-4}
     for name, value in left.items():
         assert value.dtype == right[name].dtype, name
@@ -36,7 +36,7 @@ def assert_pyramids_agree(a, b):
 
 @settings(max_examples=60, deadline=None)
 @given(seeds, people, st.sampled_from([0.03, 0.06, 0.11]), st.sampled_from([1, 7, 40, 384]), st.booleans())
-def test_the_pyramid_is_what_its_twin_says(seed, lengths, grid, most, random):
+def test_voxelize_matches_reference(seed, lengths, grid, most, random):
     points, lengths = crowd(seed, lengths, spread=np.random.default_rng(seed).choice([0.1, 0.5, 1.2]))
     view = np.random.default_rng(seed).normal(size=(len(lengths), 5))
     kwargs = {"grid": grid, "max_voxels": most, "view": view, "neighbors": bool(seed % 2)}
@@ -46,21 +46,21 @@ def test_the_pyramid_is_what_its_twin_says(seed, lengths, grid, most, random):
 
 @settings(max_examples=40, deadline=None)
 @given(seeds, people)
-def test_levels_hang_together(seed, lengths):
+def test_voxel_levels_are_consistent(seed, lengths):
     points, lengths = crowd(seed, lengths)
     tables = voxelize(points, lengths, grid=GRID, max_voxels=30)
     for level, above in ((tables.fine, tables.mid), (tables.mid, tables.coarse)):
         counts = np.where(level.valid, np.exp(level.log_count), 0)
         for b in range(len(lengths)):
             parent = level.parent[b][level.valid[b]]
-            # every parent has a child, and counts and means go up whole
+            # every parent has a child, and its count and mean are those of its children
             assert set(parent) == set(np.flatnonzero(above.valid[b]))
             for k in np.flatnonzero(above.valid[b]):
                 mine = level.valid[b] & (level.parent[b] == k)
                 assert np.exp(above.log_count[b, k]) == pytest.approx(counts[b, mine].sum(), rel=1e-5)
                 mean = (level.position[b, mine] * counts[b, mine, None]).sum(0) / counts[b, mine].sum()
                 np.testing.assert_allclose(above.position[b, k], mean, atol=1e-5)
-            # padding stands behind
+            # padding is at the end
             assert (np.diff(level.valid[b].astype(int)) <= 0).all()
     for name, value in tables.arrays().items():
         if name.startswith("fine.") or name in ("deviation", "offset"):
@@ -69,7 +69,7 @@ def test_levels_hang_together(seed, lengths):
 
 @settings(max_examples=40, deadline=None)
 @given(seeds, people)
-def test_neither_batch_mates_nor_the_order_of_points_matter(seed, lengths):
+def test_voxelize_ignores_batch_and_order_of_points(seed, lengths):
     points, lengths = crowd(seed, lengths)
     before = points.copy(), lengths.copy()
     tables = voxelize(points, lengths, grid=GRID, max_voxels=30)
@@ -85,12 +85,12 @@ def test_neither_batch_mates_nor_the_order_of_points_matter(seed, lengths):
                 width = value.shape[1]
                 np.testing.assert_allclose(together[name][b, :width], value[0], atol=1e-6, err_msg=name)
                 assert not together[name][b, width:].any()
-    # inputs stay as they are
+    # inputs are not modified
     np.testing.assert_array_equal(points, before[0])
     np.testing.assert_array_equal(lengths, before[1])
 
 
-def test_neighbors_lie_where_they_should():
+def test_voxel_neighbors_are_the_27_adjacent_cells():
     axis = np.arange(8) * GRID + GRID / 2 - 4 * GRID
     cube = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
     tables = voxelize(cube, np.array([len(cube)]), grid=GRID, max_voxels=999, neighbors=True)
@@ -107,7 +107,7 @@ def test_neighbors_lie_where_they_should():
     np.testing.assert_allclose(step, np.tile([2 * GRID, 0, 0], (48, 1)), atol=1e-6)
 
 
-def test_points_find_their_own_voxel():
+def test_point_voxel_maps_points_to_their_voxel():
     points, lengths = crowd(3, [200, 150], spread=0.9)
     tables = voxelize(points, lengths, grid=GRID, max_voxels=384)
     inside = (np.abs(points) < WINDOW).all(1)
@@ -116,13 +116,22 @@ def test_points_find_their_own_voxel():
     assert np.abs(row - points[inside]).max() < GRID
     owner = tables.point_voxel[inside] // tables.fine.valid.shape[1]
     np.testing.assert_array_equal(owner, np.repeat([0, 1], lengths)[inside])
-    # strays of any size stay outside without a warning
+    # stray points of any size are outside, without a warning
     strays = [[0, 0, 0], [1e30, 0, 0], [np.nan, 0, 0], [0, -np.inf, 0], [2.0, 0, 0], [-1.9999, 0, 0]]
     tables = voxelize(np.array(strays, np.float32), np.array([6]), grid=GRID, max_voxels=9)
     assert (tables.point_voxel >= 0).tolist() == [True, False, False, False, False, True]
 
 
-def test_nobody_empty_people_and_one_point():
+@pytest.mark.parametrize("copies", [3, 7])
+def test_deviation_of_equal_points_is_zero(copies):
+    points, _ = crowd(0, [50], dtype=float)
+    apart = np.unique(np.floor(points / GRID), axis=0, return_index=True)[1]
+    points = points[apart].repeat(copies, 0)
+    pyramid = voxelize(points, np.array([len(points)]), grid=GRID, max_voxels=1000)
+    assert (pyramid.deviation >= 0).all() and pyramid.deviation.max() < 1e-6
+
+
+def test_voxelize_accepts_empty_people_and_single_points():
     none = voxelize(np.zeros((0, 3), np.float32), np.zeros(2, int), grid=GRID, max_voxels=9)
     assert none.fine.valid.shape == (2, 1) and not none.fine.valid.any() and not none.coarse.valid.any()
     point = np.array([[0.07, -0.01, 0.5]], np.float32)
@@ -137,7 +146,7 @@ def test_nobody_empty_people_and_one_point():
     assert not outside.fine.valid.any() and outside.point_voxel.tolist() == [-1]
 
 
-def test_a_grid_too_fine_for_the_index_is_refused():
+def test_voxelize_rejects_too_fine_grid():
     points = np.array([[-1.99, 0, 0], [1.99, 1.99, -1.99]])
     assert voxelize(points, np.array([2]), grid=WINDOW / 128, max_voxels=9).fine.valid.sum() == 2
     with pytest.raises(InputError, match="grid must be at least"):
@@ -145,25 +154,27 @@ def test_a_grid_too_fine_for_the_index_is_refused():
 
 
 @pytest.mark.parametrize("random", [False, True])
-def test_thinning_spares_the_small_and_spreads_over_the_large(random):
+def test_thinning_keeps_small_people_and_covers_large_ones(random):
     small, large = crowd(1, [20])[0], crowd(2, [3000], spread=0.5)[0]
     numbers = np.array([3, 4]) if random else None
     tables = voxelize(np.concatenate([small, large]), np.array([20, 3000]), grid=GRID, max_voxels=100, seeds=numbers)
     assert tables.fine.valid[1].sum() == 100 and tables.fine.valid.shape == (2, 100)
     assert tables.fine.valid[0].sum() == voxelize(small, np.array([20]), grid=GRID, max_voxels=100).fine.valid.sum()
-    # what is kept covers the person, not one end of them: three standard errors of 100 draws of a spread of 0.5 m
+    # kept voxels cover the whole person: within three standard errors of 100 draws with a spread of 0.5 m
     np.testing.assert_allclose(tables.fine.position[1].mean(0), large.mean(0), atol=0.15)
     np.testing.assert_allclose(tables.fine.position[1].std(0), large.std(0), rtol=0.21)
-    # whoever else is in the batch
+    # independent of other people in the batch
     alone = voxelize(large, np.array([3000]), grid=GRID, max_voxels=100, seeds=None if numbers is None else numbers[1:])
     np.testing.assert_array_equal(alone.fine.position[0], tables.fine.position[1])
 
 
-def test_the_view_points_to_the_sensor():
+def test_view_features_point_to_sensor():
     center, origin = np.array([3.0, 4.0, -1.0]), np.array([0.0, 0, -1])
     view = view_features(center, origin)
     assert view.dtype == np.float32
     np.testing.assert_allclose(center + view[:3] * np.exp(view[3]), origin, atol=1e-5)
     assert view[4] == 1 and np.exp(view[3]) == pytest.approx(5, rel=1e-5)
     np.testing.assert_array_equal(view_features(center, None), np.zeros(5))
-    assert np.isfinite(view_features(center, center)).all()
+    # ranges are at least 10 cm
+    np.testing.assert_allclose(view_features(center, center + [0.02, 0, 0]), [0.2, 0, 0, np.log(0.1), 1], atol=1e-6)
+    np.testing.assert_allclose(view_features(center, center), [0, 0, 0, np.log(0.1), 1], atol=1e-6)

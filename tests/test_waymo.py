@@ -1,4 +1,4 @@
-"""Waymo, both versions: points of every laser and return come out where they went in; joins, quirks, wrong input."""
+"""Waymo reader, both versions: points of all lasers and returns, joins of tables, invalid and damaged input."""
 
 import re
 import shutil
@@ -47,7 +47,7 @@ def v1(tmp_path_factory):
 
 @pytest.fixture
 def copy(v2, tmp_path):
-    """A copy of version 2 to be damaged."""
+    """A copy of version 2 that tests may damage."""
     return shutil.copytree(v2, tmp_path / "raw")
 
 
@@ -63,12 +63,12 @@ def everything(root, source=None):
 
 
 def truth():
-    """(time, track) -> Someone, of those who must come out."""
+    """(time, track) -> Someone, for all people that must be read."""
     return {(f.time, one.track): one for f in files.scene() for one in f.people if one.points}
 
 
 def check(items):
-    """Everybody who went in comes out, once: points of each laser and return, rows, joints and labels, to 1 mm."""
+    """Each written person is read once: points of each laser and return, rows, joints and labels, within 1 mm."""
     want = truth()
     assert [(item.frame, item.track) for item in items] == sorted(want)
     for item in items:
@@ -92,7 +92,7 @@ def check(items):
 # --- end to end
 
 
-def test_version_2_comes_out_where_it_went_in(v2):
+def test_version_2_is_read_with_all_people(v2):
     source = reader("waymo")
     assert source.parts(v2) == [f"training/{SEGMENT}"] and source.skeleton == "waymo14"
     items, skipped = everything(v2, source)
@@ -100,7 +100,7 @@ def test_version_2_comes_out_where_it_went_in(v2):
     assert [(one.reason, one.where.split("/")[-1]) for one in skipped] == [
         ("keypoints without a box", "ped-boxless"),
         ("no points in the box", "ped-far: the label counts 123"),
-        ("no joint is labelled", "ped-unlabeled"),
+        ("no joint is labeled", "ped-unlabeled"),
     ]
     assert source.about["settings"] == {"box_margin_m": 0.2} and source.about["licence"] and source.about["notes"]
     labels = Counter(int(label) for item in items for label in item.joint_labels)
@@ -118,7 +118,7 @@ def test_version_2_comes_out_where_it_went_in(v2):
     ],
     ids=str,
 )
-def test_version_2_of_any_width_and_order_and_version_1_are_the_same(v1, v2, tmp_path, kinds):
+def test_all_variants_of_version_2_and_version_1_agree(v1, v2, tmp_path, kinds):
     if kinds is None:
         assert Waymo().parts(v1) == [TFRECORD]
     else:
@@ -134,8 +134,8 @@ def test_version_2_of_any_width_and_order_and_version_1_are_the_same(v1, v2, tmp
             np.testing.assert_array_equal(getattr(x, name), getattr(y, name))
 
 
-def test_rows_and_joins_are_of_one_segment(v2, tmp_path):
-    # the same times and tracks in another segment, whose people are elsewhere
+def test_tables_of_two_segments_are_joined_by_segment(v2, tmp_path):
+    # another segment with the same times and tracks, but people at other positions
     later = files.scene()[1:]
     files.write_v2(tmp_path)
     files.write_v2(tmp_path, segment="9999_0_000_20_000", split="validation", frames=later)
@@ -153,7 +153,7 @@ def test_rows_and_joins_are_of_one_segment(v2, tmp_path):
     check([item for item in items if item.sequence == SEGMENT])
 
 
-def test_the_margin_is_around_the_box(v2, monkeypatch):
+def test_box_margin_selects_points(v2, monkeypatch):
     wide, _ = everything(v2)
     monkeypatch.setattr(waymo_frames, "MARGIN", -0.1)
     tight, _ = everything(v2)
@@ -164,7 +164,7 @@ def test_the_margin_is_around_the_box(v2, monkeypatch):
     assert Waymo().about["settings"] == {"box_margin_m": -0.1}
 
 
-def test_prepare_writes_waymo_and_counts_a_corrupted_segment(v2, tmp_path):
+def test_prepare_writes_waymo_and_counts_corrupted_segment(v2, tmp_path):
     raw = shutil.copytree(v2, tmp_path / "raw")
     files.write_v2(raw, segment="damaged", frames=files.scene()[:1])
     path = raw / "training/lidar_hkp/damaged.parquet"
@@ -185,7 +185,7 @@ def top(T=None, **given):
     return Calibration(T_vehicle_laser=np.eye(4) if T is None else T, **given)
 
 
-def test_pixel_poses_turn_about_x_then_y_then_z_and_end_in_the_frame():
+def test_pixel_poses_rotate_about_x_then_y_then_z():
     image = np.zeros((3, 4))
     image[1, 1] = 2.0
     before, _ = points_of_image(image, top(), None, np.eye(4))
@@ -205,8 +205,8 @@ def test_only_finite_positive_ranges_are_returns():
     assert row.tolist() == [1, 1, 1]
 
 
-def test_the_scene_tells_wrong_readings_apart():
-    """What `check` would see of each mistake: none moves everything by less than a few centimetres."""
+def test_scene_reveals_wrong_conversions():
+    """Each likely mistake moves the points by a few centimeters, so that `check` detects it."""
     frame, laser = files.scene()[1], files.LASERS[1]
     for which in (1, 2):
         image = frame.images[1, which][..., 0]
@@ -230,7 +230,7 @@ def test_the_scene_tells_wrong_readings_apart():
 
 
 def rewritten(path, change):
-    """Writes a table anew after `change` of its rows."""
+    """Rewrites a table with `change` applied to its rows."""
     table = pq.read_table(path)
     pq.write_table(pa.Table.from_pylist(change(table.to_pylist()), schema=table.schema), path)
 
@@ -272,7 +272,7 @@ def without_people(root):
         (lambda root: (root / "v1/individual_files/training").mkdir(parents=True), "v1", "ROOT/v1/individual_files"),
     ],
 )
-def test_wrong_roots_are_told_with_what_helps(copy, change, below, message):
+def test_wrong_root_error_suggests_fix(copy, change, below, message):
     change(copy)
     with pytest.raises(InputError, match=re.escape(message.replace("ROOT", str(copy)))) as caught:
         Waymo().parts(copy / below)
@@ -286,7 +286,7 @@ def test_segments_without_keypoints_need_no_other_files(copy):
 
 @pytest.mark.parametrize("name", ["lidar", "lidar_pose"])
 @pytest.mark.parametrize("damage", ["cut", "flip"])
-def test_damaged_range_images_skip_everybody_by_name(copy, name, damage):
+def test_damaged_range_images_skip_all_people_and_name_file(copy, name, damage):
     path = component(copy, name)
     data = bytearray(path.read_bytes())
     if damage == "flip":
@@ -294,19 +294,19 @@ def test_damaged_range_images_skip_everybody_by_name(copy, name, damage):
     path.write_bytes(data[: len(data) // 2] if damage == "cut" else data)
     items, skipped = everything(copy)
     found = Counter(one.reason for one in skipped)
-    assert not items and found["range image cannot be read"] == 5 and found["no joint is labelled"] == 1
+    assert not items and found["range image cannot be read"] == 5 and found["no joint is labeled"] == 1
     where = next(one.where for one in skipped if one.reason == "range image cannot be read")
     assert f"{name}/{SEGMENT}.parquet: cannot be read as Parquet" in where and "\n" not in where
 
 
-def test_damaged_labels_are_one_line(copy):
+def test_damaged_labels_raise(copy):
     component(copy, "lidar_box").write_bytes(b"PAR1 no table")
     with pytest.raises(InputError, match=r"lidar_box/.*: cannot be read as Parquet .*; fetch it again$"):
         everything(copy)
 
 
 @pytest.mark.parametrize("name", COMPONENTS)
-def test_files_of_another_component_are_told(copy, name):
+def test_file_of_other_component_is_reported(copy, name):
     other = "lidar_box" if name != "lidar_box" else "lidar_hkp"
     shutil.copy(component(copy, other), component(copy, name))
     if name in ("lidar", "lidar_pose"):
@@ -327,7 +327,7 @@ _SHAPE, _POSE_SHAPE = (f"[{name}Component].range_image_return1.shape" for name i
 @pytest.mark.parametrize(
     "name, change, reason, lost",
     [
-        # a dict: what the first row holds; else the rows
+        # change: new values of the first row, or a function of all rows
         ("lidar_pose", lambda rows: [row for row in rows if row[_TIME] != FIRST], "no pixel poses of the top laser", 2),
         ("vehicle_pose", lambda rows: [row for row in rows if row[_TIME] != FIRST], "no vehicle pose of the frame", 2),
         ("lidar", lambda rows: [row for row in rows if row[_TIME] != FIRST], "no range image of the frame", 2),
@@ -337,7 +337,7 @@ _SHAPE, _POSE_SHAPE = (f"[{name}Component].range_image_return1.shape" for name i
         ("vehicle_pose", {_POSE: [0.0] * 16}, "frame cannot be read", 2),
         ("vehicle_pose", {_POSE: [1.0] * 15 + [None]}, "frame cannot be read", 2),
         ("vehicle_pose", {_POSE: np.diag([1.0, 1, -1, 1]).ravel()}, "frame cannot be read", 2),
-        # of volume 1, but no rotation; and one whose products overflow
+        # of determinant 1 but not a rotation; and one whose products overflow
         ("vehicle_pose", {_POSE: (np.eye(4) + np.diag([1, 0, 0], 1)).ravel()}, "frame cannot be read", 2),
         ("vehicle_pose", {_POSE: np.diag([1e200, 1e200, 1, 1]).ravel()}, "frame cannot be read", 2),
         ("vehicle_pose", {_TIME: None}, "no vehicle pose of the frame", 2),
@@ -347,17 +347,17 @@ _SHAPE, _POSE_SHAPE = (f"[{name}Component].range_image_return1.shape" for name i
         ("lidar_hkp", {_TIME: None}, "label in another format", 1),
         ("lidar_hkp", {"key.laser_object_id": None}, "label in another format", 1),
         ("lidar_hkp", {f"{_KEYPOINT}.keypoint_3d.location_m.y": [1.0]}, "label in another format", 1),
-        ("lidar_hkp", {f"{_KEYPOINT}.keypoint_3d.location_m.y": [np.nan] * 16}, "no joint is labelled", 1),
-        ("lidar_hkp", {f"{_KEYPOINT}.keypoint_3d.location_m.y": [1e300] * 16}, "no joint is labelled", 1),
+        ("lidar_hkp", {f"{_KEYPOINT}.keypoint_3d.location_m.y": [np.nan] * 16}, "no joint is labeled", 1),
+        ("lidar_hkp", {f"{_KEYPOINT}.keypoint_3d.location_m.y": [1e300] * 16}, "no joint is labeled", 1),
         ("lidar_box", {"[LiDARBoxComponent].box.center.x": 1e10}, "label in another format", 1),
         ("lidar_box", {"[LiDARBoxComponent].box.size.z": 0.0}, "label in another format", 1),
     ],
 )
-def test_one_bad_value_costs_one_frame_or_person(copy, name, change, reason, lost):
+def test_bad_value_skips_one_frame_or_person(copy, name, change, reason, lost):
     rewritten(component(copy, name), change if callable(change) else lambda rows: [rows[0] | change, *rows[1:]])
     items, skipped = everything(copy)
     assert len(items) == 4 - lost
-    # where all are lost, so is the one in whose box no points are; some are left out of the whole files, too
+    # if all people are lost, the one without points is counted, too; two reasons occur in intact files as well
     usual = 1 if lost == 4 or reason.startswith("no joint") or reason.startswith("no points") else 0
     assert Counter(one.reason for one in skipped)[reason] == lost + usual
     if not lost:
@@ -368,7 +368,7 @@ def test_one_bad_value_costs_one_frame_or_person(copy, name, change, reason, los
     "name, column",
     [("lidar_box", "[LiDARBoxComponent].box.center.x"), ("lidar_hkp", f"{_KEYPOINT}.keypoint_3d.location_m.x")],
 )
-def test_text_for_numbers_is_skipped(copy, name, column):
+def test_text_instead_of_numbers_is_skipped(copy, name, column):
     path = component(copy, name)
     table = pq.read_table(path)
     values = ["a" if not isinstance(v, list) else ["a"] * len(v) for v in table[column].to_pylist()]
@@ -377,7 +377,7 @@ def test_text_for_numbers_is_skipped(copy, name, column):
     assert not items and Counter(one.reason for one in skipped)["label in another format"] >= 4
 
 
-def test_a_missing_second_return_is_none(copy):
+def test_missing_second_return_is_accepted(copy):
     names = [f"[LiDARComponent].range_image_return2.{part}" for part in ("values", "shape")]
     rewritten(component(copy, "lidar"), lambda rows: [row | dict.fromkeys(names) for row in rows])
     items, _ = everything(copy)
@@ -387,7 +387,7 @@ def test_a_missing_second_return_is_none(copy):
         np.testing.assert_allclose(item.points, want, atol=1e-3)
 
 
-def test_range_images_are_never_all_in_memory(tmp_path):
+def test_range_images_are_read_incrementally(tmp_path):
     shape, frames = (32, 256, 6), 150
     column = "[LiDARPoseComponent].range_image_return1"
     values = np.random.default_rng(0).random((frames, *shape), np.float32)
@@ -400,7 +400,7 @@ def test_range_images_are_never_all_in_memory(tmp_path):
         f"{column}.shape": pa.array([list(shape)] * frames, pa.list_(pa.int32(), 3)),
     }
     path = tmp_path / "all.parquet"
-    # one row group: nothing but reading it bit by bit helps
+    # a single row group has to be read incrementally
     pq.write_table(pa.table(rows), path)
     del rows, lists
     most, seen = 0, 0
@@ -412,14 +412,14 @@ def test_range_images_are_never_all_in_memory(tmp_path):
     held = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert seen == frames and most + held < values.nbytes / 4
-    # only wanted rows are given
+    # only wanted rows are returned
     assert [key for key, _ in images(path, (column,), {("s", 7), ("s", 3)})] == [("s", 3, 1), ("s", 7, 1)]
 
 
 # --- version 1
 
 
-def test_a_corrupted_record_ends_a_file_by_name(v1, tmp_path):
+def test_corrupted_record_ends_file_and_is_reported(v1, tmp_path):
     data = (v1 / TFRECORD).read_bytes()
     first = 16 + int.from_bytes(data[:8], "little")
     flipped = lambda k: data[:k] + bytes([data[k] ^ 1]) + data[k + 1 :]  # noqa: E731
@@ -438,7 +438,7 @@ def test_a_corrupted_record_ends_a_file_by_name(v1, tmp_path):
         assert what in skipped[0].where and TFRECORD in skipped[0].where and "\n" not in skipped[0].where
 
 
-def test_records_that_are_no_frames_are_told_and_the_next_read(v1, tmp_path):
+def test_records_that_are_not_frames_are_skipped(v1, tmp_path):
     (tmp_path / "training").mkdir()
     scenario = files.record(files.block(5, "a scenario of the motion dataset") + files.double(1, 2.0))
     cut = files.record(files.v1_frame(files.scene()[0], SEGMENT)[:-30])
@@ -450,7 +450,7 @@ def test_records_that_are_no_frames_are_told_and_the_next_read(v1, tmp_path):
 
 
 @pytest.mark.parametrize("damage", [lambda data: data[:-9], lambda data: data[:9] + b"\0" + data[10:]])
-def test_a_range_image_that_cannot_be_inflated_skips_its_frame(tmp_path, damage, monkeypatch):
+def test_range_image_with_damaged_zlib_data_skips_frame(tmp_path, damage, monkeypatch):
     pack, first = files.matrix_float, []
 
     def broken(image):
@@ -469,22 +469,22 @@ def test_a_range_image_that_cannot_be_inflated_skips_its_frame(tmp_path, damage,
     "values, shape, told",
     [
         (10, files.number(1, 3), "a range image has 10 values, its stated shape is [3]"),
-        # whose product is 0 in 64 bits
+        # dimensions whose product is 0 in 64 bits
         (
             0,
             files.number(1, 1 << 32) * 2 + files.number(1, 1),
             "0 values, its stated shape is [4294967296, 4294967296, 1]",
         ),
-        # however many there are
+        # very many dimensions
         (1, files.number(1, 1) * 1000, "a range image has 1 values, its stated shape is [1, 1, 1, 1, 1, 1, ...]"),
         (1, files.block(1, b"\1" * 65536), "message Shape has 65,540 bytes, more than 65,536: damaged"),
         (None, b"", "no pixel poses of the top laser"),
     ],
 )
-def test_a_range_image_of_another_size_than_it_says_is_told(tmp_path, monkeypatch, values, shape, told):
+def test_range_image_of_wrong_size_is_reported(tmp_path, monkeypatch, values, shape, told):
     pack = files.matrix_float
     wrong = b"" if values is None else zlib.compress(files.block(1, bytes(4 * values)) + files.block(2, shape))
-    # without values: the poses of the pixels alone are missing
+    # without values: only the pixel poses are missing
     monkeypatch.setattr(files, "matrix_float", lambda image: wrong if wrong or image.shape[2] == 6 else pack(image))
     files.write_v1(tmp_path, frames=files.scene()[:1])
     items, skipped = everything(tmp_path)
@@ -495,7 +495,7 @@ def test_a_range_image_of_another_size_than_it_says_is_told(tmp_path, monkeypatc
 # --- TFRecord and protobuf
 
 
-def test_records_come_one_by_one_and_their_checksums_are_castagnoli(tmp_path):
+def test_records_are_read_with_crc32c_checksums(tmp_path):
     # the usual check value of CRC-32C, masked by hand
     assert files.masked(b"123456789") == (0xE3069283 >> 15 | (0xE3069283 & 0x7FFF) << 17) + 0xA282EAD8 & 0xFFFFFFFF
     written = [b"", b"a", np.random.default_rng(0).bytes(5000), b"last"]
@@ -507,7 +507,7 @@ def test_records_come_one_by_one_and_their_checksums_are_castagnoli(tmp_path):
         list(waymo_v1.records(tmp_path / "none"))
 
 
-def test_frames_larger_than_any_of_waymo_s_are_not_parsed(v1, monkeypatch):
+def test_frames_above_size_limit_are_not_parsed(v1, monkeypatch):
     monkeypatch.setattr(waymo_v1, "_LARGEST_FRAME", 1000)
     items, skipped = everything(v1)
     assert not items and skipped[0].reason == "frame cannot be read" and "message Frame has" in skipped[0].where
@@ -517,7 +517,7 @@ def test_frames_larger_than_any_of_waymo_s_are_not_parsed(v1, monkeypatch):
 @pytest.mark.parametrize(
     "field", [b"\x2a\x00", b"\x32\x00", b"\x38\x01", b"\x0a\x00"], ids=["lasers", "labels", "?", "one"]
 )
-def test_a_hostile_frame_takes_twenty_times_its_bytes_at_most(field):
+def test_parse_limits_memory_for_hostile_frames(field):
     code = f"""
 import resource
 from lidarpose.data.readers.waymo_v1 import parse
@@ -531,7 +531,7 @@ print((peak() - before) / len(data))
     assert float(ran.stdout) < 25
 
 
-def test_repeated_numbers_are_packed_or_not():
+def test_parse_reads_packed_and_unpacked_numbers():
     data = files.doubles(1, [1.0, 2.0]) + files.block(1, np.array([3.0, 4.0], "<f8").tobytes())
     assert list(waymo_v1.parse("Transform", data, 100).transform) == [1, 2, 3, 4]
     data = files.number(1, 300) + files.block(1, files.varint(7) + files.varint(-1))
@@ -540,7 +540,7 @@ def test_repeated_numbers_are_packed_or_not():
 
 @settings(max_examples=60, deadline=None)
 @given(st.sampled_from(["Frame", "Label", "MatrixFloat"]), st.binary(max_size=60), st.integers(0, 400))
-def test_any_bytes_and_every_cut_of_a_frame_are_a_message_or_an_input_error(name, data, end):
+def test_parse_raises_only_input_error(name, data, end):
     for kind, content in ((name, data), ("Frame", files.v1_frame(files.scene()[2], "s")[:end])):
         try:
             waymo_v1.parse(kind, content, 400)
@@ -548,7 +548,7 @@ def test_any_bytes_and_every_cut_of_a_frame_are_a_message_or_an_input_error(name
             assert "\n" not in str(error) and "is cut off or damaged" in str(error)
 
 
-def test_cuts_of_a_frame_are_noticed():
+def test_parse_rejects_truncated_frame():
     whole = files.v1_frame(files.scene()[2], "s")[:400]
     with pytest.raises(InputError, match="is cut off or damaged"):
         waymo_v1.parse("Frame", whole[:333], 400)

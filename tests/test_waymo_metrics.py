@@ -20,7 +20,7 @@ SIZE = (1.0, 1.0, 2.0)
 
 
 def people(*places, seed=0):
-    """(n, J, 3) m: somebody at each place along x, within a box of SIZE about it, and these boxes (n, 7)."""
+    """Joints (n, J, 3) m of a person at each place along x, and boxes (n, 7) of SIZE about these places."""
     body = np.random.default_rng(seed).uniform(-0.3, 0.3, (J, 3))
     center = np.array([[x, 0.0, 1.0] for x in places]).reshape(-1, 3)
     boxes = np.concatenate([center, np.broadcast_to(SIZE, center.shape), np.zeros((len(center), 1))], 1)
@@ -30,7 +30,7 @@ def people(*places, seed=0):
 # ---- OKS and PCK by box
 
 
-def test_sigmas_are_the_published_ones():
+def test_oks_sigmas_match_published_values():
     sigmas = dict(zip(WAYMO14.joints, metrics.oks_sigmas(), strict=True))
     assert sigmas["nose"] == 0.052 and sigmas["left_hip"] == sigmas["right_hip"] == 0.214
     assert sigmas["head_center"] == sigmas["left_shoulder"] == 0.158 and sigmas["right_wrist"] == 0.124
@@ -44,7 +44,7 @@ def test_sigmas_are_the_published_ones():
 
 @quick
 @given(seeds)
-def test_oks_against_a_loop(seed):
+def test_oks_matches_loop(seed):
     rng = np.random.default_rng(seed)
     true = rng.normal(size=(4, J, 3))
     pred = true + rng.normal(size=true.shape) * 0.1
@@ -62,7 +62,7 @@ def test_oks_against_a_loop(seed):
         assert found[i] == pytest.approx(np.mean(terms) if terms else np.nan, nan_ok=True)
 
 
-def test_oks_one_sigma_off_and_its_precision():
+def test_oks_and_oks_ap_at_error_of_one_sigma():
     true, boxes = people(0, 5)
     size = boxes[:, 3:6]
     off = metrics.oks_sigmas() * 2 ** (1 / 3)
@@ -72,7 +72,7 @@ def test_oks_one_sigma_off_and_its_precision():
     # 0.6065 is above three of the ten thresholds
     assert metrics.oks_ap(pred, true, size) == pytest.approx((30 + 100) / 2)
     assert metrics.oks_ap(pred, true, size, thresholds=[0.65]) == 50
-    # above, not at
+    # the score must be above the threshold, not equal
     assert metrics.oks_ap(true, true, size, thresholds=[1.0]) == 0
     assert metrics.oks_ap(true, true, size) == 100
     score = metrics.oks_ap(pred, true, size, np.stack([np.ones(J), np.zeros(J)]))
@@ -81,7 +81,7 @@ def test_oks_one_sigma_off_and_its_precision():
     assert metrics.by_span(table, [3, 30], (0, 10, 40))["10 to 40"].score == 100
 
 
-def test_pck_by_box_is_the_documented_example():
+def test_pck_box_matches_documented_example():
     # a box of 1 x 1 x 2 m has scale 1.26 m; 0.2 of it are 25 cm
     true, boxes = people(0)
     pred = true.copy()
@@ -89,13 +89,16 @@ def test_pck_by_box_is_the_documented_example():
     pred[0, 7:, 0] += 0.2521
     assert metrics.pck_box(pred, true, boxes[:, 3:6]) == 50
     assert metrics.pck_box(pred, true, SIZE, threshold=0.3) == 100
-    # as Waymo's code has it: times each joint's sigma
+    # joints at the threshold count
+    one = np.zeros((1, 1, 3))
+    assert metrics.pck_box(one + [0.25, 0, 0], one, (1, 1, 1), threshold=0.25) == 100
+    # as in Waymo's code: the threshold times the sigma of each joint
     pred = true.copy()
     pred[0, :, 1] += 0.2 * 2 ** (1 / 3) * 0.15
     sigmas = metrics.oks_sigmas()
     share = 100 * np.mean(sigmas > 0.15)
     assert metrics.pck_box(pred, true, SIZE, sigmas=sigmas) == pytest.approx(share) and 0 < share < 100
-    # and averaged over joints, as there
+    # averaged over joints, as in Waymo's code
     true, boxes = people(0, 5)
     pred, visible = true.copy(), np.ones((2, J))
     pred[1] += 1
@@ -113,7 +116,7 @@ def test_pck_by_box_is_the_documented_example():
         (np.ones((2, 3)), [0.1] * 13, r"sigmas must be \(14,\) positive"),
     ],
 )
-def test_boxes_and_sigmas_are_checked(metric, size, sigmas, message):
+def test_box_metrics_reject_invalid_sizes_and_sigmas(metric, size, sigmas, message):
     true, _ = people(0, 5)
     with pytest.raises(InputError, match=message):
         metric(true, true, size, sigmas=sigmas)
@@ -124,14 +127,14 @@ def test_boxes_and_sigmas_are_checked(metric, size, sigmas, message):
 
 @quick
 @given(seeds)
-def test_distance_to_boxes(seed):
+def test_distance_to_boxes_matches_box_contains(seed):
     rng = np.random.default_rng(seed)
     box = np.concatenate([rng.normal(size=3), rng.uniform(0.5, 2, 3), rng.uniform(-4, 4, 1)])
     points = box[:3] + rng.normal(size=(50, 3)) * 1.5
     found = distance_to_boxes(points, box[None])[0]
     house = Box(center=box[:3], size=box[3:6], yaw=box[6])
     np.testing.assert_array_equal(found == 0, house.contains(points))
-    # the box grown by the distance just holds the point; it is rounded at its corners, hence a ball of points about it
+    # the box grown by the distance just contains the point; no point of a ball with this radius is in the box
     for point, distance in zip(points, found, strict=True):
         assert house.contains(point[None], distance + 1e-9)[0]
         around = rng.normal(size=(20, 3))
@@ -141,7 +144,7 @@ def test_distance_to_boxes(seed):
 
 @quick
 @given(seeds, st.integers(0, 3), st.integers(0, 3))
-def test_matching_costs_least(seed, found, there):
+def test_match_people_minimizes_cost(seed, found, there):
     rng = np.random.default_rng(seed)
     true, boxes = people(*rng.uniform(0, 0.4, there), seed=seed)
     pred, _ = people(*rng.uniform(0, 0.4, found), seed=seed)
@@ -158,7 +161,7 @@ def test_matching_costs_least(seed, found, there):
                 total += 0.25
         return min(total / J, 0.25)
 
-    # whoever has no partner costs as much as one at the penalty
+    # an unmatched person costs as much as a match at the penalty
     size = min(there, found)
     best = min(
         sum(cost(g, p) for g, p in zip(some, order, strict=True))
@@ -174,8 +177,8 @@ def test_matching_costs_least(seed, found, there):
 # ---- PEM
 
 
-def test_pem_of_a_frame_by_hand():
-    # one found 10 cm off, one missed, one made up far away, one found in the box of somebody without labels
+def test_pem_of_one_frame_matches_manual_result():
+    # one match with an error of 10 cm, one miss, one false positive far away, one in the box of an unlabeled person
     true, boxes = people(0, 5, 10)
     pred, _ = people(0, 10, 20)
     pred[0, :, 2] += 0.1
@@ -197,7 +200,7 @@ def test_pem_pools_keypoints_of_all_frames():
     found = metrics.pem([pred, empty, pred], [true, true, empty], [boxes, boxes, np.empty((0, 7))])
     assert found.pem == pytest.approx((50 + 250 + 250) / 3)
     assert (found.matched, found.missed, found.extra) == (J, J, J)
-    # frames of nobody may be empty lists
+    # frames without people may be empty lists
     ones = np.ones((1, J))
     found = metrics.pem([true, []], [[], true], [[], boxes], [[], ones], predicted=[ones, []])
     assert found.pem == 250 and (found.missed, found.extra) == (J, J)
@@ -205,45 +208,52 @@ def test_pem_pools_keypoints_of_all_frames():
     assert np.isnan([nothing.pem, nothing.matched_error]).all()
 
 
-def test_pem_joints_of_one_person():
+def test_pem_counts_unlabeled_and_missing_joints():
     true, boxes = people(0)
     pred, visible, predicted = true.copy(), np.ones((1, J)), np.ones((1, J))
     pred[0, 0, 0] += 3.0
     visible[0, [1, 3]] = predicted[0, [2, 3]] = 0
     found = metrics.pem([pred], [true], [boxes], [visible], predicted=[predicted])
-    # far off costs no more than missing; neither labeled nor predicted costs nothing
+    # a large error costs no more than a miss; joints neither labeled nor predicted cost nothing
     assert found.pem == pytest.approx(3 * 250 / (J - 1)) and found.matched_error == pytest.approx(250 / (J - 3))
     assert (found.matched, found.missed, found.extra) == (J - 3, 1, 1)
     dear = metrics.pem([pred], [true], [boxes], [visible], predicted=[predicted], penalty=0.5)
     assert dear.pem == pytest.approx(3 * 500 / (J - 1))
-    # somebody without a predicted joint is nobody
+    # a prediction without predicted joints is ignored
     found = metrics.pem([true], [true], [boxes], predicted=[np.zeros((1, J))])
     assert (found.missed, found.extra, found.people_extra) == (J, 0, 0)
 
 
-def test_predictions_of_labeled_people_are_not_excused():
-    # somebody without labels stands in the same place: who is near a label stays for its person
+def test_pem_does_not_excuse_predictions_of_labeled_people():
+    # an unlabeled person stands at the same place: predictions near a label are kept for its person
     true, boxes = people(0, 0)
     visible = np.ones((2, J))
     visible[1] = 0
     found = metrics.pem([true[:1]], [true], [boxes], [visible])
     assert found.pem == 0 and (found.people, found.people_excused) == (1, 0)
-    # and each of those excuses one at most
+    # each unlabeled person excuses at most one prediction
     away, _ = people(10, 10)
     whose, boxes = people(10)
     found = metrics.pem([away], [whose], [boxes], [np.zeros((1, J))])
     assert (found.people_excused, found.people_extra, found.extra) == (1, 1, J)
+    # predictions near the box without keypoints inside are not excused
+    found = metrics.pem([whose + [0.9, 0, 0]], [whose], [boxes], [np.zeros((1, J))])
+    assert (found.people_excused, found.people_extra, found.extra) == (0, 1, J)
 
 
 def test_pem_does_not_match_far_from_the_box():
     true, boxes = people(0)
-    # a box that lies elsewhere: keypoints agree, but no keypoint is within 25 cm of it
+    # a shifted box: keypoints agree, but none of them is within 25 cm of it
     boxes[:, 0] += 2
     found = metrics.pem([true], [true], [boxes])
     assert found.pem == pytest.approx(250) and (found.people_missed, found.people_extra) == (1, 1)
+    # by the nearest keypoint, 24 or 26 cm in front of the box
+    for gap, people_matched in ((0.24, 1), (0.26, 0)):
+        boxes[:, 0] = true[0, :, 0].max() + gap + SIZE[0] / 2
+        assert metrics.pem([true], [true], [boxes]).people == people_matched
 
 
-def test_joints_that_are_not_claimed_decide_nothing():
+def test_pem_ignores_joints_that_are_not_predicted():
     true, boxes = people(0, 10)
     visible, predicted = np.ones((2, J)), np.ones((1, J))
     visible[1] = predicted[0, 0] = 0
@@ -251,17 +261,17 @@ def test_joints_that_are_not_claimed_decide_nothing():
     def matched(pred, true=true, boxes=boxes, visible=visible):
         return metrics.pem([pred], [true], [boxes], [visible], predicted=[predicted])
 
-    # the first joint alone is not claimed, and lies beside the label of somebody
+    # only the first joint is not predicted; it lies at the label of another person
     pred = true[1:].copy()
     pred[0, 0] = true[0, 0]
     found = matched(pred)
     assert (found.people_excused, found.people_missed, found.extra) == (1, 1, 0)
-    # it lies in the box of somebody without labels
+    # it lies in the box of an unlabeled person
     pred = true[1:] + [5, 0, 0]
     pred[0, 0] = true[1, 0]
     found = matched(pred)
     assert (found.people_excused, found.people_missed, found.extra) == (0, 1, J - 1)
-    # it is all that lies near the box
+    # it is the only joint near the box
     pred, moved = true[:1].copy(), boxes[:1].copy()
     moved[0, 0] = pred[0, 0, 0] = 2
     found = matched(pred, true[:1], moved, visible[:1])
@@ -282,7 +292,7 @@ def test_joints_that_are_not_claimed_decide_nothing():
         ({"penalty": 0.0}, "penalty must be a positive"),
     ],
 )
-def test_wrong_frames_get_one_line(change, message):
+def test_pem_rejects_invalid_frames(change, message):
     true, boxes = people(0)
     with pytest.raises(InputError, match=message):
         metrics.pem(**({"pred": [true], "true": [true], "boxes": [boxes]} | change))

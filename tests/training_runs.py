@@ -1,4 +1,4 @@
-"""What tests of training share: short runs, runs that are killed, and refusals in one line."""
+"""Helpers for tests of training: short runs, killed runs, and errors of one line."""
 
 from contextlib import contextmanager
 
@@ -9,13 +9,13 @@ from lidarpose.eval import charts
 from lidarpose.train import data_loader, loop, run_dir, setup
 
 FEW = 16
-# batches a chunk, half of what they are
+# batches per chunk, half of the default
 BATCHES = 4
 
 
 @pytest.fixture(scope="module", autouse=True)
 def few_to_validate_on():
-    """So that a run of several chunks takes a second, and is not all validation, nor its evaluation all pictures."""
+    """Reduces validation, chunks and charts, so that a run of several chunks takes a second."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(setup, "VALIDATION", FEW)
         for module in (data_loader, loop):
@@ -27,18 +27,18 @@ def few_to_validate_on():
 
 @contextmanager
 def refused(message):
-    """An InputError that matches, in one line."""
+    """Expects an InputError with a matching message of one line."""
     with pytest.raises(InputError, match=message) as caught:
         yield
     assert "\n" not in str(caught.value)
 
 
 class Killed(BaseException):
-    """As a signal would: nothing catches it."""
+    """Stands for a kill signal: no code catches it."""
 
 
 def train_until_killed(recipe, folder, name, call):
-    """Lets the named function of the loop be called `call` times, then kills the run; saves after every chunk."""
+    """Trains, saving after every chunk, and raises Killed after `call` calls of the function `name`."""
     where = run_dir if hasattr(run_dir, name) else loop._Run
     original, calls = getattr(where, name), []
 

@@ -1,4 +1,4 @@
-"""Shared by tests of scenes: a box that goes and turns, and volumes, distances to bones."""
+"""Helpers for tests of scenes: a moving box-shaped body, volumes of meshes, and distances to bones."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ HEADINGS, STEP = (0.0, 1.2, -2.0), 1.5
 
 
 def goer(still=False):
-    """A box 0.3 m deep, 0.9 m wide and 1.7 m tall that goes along x and turns; joints along its left-right axis."""
+    """A box 0.3 m deep, 0.9 m wide and 1.7 m tall that moves along x and turns; joints along its left-right axis."""
     mesh = box((0.3, 0.9, 1.7))
     headings = (0.0,) * 3 if still else HEADINGS
     vertices, joints, extent = [], [], []
@@ -31,13 +31,13 @@ def goer(still=False):
 
 
 def strider(step):
-    """The same one, who stands at all frames and goes `step` (3,) m within each."""
+    """The same body, at the same place in all frames, moving by `step` (3,) m within each frame."""
     still, way = goer(still=True), np.array(step, np.float32)
     return replace(still, moved=lambda frame: (still.vertices[frame] + way, still.joints[frame] + way))
 
 
 def piece_volumes(mesh):
-    """The volume of each piece: negative where its faces look inwards."""
+    """The volume of each connected piece, negative if its faces point inwards."""
     piece = np.arange(len(mesh.vertices))
     for _ in range(len(piece)):
         least = piece.copy()

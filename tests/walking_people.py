@@ -1,4 +1,4 @@
-"""Two people who walk on flat ground about a LiDAR, frame by frame, as a recording of a sensor that goes and turns."""
+"""Two people who walk on flat ground near a LiDAR: frames of a static sensor, and a recording of a moving sensor."""
 
 from functools import cache
 
@@ -13,15 +13,15 @@ from lidarpose.synth.bodies import draw_bodies
 from lidarpose.synth.environment.mesh import Mesh, quad, union
 
 FRAMES = 7
-# where two people stand in the first frame, and how far they go in each, m
+# positions of two people in the first frame, and their steps per frame, m
 PLACES, STEPS = np.array([[4.0, 1.5], [3.0, -3.0]]), np.array([[0.1, 0.0], [0.0, 0.08]])
-# where the world's zero of `walking_clouds` is in that of `moving_source`
+# origin of `walking_clouds` in the world frame of `moving_source`, m
 _ORIGIN = np.array([100.0, -50.0, 2.0])
 
 
 @cache
 def walking_clouds():
-    """Points (n, 3) m of each frame, about a VLP-32C that stays where it is."""
+    """Points (n, 3) m of each frame of a static VLP-32C."""
     sensor = lidarpose.sensor("vlp-32c")
     bodies = draw_bodies(None, captured=0.0, count=12, seed=1, block=0, moving=False)
     standing = [i for i, kind in enumerate(bodies.kinds) if kind in ("stand", "idle", "walk")][:2]
@@ -36,7 +36,7 @@ def walking_clouds():
 
 
 def places_in_world(frame):
-    """(2, 2) m: where the people are in the world of `moving_source`."""
+    """Positions (2, 2) m of the people in the world frame of `moving_source`."""
     return PLACES + frame * STEPS + _ORIGIN[:2]
 
 
@@ -47,7 +47,7 @@ def world_pose(frame, up="z"):
 
 
 def moving_source(clouds, *, times=None, up="z", unknown=()):
-    """The frames as of a sensor that goes and turns, whose pose is known, but for the frames `unknown`."""
+    """The clouds as frames of a sensor that moves and turns; its pose is None in the frames `unknown`."""
 
     def read(i):
         T_sensor_world = np.linalg.inv(world_pose(i, up))
@@ -61,7 +61,7 @@ def moving_source(clouds, *, times=None, up="z", unknown=()):
 
 
 def boxes_of(frames, up="z"):
-    """Boxes of both people by frame, in the frames of `moving_source`."""
+    """Boxes of both people by frame, in the sensor frames of `moving_source`."""
     boxes = {}
     for k in range(frames):
         T_sensor_world = np.linalg.inv(world_pose(k, up))

@@ -1,7 +1,7 @@
-"""A tiny Waymo scene of synthesized people, and writers of both versions of the dataset in their on-disk layouts.
+"""A small Waymo scene of synthesized people, and writers of both versions of the dataset in their on-disk layouts.
 
-The scene is cast laser by laser from a moving car: what a reader must give is known point by point. Nothing of the
-readers is used here.
+The scene is cast laser by laser from a moving car, so every point that a reader must return is known. The code of the
+readers is not used here.
 """
 
 import struct
@@ -20,7 +20,7 @@ from lidarpose.geometry import rotation_about
 from lidarpose.lidar.raycast import cast_ray_list
 from lidarpose.skeleton import BODY26, WAYMO14
 
-# of the 14 joints, in the skeleton's order
+# Waymo's types of the 14 joints, in the skeleton's order
 TYPES = (1, 5, 13, 6, 14, 7, 15, 8, 16, 9, 17, 10, 18, 20)
 HIDDEN, SEEN = 1, 2
 # time of the first frame of `scene`, us
@@ -31,7 +31,8 @@ FACES = load_rig().faces
 
 @dataclass
 class Laser:
-    """E (4, 4) laser -> vehicle; beams (H,) rad from the lowest; whether their table is written; columns."""
+    """E (4, 4) laser -> vehicle; beams (H,) rad, lowest first; table: whether `beams` is written, besides low and high;
+    width: number of columns."""
 
     E: np.ndarray
     beams: np.ndarray
@@ -41,8 +42,8 @@ class Laser:
     width: int
 
     def directions(self):
-        """(H, W, 3) in the laser's frame: row 0 is the highest beam; column 0 looks just left of the car's rear,
-        then on clockwise, whichever way the laser is turned."""
+        """(H, W, 3) in the laser's frame: row 0 is the highest beam; column 0 points just left of the car's rear, and
+        the columns continue clockwise, for any heading of the laser."""
         ahead = np.pi * (1 - (2 * np.arange(self.width) + 1) / self.width)
         azimuth = ahead - np.arctan2(self.E[1, 0], self.E[0, 0])
         up = np.asarray(self.beams)[::-1, None]
@@ -72,7 +73,7 @@ LASERS = {
 
 @dataclass
 class Someone:
-    """track; kind: Waymo's type of the box; joints (14, 3) m in the frame's vehicle frame, NaN where not labelled, and
+    """track; kind: Waymo's type of the box; joints (14, 3) m in the frame's vehicle frame, NaN where not labeled, and
     labels (14,); box: center, size, heading or None; keypoints as they are written: (type, x, y, z, occluded); points:
     (laser, return) -> (n, 3) m in the vehicle's frame and their rows (n,)."""
 
@@ -98,7 +99,7 @@ class Frame:
 
 
 def car(seconds):
-    """Roll, pitch, yaw, x, y, z of a car that drives a left bend at 12 m/s over uneven ground."""
+    """Roll, pitch, yaw, x, y, z of a car in a left bend at 12 m/s on uneven ground."""
     yaw = 0.8 + 0.4 * seconds
     angles = 0.01 * np.sin(9 * seconds), 0.012 * np.cos(7 * seconds), yaw
     return np.array([*angles, 1520 + 30 * np.sin(yaw), -810 - 30 * np.cos(yaw), 12 + 0.2 * np.sin(5 * seconds)])
@@ -121,7 +122,7 @@ def bodies(count=3, seed=4):
 
 
 def someone(track, number, place, yaw, *, kind=2, missing=(), hidden=()):
-    """A body of `bodies` at a place, and what is labelled of it. Returns (Someone, vertices)."""
+    """A body of `bodies` at a place, with labels. Returns (Someone, vertices)."""
     vertices, joints = (x[number] @ rotation_about("z", yaw).T + place for x in bodies())
     local = (vertices - place) @ rotation_about("z", yaw)
     low, high = local.min(0) - 0.03, local.max(0) + 0.03
@@ -131,17 +132,18 @@ def someone(track, number, place, yaw, *, kind=2, missing=(), hidden=()):
     labels[list(missing)] = 0
     joints = np.where(labels[:, None] > 0, joints, np.nan)
     keypoints = [(TYPES[j], *joints[j], labels[j] == HIDDEN) for j in range(14) if labels[j]]
-    # a camera's joint, and one of a later release; and in no order
+    # plus a joint of a camera and one of a later release, in another order
     keypoints = [(19, 1.0, 2.0, 3.0, False), *keypoints[::-1], (77, 0.0, 0.0, 0.0, True)]
     box = (*center, *(high - low), (yaw + np.pi) % (2 * np.pi) - np.pi)
     return Someone(track, kind, joints, labels, box, keypoints), vertices
 
 
 def cast(frame, start, vertices, owners):
-    """Fills in a frame's images, pixel poses and its people's points. vertices (P, V, 3) of owners, in the frame."""
+    """Fills in the images, pixel poses and people's points of a frame. vertices (P, V, 3) m of owners, in its vehicle
+    frame."""
     faces = np.concatenate([FACES + k * vertices.shape[1] for k in range(len(vertices))])
     middles = vertices.mean(1)
-    # what the second return sees: the same surface 6 cm farther away from the car
+    # the second return sees the same surface 6 cm farther away from the car
     outwards = middles * [1, 1, 0] / np.linalg.norm(middles[:, :2], axis=1)[:, None]
     surfaces = {1: vertices, 2: vertices + 0.06 * outwards[:, None]}
     rng = np.random.default_rng(frame.time % 1000)
@@ -151,14 +153,14 @@ def cast(frame, start, vertices, owners):
         image = {which: np.zeros((*directions.shape[:2], 4), np.float32) for which in (1, 2)}
         truth = {which: np.zeros((*directions.shape[:2], 4)) for which in (1, 2)}
         if number == 1:
-            # the top laser turns once a sweep, its middle is the frame's time
+            # the top laser turns once per sweep; the middle of the sweep is the frame's time
             seconds = start + ((np.arange(laser.width) + 0.5) / laser.width - 0.5) * SWEEP
             frame.poses[:] = np.array([car(s) for s in seconds], np.float32)
             columns = np.array([[c] for c in near_columns(laser, middles)])
         else:
             columns = np.arange(laser.width)[None]
         for some in columns:
-            # where this column's car is in the frame's vehicle frame
+            # pose of the car at the time of this column, in the frame's vehicle frame
             T = np.eye(4) if number > 1 else np.linalg.inv(frame.pose) @ at(frame.poses[0, some[0]].astype(float))
             T = T @ laser.E
             rays = directions[:, some].reshape(-1, 3)
@@ -183,13 +185,13 @@ def cast(frame, start, vertices, owners):
             for k, one in enumerate(owners):
                 row, column = np.nonzero(truth[which][..., 3] == k + 1)
                 one.points[number, which] = truth[which][row, column, :3], row
-    # where nothing came back there is no pose either
+    # pixels without a return have no pose
     nothing = (frame.images[1, 1][..., 0] == 0) & (frame.images[1, 2][..., 0] == 0)
     frame.poses[nothing] = 0
 
 
 def near_columns(laser, middles):
-    """The columns of a laser that may see one of the people (P, 3), with room for the car's motion."""
+    """The columns of a laser that may hit one of the people (P, 3), with a margin for the car's motion."""
     flat = middles[:, :2] - laser.E[:2, 3]
     azimuth = np.arctan2(flat[:, 1], flat[:, 0])
     ahead = np.pi * (1 - (2 * np.arange(laser.width) + 1) / laser.width)
@@ -199,7 +201,7 @@ def near_columns(laser, middles):
 
 @cache
 def scene():
-    """Two frames of a segment: people with all, some and no labelled joints, without a box, and without points."""
+    """Three frames of a segment: people with all, some and no labeled joints, without a box, and without points."""
     frames = []
     for k in range(2):
         seconds = 1.3 + 0.5 * k
@@ -216,7 +218,7 @@ def scene():
         frame = Frame(START + 500_000 * k, at(car(seconds)), people)
         cast(frame, seconds, np.array(casts), shown)
         frames.append(frame)
-    # a frame that nobody is labelled in
+    # a frame without labeled people
     frames.append(Frame(START + 700_000, at(car(2.0)), [Someone("sign-1", 3, box=(9.0, 9.0, 2.0, 0.2, 0.6, 0.7, 0.1))]))
     frames[-1].images, frames[-1].poses = frames[0].images, frames[0].poses
     return frames
@@ -226,8 +228,8 @@ def scene():
 
 
 def write_v2(root, segment="10017090168044687777_6380_000_6400_000", split="training", *, frames=None, **kinds):
-    """A segment. wide: int32 and double instead of int8 and float; index: pandas' column as well; shuffled: rows in no
-    order; group: rows a row group."""
+    """Writes a segment. wide: int32 and double instead of int8 and float; index: with the index column of pandas;
+    shuffled: rows in random order; group: rows per row group."""
     for name, (rows, schema) in v2_tables(frames or scene(), segment, **kinds).items():
         path = root / split / name / f"{segment}.parquet"
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -357,7 +359,7 @@ def v1_frame(frame, segment):
         context += block(3, calibration)
     context += block(4, block(2, "Day") + block(3, "location_sf"))
     out = block(1, context) + number(2, frame.time) + block(3, doubles(1, frame.pose.ravel()))
-    # a camera's picture, which takes most of a real frame
+    # a camera image, which is most of a real frame
     out += block(4, number(1, 1) + block(2, b"\xff\xd8" + bytes(3000)) + double(5, 1.0))
     for laser in LASERS:
         first = block(2, matrix_float(frame.images[laser, 1])) + block(3, zlib.compress(b"a projection"))

@@ -22,11 +22,13 @@ if TYPE_CHECKING:
     from lidarpose.body.pose_prior.sampling import sample_poses as sample_poses
     from lidarpose.errors import InputError as InputError
     from lidarpose.errors import LidarPoseError as LidarPoseError
+    from lidarpose.errors import MissingExtra as MissingExtra
     from lidarpose.inference.background import learn_background as learn_background
     from lidarpose.inference.detection import detect as detect
     from lidarpose.inference.predict_scan import predict as predict
     from lidarpose.inference.predictor import Predictor as Predictor
     from lidarpose.inference.predictor import load as load
+    from lidarpose.inference.read_poses import read_poses as read_poses
     from lidarpose.inference.results import PersonPose as PersonPose
     from lidarpose.inference.results import Poses as Poses
     from lidarpose.io.boxes import Boxes as Boxes
@@ -66,6 +68,7 @@ _HOMES = {
     "sample_poses": "lidarpose.body.pose_prior.sampling",
     "read_points": "lidarpose.io.point_cloud",
     "read_boxes": "lidarpose.io.boxes",
+    "read_poses": "lidarpose.inference.read_poses",
     "open_source": "lidarpose.io.sources",
     "Frame": "lidarpose.io.sources.frame",
     "Box": "lidarpose.sample",
@@ -76,6 +79,7 @@ _HOMES = {
     "SKELETONS": "lidarpose.skeleton",
     "LidarPoseError": "lidarpose.errors",
     "InputError": "lidarpose.errors",
+    "MissingExtra": "lidarpose.errors",
 }
 
 _renamed.install()

@@ -199,9 +199,13 @@ class Box:
             object.__setattr__(self, "up", up_text(self.up))
 
     def to_dict(self) -> dict[str, Any]:
-        """center, size and yaw, and up if it is not z, as JSON values."""
-        place = {"center": self.center.tolist(), "size": self.size.tolist(), "yaw": float(self.yaw)}
-        return place if self.up in (None, "z") else place | {"up": self.up}
+        """The values of the box that are known, as JSON values; `read_boxes` reads a list of such dicts."""
+        values = {"id": self.id, "score": self.score, "mounted": self.mounted, "up": self.up}
+        return self.place_dict() | {name: value for name, value in values.items() if value is not None}
+
+    def place_dict(self) -> dict[str, Any]:
+        """center, size and yaw as JSON values."""
+        return {"center": self.center.tolist(), "size": self.size.tolist(), "yaw": float(self.yaw)}
 
     def contains(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Whether points lie inside the box.

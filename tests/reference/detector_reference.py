@@ -1,4 +1,4 @@
-"""Slow twins of what the detector reads of a scan: one point or one candidate at a time, straight from the words."""
+"""Slow reference implementations of the detector's inputs and suppression, with loops over points and candidates."""
 
 import math
 
@@ -8,7 +8,7 @@ from lidarpose.models.detector.candidates import Candidates
 
 
 def fine_reference(points: np.ndarray) -> np.ndarray:
-    """(28, 24, 24) of points (n, 3) m in the view frame."""
+    """The input "fine" (28, 24, 24) of points (n, 3) m in the view frame."""
     count = np.zeros((28, 24, 24))
     for x, y, z in points:
         cell = (math.floor(10 * z + 5), math.floor(10 * x) + 12, math.floor(10 * y) + 12)
@@ -18,7 +18,8 @@ def fine_reference(points: np.ndarray) -> np.ndarray:
 
 
 def context_reference(points: np.ndarray, heights: np.ndarray, center: np.ndarray, yaw: float) -> np.ndarray:
-    """(4, 20, 20) of points (n, 3) m with heights (n,) above the ground; the cells of the maps start at whole 0.5 m."""
+    """The input "context" (4, 20, 20) of points (n, 3) m with heights (n,) m above the ground. Cell edges are
+    multiples of 0.5 m."""
     context = np.zeros((4, 20, 20))
     for i in range(20):
         for j in range(20):
@@ -43,7 +44,7 @@ def suppress_near_reference(centers: np.ndarray, strength: np.ndarray, radius: f
 
 
 def range_reference(points: np.ndarray, origin: np.ndarray, chosen: Candidates, k: int) -> np.ndarray:
-    """Whether (28, 24) a return lies in each direction of candidate k's picture, by angles instead of tables."""
+    """(28, 24) bool: directions of candidate k's range view that contain a return, from angles instead of tables."""
     seen = np.zeros((28, 24), bool)
     away, distance = points - origin, chosen.distance[k]
     for x, y, z in away:

@@ -1,4 +1,5 @@
-"""Slow twins of `lidarpose.lidar`: every ray against every triangle, in float64 (Moeller and Trumbore 1997)."""
+"""Slow reference implementations of `lidarpose.lidar`: each ray against each triangle in float64 (Moeller and Trumbore
+1997)."""
 
 import numpy as np
 
@@ -11,7 +12,7 @@ _RAYS_AT_ONCE = 256
 def cast_rays_reference(
     vertices: np.ndarray, faces: np.ndarray, azimuth: np.ndarray, elevation: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As `raycast.cast_rays`: range (A, E) float32 m, inf for no hit, and face (A, E) int32, -1 for no hit."""
+    """Same as `raycast.cast_rays`: range (A, E) float32 m, inf for no hit, and face (A, E) int32, -1 for no hit."""
     azimuth, elevation = np.meshgrid(np.asarray(azimuth, float), np.asarray(elevation, float), indexing="ij")
     directions = np.stack(
         [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)], -1
@@ -28,7 +29,7 @@ def cast_ray_list_reference(
     moved: np.ndarray | None = None,
     time: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As `raycast.cast_ray_list`: range (N,) float32 m and face (N,) int32 of rays along directions (N, 3)."""
+    """Same as `raycast.cast_ray_list`: range (N,) float32 m and face (N,) int32 of rays along directions (N, 3)."""
     corners = np.asarray(vertices, float)[np.asarray(faces)]
     directions = np.asarray(directions, float)
     directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
@@ -63,7 +64,7 @@ def cast_ray_list_reference(
 def merge_echoes_reference(
     distance: np.ndarray, face: np.ndarray, weights: np.ndarray, *, pulse: float, range_max: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """As `scan_kernels` merges the sub-beams (N, K) of beams: range (N,) float32 m and face (N,) int32."""
+    """Merges sub-beams (N, K) into beams like `scan_kernels`: range (N,) float32 m and face (N,) int32."""
     merged, merged_face = np.full(len(distance), np.inf, np.float32), np.full(len(distance), -1, np.int32)
     for i, ranges in enumerate(distance):
         met = np.flatnonzero(np.isfinite(ranges))
@@ -78,7 +79,7 @@ def merge_echoes_reference(
 
 
 def window_reference(vertices: np.ndarray, sensor: Sensor, *, margin: float = 0.0) -> Window:
-    """The smallest window of beams that holds vertices (V, 3) m, `margin` rad wider on each side. Paper: Eq. 3."""
+    """Smallest beam window that contains vertices (V, 3) m, extended by `margin` rad on each side. Paper: Eq. 3."""
     if not len(vertices):
         return Window(column0=0, columns=0, row0=0, rows=0)
     x, y, z = np.asarray(vertices, float).T
@@ -92,7 +93,7 @@ def window_reference(vertices: np.ndarray, sensor: Sensor, *, margin: float = 0.
 
 
 def window_of(hits: Hits) -> Window:
-    """Where `Hits` were looked for."""
+    """The beam window of `Hits`."""
     return Window(column0=hits.column0, columns=hits.columns, row0=hits.row0, rows=hits.rows)
 
 

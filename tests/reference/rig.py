@@ -1,4 +1,4 @@
-"""Slow twins of the compiled body kernels, in plain numpy, as the formulas read. Arguments as in `lidarpose.body`."""
+"""Slow NumPy reference implementations of the compiled body kernels. Arguments as in `lidarpose.body`."""
 
 import numpy as np
 
@@ -6,11 +6,11 @@ from lidarpose.body.rig import FOLD_GAIN, forward_kinematics
 from lidarpose.skeleton import BODY26, SMPL24
 
 HEAD = SMPL24.index("head")
-HEAD_POINTS = tuple(range(len(SMPL24), len(BODY26)))  # joints behind SMPL's 24, which the head carries
+HEAD_POINTS = tuple(range(len(SMPL24), len(BODY26)))  # joints after SMPL's 24; they move with the head
 
 
 def pose_bodies_reference(rig, rest, rotations, translation):
-    """Linear blend skinning: every vertex moves with the weighted sum of its bones' motions."""
+    """Linear blend skinning: each vertex is moved by the weighted sum of its bones' transforms."""
     rotations, translation = np.float32(rotations), np.float32(translation)
     rest_joints = rest.joints[:, : len(SMPL24)]
     turned, position = forward_kinematics(rig.parents, rest_joints, rotations, translation)
@@ -33,7 +33,7 @@ def vertex_normals_reference(faces, vertices):
 
 
 def add_folds_reference(template, direction, phase, offset):
-    """offset (n, V), thickened by waves of parabolas; see `rig_kernels.fold_clothing`."""
+    """Offset (n, V) modulated by parabolic waves; see `rig_kernels.fold_clothing`."""
     turns = direction @ template.T + phase[..., None]
     u = turns - np.floor(turns) - np.float32(0.5)
     return offset * (1 + FOLD_GAIN * (8 * u * (1 - 2 * np.abs(u))).sum(1))

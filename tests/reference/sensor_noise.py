@@ -1,10 +1,10 @@
-"""Slow twin of `synth.noise_kernels.lose_returns`."""
+"""Slow reference implementation of `synth.noise_kernels.lose_returns`."""
 
 import numpy as np
 
 from lidarpose.synth.simulate import REACH
 
-# what is nearer to the sensor is not moved by more than its share, m
+# lower limit of distances in denominators, m
 _NEAREST = 1e-3
 
 

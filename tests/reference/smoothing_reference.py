@@ -1,4 +1,4 @@
-"""Slow twin of the smoother: all frames' positions and velocities in one dense least-squares problem."""
+"""Slow reference implementation of the smoother: one dense least-squares problem for all positions and velocities."""
 
 import numpy as np
 
@@ -22,7 +22,7 @@ def smooth_joints_reference(
             if t:
                 step = times[t] - times[t - 1]
                 noise = process_noise[t, j] * np.array([[step**3 / 3, step**2 / 2], [step**2 / 2, step]])
-                # from what was expected of the frame to what it is
+                # state of the frame minus its prediction from the previous frame
                 jump = np.hstack([-np.array([[1, step], [0, 1]]), np.eye(2)])
                 information[2 * t - 2 : 2 * t + 2, 2 * t - 2 : 2 * t + 2] += jump.T @ np.linalg.inv(noise) @ jump
         covariance = np.linalg.inv(information)

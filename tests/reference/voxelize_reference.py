@@ -1,4 +1,4 @@
-"""Slow twin of `voxelize`: dictionaries of voxels, one person and one point after the other."""
+"""Slow reference implementation of `voxelize`, with dictionaries of voxels and loops over people and points."""
 
 from collections import defaultdict
 
@@ -19,7 +19,7 @@ def voxelize_reference(
     seeds: np.ndarray | None = None,
     neighbors: bool = False,
 ) -> VoxelPyramid:
-    """The same arguments and result as `voxelize`; with `seeds` it draws the same numbers."""
+    """Same arguments and result as `voxelize`; with `seeds` the same random numbers are drawn."""
     fine, mid, coarse = [], [], []
     start = 0
     for b, length in enumerate(lengths):
@@ -62,7 +62,7 @@ def _thinned(cells: list[Cell], most: int, seed: int | None) -> list[Cell]:
 
 
 def _merged(voxels: dict[Cell, list[int]]) -> dict[Cell, list[int]]:
-    """Voxels twice as wide, in order of their cells."""
+    """Merges voxels into cells of twice the size, sorted by cell."""
     wider: dict[Cell, list[int]] = defaultdict(list)
     for cell, members in voxels.items():
         wider[_parent(cell)] += members
@@ -89,7 +89,7 @@ def _level(points: np.ndarray, people: list[dict], parents: list[dict] | None, n
 
 
 def _around(people: list[dict], shape: tuple[int, int]) -> np.ndarray:
-    """Rows of the 27 cells around each voxel."""
+    """Indices of the voxels in the 27 cells around each voxel."""
     rows = np.full((*shape, 27), shape[1])
     for b, voxels in enumerate(people):
         number = {cell: n for n, cell in enumerate(voxels)}

@@ -45,14 +45,16 @@ def run(folder: str | Path, *, seed: int, weights: str = DEFAULT) -> None:
             for _ in range(PEOPLE_EACH):
                 people.append(generator.person(seed, len(people)))
                 bar.update(len(people))
-    rows, contents = _report(model, people)
+    rows, contents, milliseconds = _report(model, people)
     write_all_atomic({folder / name: content for name, content in contents.items()})
     print(pandas.DataFrame(rows).to_string(index=False, justify="left"))
+    print(f"{milliseconds:.1f} ms per person")
     print(f"open {folder / 'index.html'} to view the people in 3D; pictures: {folder}/*.png")
 
 
-def _report(model: Predictor, people: list) -> tuple[list[dict], dict[str, bytes]]:
-    """Predicts synthetic people. Returns the table's rows, and the report and the pictures by their files' names."""
+def _report(model: Predictor, people: list) -> tuple[list[dict], dict[str, bytes], float]:
+    """Predicts synthetic people. Returns the table's rows, the report and the pictures by their files' names, and the
+    time in ms per person."""
     from lidarpose.viz.draw import Panel, draw_people
     from lidarpose.viz.html import render_report
 
@@ -74,7 +76,6 @@ def _report(model: Predictor, people: list) -> tuple[list[dict], dict[str, bytes
                 "distance m": round(facts.distance, 1),
                 "visible %": round(facts.visible * 100),
                 "MPJPE mm": round(error),
-                "ms per person": round(milliseconds, 1),
             }
         )
         label = f"{facts.sensor}, {facts.distance:.1f} m"
@@ -88,4 +89,4 @@ def _report(model: Predictor, people: list) -> tuple[list[dict], dict[str, bytes
     }
     title = "lidarpose demo: synthesized people, predicted and true"
     contents["index.html"] = render_report(panels, title=title, summary=rows).encode()
-    return rows, contents
+    return rows, contents, milliseconds

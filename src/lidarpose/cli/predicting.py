@@ -20,6 +20,8 @@ _NOBODY = (
     "if there should be: points need meters and z up (--up), a lower --min-score finds more, and predict --crop "
     "treats all points as one person"
 )
+# parts of the warnings that state why no person was found: wrong axes, units or background
+_CAUSES = ("try up", "all coordinates by", "on the background")
 # maximum characters of an id in a warning
 _LONGEST_ID = 40
 
@@ -99,7 +101,7 @@ def _predict(options: argparse.Namespace) -> None:
     outputs: dict[Path, bytes] = {}
     if result is not None:
         is_csv = result.suffix.lower() == ".csv"
-        outputs[result] = (poses.to_dataframe().to_csv(index=False) if is_csv else poses.to_json()).encode()
+        outputs[result] = (poses.to_csv() if is_csv else poses.to_json()).encode()
     if picture is not None:
         outputs[picture] = poses.picture(title=file.name)
     if page is not None:
@@ -111,11 +113,12 @@ def _predict(options: argparse.Namespace) -> None:
         tell(f"lidarpose: warning: {line}")
     num_posed = sum(person.has_pose for person in poses)
     destination = f" -> {' and '.join(map(str, outputs))}" if outputs else ""
-    if not poses and poses.scan is not None:
-        tell(f"no people found{destination}; {_NOBODY}")
+    if not poses:
+        tell(f"no boxes{destination}" if poses.scan is None else _none_found(destination, poses.warnings))
         return
     search = f"searched in {poses.timing_ms['find'] / 1e3:.1f} s, " if poses.scan is not None else ""
-    tell(f"{num_posed} of {len(poses)} people, {search}{poses.timing_ms['per_person']:.0f} ms each{destination}")
+    people = counted(len(poses), "person", "people")
+    tell(f"{num_posed} of {people}, {search}{poses.timing_ms['per_person']:.0f} ms each{destination}")
 
 
 def output_paths(
@@ -167,8 +170,15 @@ def _detect(options: argparse.Namespace) -> None:
         boxes.save(result)
     for line in boxes.warnings:
         tell(f"lidarpose: warning: {line}")
-    outcome = f"{counted(len(boxes), 'person', 'people')} found" if boxes else "no people found"
-    tell(outcome + (f" -> {result}" if result else "") + ("" if boxes else f"; {_NOBODY}"))
+    destination = f" -> {result}" if result else ""
+    found = f"{counted(len(boxes), 'person', 'people')} found{destination}"
+    tell(found if boxes else _none_found(destination, boxes.warnings))
+
+
+def _none_found(destination: str, warnings: Sequence[str]) -> str:
+    """The line for a scan without people, with advice unless a warning states the likely cause."""
+    is_explained = any(cause in warning for cause in _CAUSES for warning in warnings)
+    return f"no people found{destination}" + ("" if is_explained else f"; {_NOBODY}")
 
 
 def _reading(options: argparse.Namespace) -> dict[str, Any]:

@@ -81,7 +81,7 @@ def _add(parser, kind: type[Recipe]) -> None:
 {folder_option}  run folder, new (default runs/{kind.kind}-001, -002, ...), or with --resume an existing one
 --resume  continue an interrupted run (default: the latest)
 --recipe NAME  {"default" if kind in (TrainDetector, TrainVerifier) else recipe_help}
---device NAME  cpu, to train on the CPU (default: a GPU if there is one)
+--device NAME  cpu or cuda (default: a GPU if there is one)
 --tracker NAME  also log to tensorboard or wandb, if installed
 """
     add_options(parser, options)

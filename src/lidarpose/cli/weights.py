@@ -11,6 +11,7 @@ from typing import Any, cast
 
 from lidarpose._version import __version__
 from lidarpose.cli.terminal import add_command, tell
+from lidarpose.errors import counted
 from lidarpose.models import BUNDLED, DEFAULT, bundled_path
 
 _INFO = """
@@ -97,7 +98,8 @@ def installed() -> dict[str, Any]:
 def _lines(facts: dict[str, Any], *, verbose: bool) -> Iterator[str]:
     """`installed` for reading: what a user needs, or everything."""
     yield f"lidarpose  {facts['lidarpose']}, Python {facts['python']}"
-    yield f"onnx       ONNX Runtime {facts['onnxruntime']}, cpu, {facts['threads']} threads: the default backend"
+    threads = counted(facts["threads"], "thread")
+    yield f"onnx       ONNX Runtime {facts['onnxruntime']}, cpu, {threads}: the default backend"
     yield f"torch      {facts['torch']}"
     for name, entry in facts["weights"].items():
         size = f"{entry['parameters']:,} parameters, {entry['bytes'] / 1e6:.2f} MB"

@@ -195,4 +195,5 @@ def read_poses(path: str | Path) -> dict[str, Predictions]:
             predictions[name] = stack(Skeleton(name=entry["skeleton"], joints=joints, parents=parents), rows)
         return predictions
     except (pa.ArrowException, OSError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise file_error(path, f"is not the poses.parquet of an evaluation ({error}); evaluate again") from None
+        remedy = "lidarpose.read_poses reads .poses.json" if data.startswith(b"{") else "evaluate again"
+        raise file_error(path, f"is not the poses.parquet of an evaluation ({error}); {remedy}") from None

@@ -115,7 +115,9 @@ class Result:
         for row in self.lines:
             if all(getattr(row, name) == value for name, value in keys.items()):
                 return row
-        raise InputError(f"{self.setting.dataset} has no line {', '.join(map(str, keys.values()))}")
+        figures = ", ".join(dict.fromkeys(row.figure for row in self.lines))
+        wanted = ", ".join(map(str, keys.values()))
+        raise InputError(f"{self.setting.dataset} has no row {wanted}: figures are {figures}")
 
 
 @dataclass(frozen=True, kw_only=True)

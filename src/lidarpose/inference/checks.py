@@ -155,11 +155,16 @@ def box_units(scan: Scan, people: Poses) -> str | None:
     boxes = scan.boxes or []
     warnings = [(str(person.id), unit_warning(box.size, what="it")) for person, box in zip(people, boxes, strict=True)]
     warnings = [(name, warning) for name, warning in warnings if warning]
-    if 2 * len(warnings) > len(boxes):
+    if are_boxes_in_other_units(boxes):
         return unit_warning(np.median([box.size for box in boxes], axis=0), what="a person's box") or warnings[0][1]
     if not warnings:
         return None
     return f"box {first_names([name for name, _ in warnings])} is unlike the others: {warnings[0][1]}"
+
+
+def are_boxes_in_other_units(boxes: list[Box]) -> bool:
+    """Whether the sizes of most boxes are not in meters."""
+    return 2 * sum(unit_warning(box.size, what="it") is not None for box in boxes) > len(boxes)
 
 
 def empty_boxes(scan: Scan, people: Poses) -> str | None:
@@ -213,6 +218,9 @@ def check_scan(scan: Scan, people: Poses) -> list[str]:
     # detected boxes need no check, and detection has already checked the axes
     is_given = scan.detected_rows is None
     warnings = {check: check(scan, people) for check in SCAN_CHECKS if scan.boxes and is_given}
+    if are_boxes_in_other_units(scan.boxes or []):
+        # other problems of the boxes follow from this one
+        warnings = {box_units: warnings[box_units]} if box_units in warnings else {}
     # warn of a wrong axis only once; people who are cut off by wrong boxes only appear to lie
     axis = flat_along_another_axis(scan) if is_given else None
     if not (axis or warnings.get(wide_boxes) or warnings.get(boxes_at_feet)):
@@ -222,7 +230,7 @@ def check_scan(scan: Scan, people: Poses) -> list[str]:
 
 def origin_warning(scan: Scan) -> str | None:
     """The sensor is farther from the boxes than a LiDAR can see people."""
-    if scan.origin is None or not scan.boxes:
+    if scan.origin is None or not scan.boxes or are_boxes_in_other_units(scan.boxes):
         return None
     distance = float(np.median([np.linalg.norm(box.center - scan.origin) for box in scan.boxes]))
     if distance < FARTHEST_PERSON:
@@ -241,7 +249,8 @@ def scan_unit_warning(points: np.ndarray, count: int) -> str | None:
     width, largest = float(extent[:2].max()), float(extent.max())
     if largest < _SMALLEST_SCAN:
         return f"the points extend over {largest:.2g} m: are the units kilometers? multiply all coordinates by 1000"
-    if width > _LONGEST_SCAN and count < _SPARSEST * width**2:
+    is_flat = extent[2] < largest / _WIDEST
+    if is_flat and width > _LONGEST_SCAN and count < _SPARSEST * width**2:
         unit, factor = ("millimeters", 1000) if width > _LONG_IN_MILLIMETERS else ("centimeters", 100)
         return f"the points extend over {width:,.0f} m: are the units {unit}? divide all coordinates by {factor}"
     return unit_warning(extent, what="the scan")
@@ -259,7 +268,7 @@ def unlikely_origin(points: np.ndarray, origin: np.ndarray) -> str | None:
     else:
         return None
     return (
-        f"the sensor {problem}, so its position is treated as unknown: give it in the points' own frame (sensor origin)"
+        f"the sensor {problem}, so its position is treated as unknown: give it in the points' own frame (sensor_origin)"
     )
 
 

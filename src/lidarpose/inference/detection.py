@@ -56,11 +56,11 @@ class Search:
 
     def __post_init__(self):
         if not _is_number(self.max_range) or not 0 < self.max_range < np.inf:
-            raise InputError(f"range: expected meters, more than 0, got {self.max_range!r}")
+            raise InputError(f"max_range: expected meters, more than 0, got {self.max_range!r}")
         if self.min_score is not None and not (_is_number(self.min_score) and 0 <= self.min_score <= 1):
-            raise InputError(f"min score: expected a probability from 0 to 1, got {self.min_score!r}")
+            raise InputError(f"min_score: expected a probability from 0 to 1, got {self.min_score!r}")
         if self.max_people is not None:
-            check_int("max people", self.max_people, least=1)
+            check_int("max_people", self.max_people, least=1)
 
 
 def detect(

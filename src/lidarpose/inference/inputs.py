@@ -126,6 +126,9 @@ def as_points(points: Any, what: str = "points") -> np.ndarray:
         raise InputError(f"{what} must be an (n, 3) array of numbers, got rows of unequal length ({error})") from None
     if array.shape == (0,):
         return np.empty((0, 3))
+    if array.dtype == object and array.ndim == 0:
+        frame = ", its points are in .points" if hasattr(points, "points") else ""
+        raise InputError(f"{what} must be an (n, 3) array of numbers, got {type(points).__name__}{frame}")
     if array.dtype == object:
         raise InputError(
             f"{what} must be an (n, 3) array of numbers, got {type(points).__name__} of objects, shape {array.shape}: "

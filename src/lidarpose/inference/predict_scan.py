@@ -104,7 +104,7 @@ def predict(
     scan = read_scan(scan, path, columns)
     find = find or boxes is None and not crop and (not len(scan.points) or is_wide(scan))
     if not find and any(option is not None for option in options):
-        note = f"treated as one person because under {CROP_SIZE:g} m across: use find to detect people"
+        note = f"treated as one person because under {CROP_SIZE:g} m across: set find (--find) to detect people"
         scan = replace(scan, warnings=(*scan.warnings, note))
     if sensor_origin is None and (find or boxes is not None):
         scan = replace(scan, origin=np.zeros(3))
@@ -194,7 +194,9 @@ def check_up(boxes: Boxes, up: str | Sequence[float], *, most: float = _SAME_UP)
     """Raises InputError if the up axis stated by boxes differs from the given one. most: maximum difference of the
     directions, as unit vectors."""
     difference = rotation_from_up(boxes.up)[2] - rotation_from_up(up)[2]
-    if boxes.up != "z" and np.linalg.norm(difference) > most:
+    # boxes along z may belong to a tilted scan
+    most = _SAME_AXIS if boxes.up == "z" else most
+    if boxes.has_up and np.linalg.norm(difference) > most:
         raise InputError(f"the up axis of the boxes is {boxes.up}, not {up_text(up)}: give up {boxes.up}")
 
 
@@ -205,5 +207,5 @@ def check_choice(boxes: object, crop: bool, searched: bool, calib: object) -> No
     if boxes is not None and crop:
         raise InputError("expected boxes or a crop, got both: a crop contains one person, so omit the boxes")
     if searched and (boxes is not None or crop):
-        options = "find, min score, range, max people and background"
+        options = "find, min_score, max_range, max_people and background"
         raise InputError(f"{options} are options of the detection: omit them with boxes or a crop")

@@ -367,9 +367,15 @@ class Predictor(PoseEstimator):
         # pose the few uncertain clouds again upside down; if pelvises are known, people were upright in earlier frames
         flipped_clouds = [best_poses[i][1] * UPSIDE_DOWN for i in unsure_rows]
         flipped_poses = self.poses(flipped_clouds, None if origin is None else origin * UPSIDE_DOWN)
-        for i, flipped_pose in zip(unsure_rows, flipped_poses, strict=True):
-            # for lying people another up axis is possible; `check_scan` warns of it once for all people
-            if (warning := upside_down_warning(best_poses[i][0], flipped_pose)) and not is_lying(*best_poses[i]):
+        # for lying people another up axis is possible; `check_scan` warns of it once for all people
+        flipped_warnings = {
+            i: warning
+            for i, flipped_pose in zip(unsure_rows, flipped_poses, strict=True)
+            if (warning := upside_down_warning(best_poses[i][0], flipped_pose)) and not is_lying(*best_poses[i])
+        }
+        # detected people share one up axis: a few of many who look upside down are no sign of a wrong one
+        if not is_scored or 2 * len(flipped_warnings) > len(best_poses):
+            for i, warning in flipped_warnings.items():
                 cleaned_clouds[i][1].append(warning)
         people = tuple(
             PersonPose(pose=pose, skeleton=target_skeleton, points=points, warnings=tuple(notes), model=self.model)

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from lidarpose.viz.person_view import Panel
 
 SCHEMA = "lidarpose.poses/1"
+# decimals of the values in files, by column of tables
+_DECIMALS = {"x": 4, "y": 4, "z": 4, "confidence": 3, "spread": 4, "visible": 3}
+_DECIMALS |= {"person_probability": 4, "second_person": 4, "score": 4}
 
 
 class Picture(bytes):
@@ -47,6 +50,7 @@ class PersonPose:
         warnings: messages for the user about this person.
         model: name, version and settings of the network.
         up: up axis of the input frame, used for drawing.
+        stored_points: number of points of the crop if `points` does not hold them, see `read_poses`.
     """
 
     pose: Pose | None
@@ -57,6 +61,7 @@ class PersonPose:
     warnings: tuple[str, ...] = ()
     model: dict = field(default_factory=dict)
     up: str = "z"
+    stored_points: int | None = None
 
     @property
     def has_pose(self) -> bool:
@@ -128,23 +133,24 @@ class PersonPose:
 
     @property
     def num_points(self) -> int:
-        return len(self.points)
+        return len(self.points) if self.stored_points is None else self.stored_points
 
     def to_dict(self) -> dict:
         """The entry of this person in the list "people" of `Poses.to_dict`."""
         return {
             "id": self.id,
-            # the document states "up" once for all people
-            "box": self.box and replace(self.box, up=None).to_dict(),
-            "score": None if self.score is None else round(self.score, 4),
+            "box": self.box and self.box.place_dict(),
+            "score": None if self.score is None else round(self.score, _DECIMALS["score"]),
             "mounted": self.mounted,
             "num_points": self.num_points,
-            "person": None if self.person is None else round(self.person, 4),
-            "second_person": None if self.second_person is None else round(self.second_person, 4),
-            "joints": None if self.pose is None else _rounded(self.joints, 4),
-            "confidence": _rounded(self.confidence, 3),
-            "spread": _rounded(self.spread, 4),
-            "visible": _rounded(self.visible, 3),
+            "person": None if self.person is None else round(self.person, _DECIMALS["person_probability"]),
+            "second_person": None
+            if self.second_person is None
+            else round(self.second_person, _DECIMALS["second_person"]),
+            "joints": None if self.pose is None else _rounded(self.joints, _DECIMALS["x"]),
+            "confidence": _rounded(self.confidence, _DECIMALS["confidence"]),
+            "spread": _rounded(self.spread, _DECIMALS["spread"]),
+            "visible": _rounded(self.visible, _DECIMALS["visible"]),
             "out_of_range": self.out_of_range,
             "warnings": list(self.warnings),
         }
@@ -288,6 +294,10 @@ class Poses(Sequence[PersonPose]):
                 rows.append((number, id, joint, *person.pose.joints[j], *joint_values, *person_values))
         return pandas.DataFrame(rows, columns=["person", "id", *JOINT_COLUMNS])
 
+    def to_csv(self) -> str:
+        """`to_dataframe` as CSV text, with the decimals of `to_json`."""
+        return self.to_dataframe().round(_DECIMALS).to_csv(index=False)
+
     def to_dict(self) -> dict:
         """A document with the schema lidarpose.poses/1. Its top-level "warnings" concern the whole input."""
         return {
@@ -314,11 +324,11 @@ class Poses(Sequence[PersonPose]):
         return lined_json(document | last_entries, "people") + "\n"
 
     def save(self, path: str | Path) -> None:
-        """Writes `to_json` to a .json file or `to_dataframe` to a .csv file; the file is written completely or not at
+        """Writes `to_json` to a .json file or `to_csv` to a .csv file; the file is written completely or not at
         all."""
         check_suffix(path, ".json", ".csv")
         is_csv = str(path).lower().endswith(".csv")
-        write_atomic(path, self.to_dataframe().to_csv(index=False) if is_csv else self.to_json())
+        write_atomic(path, self.to_csv() if is_csv else self.to_json())
 
     def picture(self, path: str | Path | None = None, *, title: str = "") -> Picture:
         """Front and side views of all people on one PNG; also written to `path` if given.
@@ -362,7 +372,7 @@ class Poses(Sequence[PersonPose]):
     def _distance(self, person: PersonPose) -> float | None:
         """Distance of the person from the sensor, m; NaN if the sensor position is unknown, None without detection or
         points."""
-        if self.scan is None or not person.num_points:
+        if self.scan is None or not len(person.points):
             return None
         return np.nan if self.origin is None else float(np.linalg.norm(np.median(person.points, 0) - self.origin))
 
@@ -398,7 +408,7 @@ def _upright(person: PersonPose, up: str) -> PersonPose:
 
 def _box_around(person: PersonPose) -> Box | None:
     """A box around the points of a person (z up), aligned with the heading of the pose; None without points."""
-    if not person.num_points:
+    if not len(person.points):
         return None
     yaw = facing_yaw(person.pose)
     R_level_local = rotation_about("z", yaw)

@@ -46,7 +46,7 @@ class Boxes(list[Box]):
 
     source: the file; warnings: lines about the scan; detector: the version of the detector, if the boxes are
     detections; up: the scan's up axis or direction, see `rotation_from_up`, by default that of the boxes, or z if no
-    box has one.
+    box has one; has_up: whether it is stated, not this default.
     """
 
     def __init__(
@@ -59,6 +59,9 @@ class Boxes(list[Box]):
         up: str | None = None,
     ):
         boxes = list(boxes)
+        if others := [type(box).__name__ for box in boxes if not isinstance(box, Box)]:
+            raise InputError(f"Boxes: expected objects of type Box, got {others[0]}: convert with lidarpose.read_boxes")
+        self.has_up = up is not None or any(box.up is not None for box in boxes)
         up = _common_up(boxes) if up is None else up
         # each box stores the up axis too, so that a box taken out of this list keeps it
         super().__init__(box if (box.up or "z") == up else replace(box, up=up) for box in boxes)
@@ -74,13 +77,12 @@ class Boxes(list[Box]):
         item = super().__getitem__(index)
         if not isinstance(index, slice):
             return item
-        return Boxes(item, source=self.source, warnings=self.warnings, detector=self.detector, up=self.up)
+        up = self.up if self.has_up else None
+        return Boxes(item, source=self.source, warnings=self.warnings, detector=self.detector, up=up)
 
     def to_dict(self) -> dict:
         """The document of the schema lidarpose.boxes/1, which `read_boxes` reads."""
-        # "up" is a key of the document, next to "people"
-        boxes = [replace(box, up=None) for box in self]
-        people = [{"id": box.id, **box.to_dict(), "score": box.score, "mounted": box.mounted} for box in boxes]
+        people = [{"id": box.id, **box.place_dict(), "score": box.score, "mounted": box.mounted} for box in self]
         return {
             "schema": SCHEMA,
             "source": self.source,
@@ -147,7 +149,9 @@ def _up(content: object) -> str | None:
     """The up axis that a lidarpose document states, None for any other content."""
     up: object
     if isinstance(content, Boxes):
-        up = content.up
+        up = content.up if content.has_up else None
+        if up is None:
+            return None
     elif isinstance(content, dict) and str(content.get("schema")).startswith("lidarpose."):
         up = content.get("up", "z")
     else:

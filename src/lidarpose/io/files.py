@@ -212,7 +212,8 @@ def check_suffix(path: str | os.PathLike, *suffixes: str) -> None:
     except TypeError as error:
         raise file_error(repr(path), f"expected the path of a file to write ({error})") from None
     if not name.endswith(suffixes):
-        raise file_error(path, f"is written as {suffixes[0][1:].upper()}: give a name that ends in {suffixes[0]}")
+        formats, endings = (" or ".join(words) for words in ([s[1:].upper() for s in suffixes], suffixes))
+        raise file_error(path, f"is written as {formats}: give a name that ends in {endings}")
 
 
 @contextmanager

@@ -79,6 +79,12 @@ class Cloud:
     fields: tuple[str, ...] = ("x", "y", "z")
     warnings: tuple[str, ...] = ()
 
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __repr__(self) -> str:
+        return f"Cloud({len(self):,} points, columns {' '.join(self.fields)})"
+
     def __array__(self, dtype=None, copy=None) -> np.ndarray:
         """The points, so that the cloud itself can be passed to `predict`."""
         return np.array(self.points, dtype, copy=copy)

@@ -245,7 +245,7 @@ def _parse_safetensors(path: str | os.PathLike, content: bytes) -> dict:
         raise file_error(path, f"expected {_EXPECTED}, but the file ends at byte {size}: {remedy}")
     length = struct.unpack("<Q", content[:8])[0]
     if content[8:9] not in (b"", b"{") or not 0 < length <= _MOST_HEADER:
-        raise file_error(path, f"expected {_EXPECTED}, but the file is something else: give a checkpoint")
+        raise file_error(path, f"expected {_EXPECTED}, but the file is something else: give a file of weights")
     if size < 8 + length:
         raise file_error(path, f"the file ends at byte {size:,}, within its header of {length:,} bytes: {remedy}")
     end = 0

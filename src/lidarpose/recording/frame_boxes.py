@@ -89,7 +89,9 @@ def _by_frame(path: str | os.PathLike) -> dict[str, Any]:
     by_frame: dict[str, Any] = {}
     for i, entry in enumerate(entries if isinstance(entries, list) else [entries]):
         frame = entry.get("frame") if isinstance(entry, dict) else None
-        if isinstance(frame, bool) or not isinstance(frame, str | int) or "people" not in entry:
+        # documents of one scan state their coordinate frame under this key
+        is_scan = frame == "input" and "schema" in entry
+        if is_scan or isinstance(frame, bool) or not isinstance(frame, str | int) or "people" not in entry:
             excerpt = shorten(json.dumps(entry), 60)
             raise file_error(
                 path, f"expected one entry per frame, {_FORM}, got {excerpt} as entry {i}: one box file is one scan"

@@ -173,13 +173,13 @@ def _is_locked(file: BinaryIO) -> bool:
 class Summary:
     """Statistics of a recording's result.
 
-    frames, people, damaged, in_world: counts; damaged and in_world count frames, the latter those in the world frame;
+    frames, poses, damaged, in_world: counts; damaged and in_world count frames, the latter those in the world frame;
     tracks: ids; first_error: message of the first damaged frame; warnings: an example of each kind of warning of frames
     and people; warned: number of frames with each kind. Warnings that differ only in numbers are of one kind.
     """
 
     frames: int = 0
-    people: int = 0
+    poses: int = 0
     damaged: int = 0
     in_world: int = 0
     tracks: set[int] = field(default_factory=set)
@@ -189,7 +189,7 @@ class Summary:
 
     def add(self, line: dict[str, Any]) -> None:
         self.frames += 1
-        self.people += len(line["people"])
+        self.poses += sum(person["joints"] is not None for person in line["people"])
         self.in_world += line.get("coordinates") == "world"
         self.tracks.update(person["track"] for person in line["people"] if person["track"] is not None)
         if line["error"] is not None:
@@ -211,7 +211,7 @@ class Summary:
 
     def text(self, is_tracked: bool) -> str:
         """The counts as text."""
-        parts = [counted(self.frames, "frame"), counted(self.people, "person", "people")]
+        parts = [counted(self.frames, "frame"), counted(self.poses, "pose")]
         parts += [counted(len(self.tracks), "track")] if is_tracked else []
         return ", ".join(parts + ([f"{self.damaged:,} damaged"] if self.damaged else []))
 

@@ -160,7 +160,9 @@ def _accelerator(recipe: Recipe, on_cpu: bool, tracker: str | None) -> Accelerat
 def _check(device: str | None, tracker: str | None) -> None:
     """Raises InputError for an unknown device or a tracker that is not installed."""
     if device is not None:
-        check_name("device to train on", device, ("cpu",))
+        check_name("device to train on", device, ("cpu", "cuda"))
+    if device == "cuda" and not torch.cuda.is_available():
+        raise InputError("--device cuda: torch finds no GPU: install torch with CUDA, or train with --device cpu")
     if tracker is not None:
         check_name("tracker", tracker, TRACKERS)
         if find_spec(tracker) is None:

@@ -13,8 +13,6 @@ from lidarpose.train.recipes import PoseRecipe, Recipe
 
 # the released schedule begins at a tenth of its peak rate and ends at a thousandth
 _FIRST, _LAST = 0.1, 1e-3
-# lower bound of a rate that is reduced on plateaus
-_LEAST_RATE = 3e-8
 # parameters of a `PoseNet` that Muon does not step: vectors, embeddings, and layers that output meters or logits
 _ENDS = (
     *("anchors", "stem.voxel", "stem.view", "place", "anchor_view", "level_joints", "vote.residual", "part"),
@@ -73,11 +71,10 @@ def rate_factor(done: float, recipe: Recipe) -> float:
 
 def plateau_factor(losses: Sequence[float], rate: float) -> float:
     """Share of the peak rate after epochs with these mean losses: it falls by a tenth after two consecutive epochs that
-    each improve the loss by less than 1 %; the rate stays at 3e-8 or more. Source: LiDARCap's ReduceLROnPlateau."""
+    each improve the loss by less than 1 %. Source: LiDARCap's ReduceLROnPlateau. Its lower bound of 3e-8 is left out,
+    since torch omits reductions by less than 1e-8: a rate stays above 9e-8."""
     optimizer = torch.optim.SGD([torch.zeros(1)], lr=rate)
-    scheduler = torch.optim.lr_scheduler.ReduceLROnPlateau(
-        optimizer, factor=0.9, patience=1, threshold=0.01, min_lr=min(_LEAST_RATE, rate)
-    )
+    scheduler = torch.optim.lr_scheduler.ReduceLROnPlateau(optimizer, factor=0.9, patience=1, threshold=0.01)
     for loss in losses:
         scheduler.step(loss)
     return optimizer.param_groups[0]["lr"] / rate

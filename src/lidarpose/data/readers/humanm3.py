@@ -164,7 +164,7 @@ def _people(
     for track, joints in people.items():
         where, labeled_joints = f"{frame_id}/{track}", joints[~np.isnan(joints).any(-1)]
         if not len(labeled_joints):
-            yield Skipped("no joint is labelled", where)
+            yield Skipped("no joint is labeled", where)
             continue
         try:
             box = base.box_of_joints(labeled_joints, track)

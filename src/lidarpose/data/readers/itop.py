@@ -121,7 +121,7 @@ def _sample(
     """The person in a cloud (n, 3) m with joints (14, 3) m, both in the camera's axes; fields: others of the sample."""
     is_labeled, frame_id = np.isfinite(joints).all(-1), fields["frame_id"]
     if not is_labeled.any():
-        return Skipped("no joint is labelled", frame_id)
+        return Skipped("no joint is labeled", frame_id)
     joints = np.where(is_labeled[:, None], joints, np.nan) @ R_level_camera.T
     if fields["sequence"].startswith("side"):
         points = person_of_room(cloud) @ R_level_camera.T

@@ -159,7 +159,7 @@ def person(
     if box is None:
         return Problem("keypoints without a box", track=track)
     if (labels == UNLABELED).all():
-        return Problem("no joint is labelled", track=track)
+        return Problem("no joint is labeled", track=track)
     try:
         labeled_box = Box(center=np.asarray(box[:3]), size=np.asarray(box[3:6]), yaw=box[6], id=track)
     except InputError as error:

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from lidarpose.arrays import to_numpy
 from lidarpose.errors import InputError, check_int, check_name
+from lidarpose.inference.results import Poses
 from lidarpose.skeleton import Skeleton, as_skeleton
 
 # ways to average: "person", over people the mean of each person's joints; "joint", over all joints alike
@@ -44,8 +45,10 @@ _BLOCK = 1 << 21
 # ---- validation of arguments
 
 
-def as_numbers(name: str, value: ArrayLike) -> np.ndarray:
-    """An array of floats, NaN where masked. Raises InputError for other content or lists of unequal length."""
+def as_numbers(name: str, value: ArrayLike | Poses) -> np.ndarray:
+    """An array of floats, NaN where masked; of `Poses`, the joints. Raises InputError for other content or lists of
+    unequal length."""
+    value = value.to_numpy() if isinstance(value, Poses) else value
     try:
         value = list(map(to_numpy, value)) if isinstance(value, list | tuple) else to_numpy(value)
         return np.asarray(value, float)

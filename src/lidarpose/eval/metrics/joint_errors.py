@@ -192,7 +192,8 @@ def checked_poses(pred, true, visible, trailing=("joints", "3")) -> tuple[np.nda
         raise InputError(f"pred and true must both be ({expected_shape}), got {pred.shape} and {true.shape}")
     if not np.isfinite(pred).all():
         num_joints = int((~np.isfinite(pred).all(-1)).sum())
-        raise InputError(f"pred must be finite, got NaN or infinity in {num_joints} joints: predict every joint")
+        remedy = "leave out people without a pose (has_pose), and predict every joint"
+        raise InputError(f"pred must be finite, got NaN or infinity in {num_joints} joints: {remedy}")
     if np.isinf(true).any():
         raise InputError("true must be finite, or NaN where a joint has no label; got infinity")
     is_labeled = ~np.isnan(true).any(-1)

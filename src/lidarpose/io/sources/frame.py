@@ -231,8 +231,9 @@ class FrameSource:
                 check_finite(name, value)
         if rate is not None and rate <= 0:
             raise InputError(f"rate must be positive, in frames per second, got {rate!r}")
-        if end is not None and end <= (start or 0):
-            raise InputError(f"end must be later than start, in seconds from the first frame, got {start!r} to {end!r}")
+        first = start or 0
+        if end is not None and end <= first:
+            raise InputError(f"end must be later than start, in seconds from the first frame, got {first!r} to {end!r}")
         self.name = recording.name
         self.recording = recording
         self.rate = rate or DEFAULT_RATE

@@ -34,7 +34,7 @@ def import_dapt(path: str | os.PathLike, config: DaptConfig | dict | str | None 
         InputError: one line that names the file and the tensor, if anything does not fit.
     """
     path = Path(path)
-    if path.suffix.lower() in _PICKLES:
+    if path.suffix.lower() in _PICKLES and path.exists():
         raise file_error(
             path,
             "expected a .safetensors file, got a pickle, which can run programs: if you trust it, convert it once with "
