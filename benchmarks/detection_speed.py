@@ -47,6 +47,7 @@ def worker(file: str) -> None:
     """Times one step for each line on the standard input, with the package on Python's path."""
     import lidarpose
     from lidarpose.inference import detection, verification
+    from lidarpose.inference.backend import OnnxBackend
     from lidarpose.inference.scan import Scan
     from lidarpose.models import weights_file
     from lidarpose.models.detector.detector import Detector
@@ -55,9 +56,9 @@ def worker(file: str) -> None:
     detector, predictor = Detector(threads=1), lidarpose.load("small", threads=1, tta=1)
     # replaces the package's own detector and verifiers, which use all processors
     detection._detector = lambda: detector
-    backend = cache(lambda name: verification.OnnxBackend(weights_file(f"{name}.onnx"), threads=1))
+    backend = cache(lambda name: OnnxBackend(weights_file(f"{name}.onnx"), threads=1))
     # for versions without a separate verification network
-    verification._bundled = backend
+    verification.bundled_backend = backend
     verification._verifier = lambda: backend(verification.VERIFIER)
     origin = np.zeros(3)
 

@@ -85,7 +85,7 @@ def test_scan_crops_match_crops_of_detection(monkeypatch):
                 person=np.zeros((len(clouds), 2)),
             )
 
-    monkeypatch.setattr(verification, "_bundled", lambda name: Backend())
+    monkeypatch.setattr(verification, "bundled_backend", lambda name: Backend())
     rows = rows_near(detections.centers, scene.points, verification.AROUND)
     clouds = {i: scene.points[near] for i, near in enumerate(rows)}
     verification.Crops(detections, clouds, origin).verdicts()

@@ -73,7 +73,7 @@ def test_verification_features_and_score_bound(monkeypatch):
         def run(self, clouds, view):
             return SimpleNamespace(person=np.array([outputs[len(cloud)] for cloud in clouds]))
 
-    monkeypatch.setattr(verification, "_bundled", lambda name: Verifier())
+    monkeypatch.setattr(verification, "bundled_backend", lambda name: Verifier())
     features, mounted = Crops(detections_at(*places), clouds, None).verdicts()
     np.testing.assert_allclose(features[:, 0], [0, 1, 2])
     np.testing.assert_allclose(features[:, 1], [6 + 0.2, np.nan, -2 - 0.02])
@@ -91,7 +91,7 @@ def test_verification_features_and_score_bound(monkeypatch):
 def fitted(monkeypatch, scores, places, mounted=0.0, sure=0.5, max_people=None, known=None):
     """Boxes of standing people at places (x, y), fitted to a grid of points around all of them."""
     network = SimpleNamespace(header=SimpleNamespace(skeleton=HUMAN15))
-    monkeypatch.setattr(verification, "_bundled", lambda name: network)
+    monkeypatch.setattr(verification, "bundled_backend", lambda name: network)
     joints = np.array([standing(0.0, np.array([*place, 0.0])).joints for place in places])
     axes = np.arange(-3, 3, 0.1), np.arange(-3, 3, 0.1), np.arange(0, 1.8, 0.1)
     points = np.stack(np.meshgrid(*axes), -1).reshape(-1, 3)
@@ -131,7 +131,7 @@ def test_fit_boxes_keeps_known_box(monkeypatch):
 
 def test_on_people_uses_bones_or_known_boxes(monkeypatch):
     monkeypatch.setattr(
-        verification, "_bundled", lambda name: SimpleNamespace(header=SimpleNamespace(skeleton=HUMAN15))
+        verification, "bundled_backend", lambda name: SimpleNamespace(header=SimpleNamespace(skeleton=HUMAN15))
     )
     joints = np.stack([standing(0.0, np.array([x, 0.0, 0.0])).joints for x in (0.0, 5.0)])
     # at the left knee, 17 and 19 cm in front of it, between bones, and two points far from the first person

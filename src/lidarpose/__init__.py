@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from lidarpose import _renamed
 from lidarpose._version import __version__
-from lidarpose.errors import missing_extra
+from lidarpose.errors import needs_extra
 
 if TYPE_CHECKING:
     # the names below, for editors and type checkers
@@ -96,10 +96,8 @@ __all__ = ["__version__", *(name for name in _HOMES if name not in _NEEDS or fin
 
 def __getattr__(name: str):
     if name in _HOMES:
-        try:
+        with needs_extra(f"lidarpose.{name}", "export" if name == "export" else None):
             return getattr(import_module(_HOMES[name]), name)
-        except ModuleNotFoundError as error:
-            raise missing_extra(error, f"lidarpose.{name}", "export" if name == "export" else None) from None
     if name in _MODULES:
         return import_module(f"lidarpose.{name}")
     raise AttributeError(f"module 'lidarpose' has no attribute {name!r}")

@@ -1,7 +1,8 @@
 """Errors that a user can act on: the message states in one line what was expected, what was given, and what to do."""
 
 import difflib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from math import isfinite
 from numbers import Integral
 from typing import Any
@@ -45,6 +46,15 @@ def missing_extra(error: ModuleNotFoundError, what: str, extra: str | None = Non
     """
     known_extra = _EXTRA_OF.get((error.name or "").partition(".")[0])
     return error if known_extra is None else MissingExtra(what, extra or known_extra)
+
+
+@contextmanager
+def needs_extra(what: str, extra: str | None = None) -> Iterator[None]:
+    """Raises `missing_extra` for a module that an import in the block does not find."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise missing_extra(error, what, extra) from None
 
 
 def unknown_name(kind: str, name: object, known: Iterable[str]) -> InputError:

@@ -85,14 +85,13 @@ class Pose:
             raise InputError(
                 f"Pose.joints of {self.skeleton.name} must be (..., {count}, 3), got {tuple(self.joints.shape)}"
             )
-        for name in PER_JOINT:
-            value = getattr(self, name)
-            if value is not None and value.shape != self.joints.shape[:-1]:
-                raise InputError(f"Pose.{name} must be {self.joints.shape[:-1]}, one per joint, got {value.shape}")
-        for name in PER_PERSON:
-            value = getattr(self, name)
-            if value is not None and value.shape != self.joints.shape[:-2]:
-                raise InputError(f"Pose.{name} must be {self.joints.shape[:-2]}, one per person, got {value.shape}")
+        for names, shape, what in (
+            (PER_JOINT, self.joints.shape[:-1], "joint"),
+            (PER_PERSON, self.joints.shape[:-2], "person"),
+        ):
+            for name, value in known_values(self, *names).items():
+                if value.shape != shape:
+                    raise InputError(f"Pose.{name} must be {shape}, one per {what}, got {value.shape}")
         if self.in_range is not None and self.in_range.dtype != bool:
             raise InputError(f"Pose.in_range must be true or false for each joint, got {self.in_range.dtype}")
 
@@ -107,11 +106,14 @@ class Pose:
         """
         skeleton = as_skeleton(skeleton)
         indices = self.skeleton.map_to(skeleton)
-        values = {name: getattr(self, name) for name in PER_JOINT}
-        joint_values: dict[str, Any] = {
-            name: None if value is None else value[..., indices] for name, value in values.items()
-        }
+        joint_values = {name: value[..., indices] for name, value in known_values(self, *PER_JOINT).items()}
         return replace(self, joints=self.joints[..., indices, :], skeleton=skeleton, **joint_values)
+
+
+def known_values(record: object, *names: str) -> dict[str, Any]:
+    """The values of a record that are not None, by name."""
+    values = {name: getattr(record, name) for name in names}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def facing(pose: Pose | None) -> np.ndarray | None:

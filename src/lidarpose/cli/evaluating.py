@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from types import SimpleNamespace
 
-from lidarpose.cli.terminal import add_command, option_names, tell
+from lidarpose.cli.terminal import add_command, flag, option_names, tell
 from lidarpose.errors import InputError
 from lidarpose.models import BUNDLED, DEFAULT
 from lidarpose.progress import Progress
@@ -83,10 +83,6 @@ def add(commands) -> None:
     add_command(commands, "table", _table, _TABLE)
 
 
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
-
-
 def _evaluate(options: argparse.Namespace) -> None:
     from lidarpose import evaluation
 
@@ -119,7 +115,7 @@ def _evaluate_detector(options: argparse.Namespace) -> None:
 
     for name in option_names(_OPTIONS):
         if name not in _OF_BOTH and getattr(options, name) != options.defaults[name]:
-            raise InputError(f"{_flag(name)} is an option for pose networks, got the detector: omit it")
+            raise InputError(f"{flag(name)} is an option for pose networks, got the detector: omit it")
     if set(options.datasets) - {HELDOUT}:
         raise InputError(
             f"expected {HELDOUT} or nothing as the detector's dataset, got {options.datasets[0]}: use --scans"
@@ -187,10 +183,10 @@ def _command(options: argparse.Namespace) -> str:
     for name, default in options.defaults.items():
         value = getattr(options, name)
         if value is True:
-            switches.append(_flag(name))
+            switches.append(flag(name))
         elif value != default:
             words += [
-                word for part in (value if isinstance(value, list) else [value]) for word in (_flag(name), str(part))
+                word for part in (value if isinstance(value, list) else [value]) for word in (flag(name), str(part))
             ]
     return shlex.join([*words, *switches])
 

@@ -133,15 +133,13 @@ def _print_lines(options: argparse.Namespace, source, predictor, on_line: Callab
         raise InputError("--out - prints frames as they come: use --live, which needs no later frames, or give a file")
     if options.format not in (None, "jsonl"):
         raise InputError(f"--out - prints lines of JSON, not {options.format}: give a file")
-    summary, last = Summary(), None
+    summary = Summary()
     for frame in predictor.predict_all(source.frames()):
         line = frame.to_dict()
         line = in_world(line, predictor.up) if options.world else line
         summary.add(line)
         on_line(line)
         print(json.dumps(line), flush=True)
-        last = frame.index, frame.id
-    predictor.check_boxes(last)
     if summary.damaged == summary.frames:
         raise nothing_read(source.name, summary.frames, summary.first_error)
     return summary

@@ -97,6 +97,11 @@ def add_options(parser, table: str) -> None:
         target.add_argument(*flags.split(","), help=words.strip(), **style)
 
 
+def flag(name: str) -> str:
+    """The option of a key in the namespace."""
+    return f"--{name.replace('_', '-')}"
+
+
 def option_names(table: str) -> list[str]:
     """The options of a table by their keys in the namespace."""
     return [name.replace("-", "_") for name in re.findall(r"^--([\w-]+)", table, re.M)]

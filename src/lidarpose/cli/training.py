@@ -8,7 +8,7 @@ from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any
 
-from lidarpose.cli.terminal import KEEP, add_command, add_options, names, scene_changes
+from lidarpose.cli.terminal import KEEP, add_command, add_options, flag, names, scene_changes
 from lidarpose.errors import InputError
 from lidarpose.train.recipes import TYPES, Finetune, PoseRecipe, Pretrain, Recipe, TrainDetector, TrainVerifier
 
@@ -95,7 +95,7 @@ def _add(parser, kind: type[Recipe]) -> None:
         if field.name != "data":
             default = "" if field.default in (None, (), "") else f" ({_as_typed(field.default)})"
             (common_group if field.name in common_names else kind_group).add_argument(
-                f"--{field.name.replace('_', '-')}",
+                flag(field.name),
                 dest=f"set_{field.name}",
                 metavar=field.metadata.get("metavar") or TYPES[field.type][2],
                 help=field.metadata["help"] + default,
@@ -120,8 +120,8 @@ def _train(options: argparse.Namespace) -> None:
 
         other_options = [*changes, *(key for key in ("resume", "recipe", "device", "tracker") if getattr(options, key))]
         if other_options:
-            flag = f"--{other_options[0].replace('_', '-')}"
-            raise InputError(f"--calibrate does not train: expected no other option than --scans, got {flag}: omit it")
+            problem = f"expected no other option than --scans, got {flag(other_options[0])}: omit it"
+            raise InputError(f"--calibrate does not train: {problem}")
         print(calibrate(options.folder or latest(name), options.calibrate, labeled=options.scans))
         return
     if getattr(options, "scans", None) is not None:
@@ -144,7 +144,7 @@ def _train(options: argparse.Namespace) -> None:
         model = changes.get("model") or model_of_size(changes.get("size", ""))
         recipe_name = options.recipe or recipe_of_model(kind, model)
         run_recipe = recipe(kind, recipe_name, **changes)
-    words = [f"--{key.replace('_', '-')} {_as_typed(value)}" for key, value in changes.items() if key != "data"]
+    words = [f"{flag(key)} {_as_typed(value)}" for key, value in changes.items() if key != "data"]
     words += [f"--recipe {options.recipe}"] * (options.recipe not in (None, "default"))
     words += ["--resume"] * options.resume
     dataset_names = [shlex.quote(Path(data).name) for data in changes.get("data", ())]

@@ -19,7 +19,7 @@ from lidarpose.eval.predictions import Predictions, stack
 from lidarpose.eval.scores import Setting
 from lidarpose.inference.inputs import Clips
 from lidarpose.io.files import shorten
-from lidarpose.sample import PER_PERSON, UNLABELED, Box, LabeledSample, clip_windows
+from lidarpose.sample import PER_PERSON, UNLABELED, Box, LabeledSample, clip_windows, known_values
 from lidarpose.skeleton import Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 
@@ -272,23 +272,19 @@ class EvalSetup:
             return {}
         labeled_samples = [person.sample for person in samples]
         runs = _runs(labeled_samples) if self.dataset.limit is None else np.arange(len(labeled_samples))[:, None]
-        surroundings = {
-            name: [getattr(sample, name) for sample in labeled_samples] for name in ("background", "neighbors")
-        }
-        surroundings = {
-            name: [np.zeros((0, 3)) if cloud is None else cloud for cloud in clouds]
-            for name, clouds in surroundings.items()
-        }
-        return {"clips": Clips(windows=np.concatenate([clip_windows(run) for run in runs]), **surroundings)}
+        background, neighbors = (
+            [np.zeros((0, 3)) if (cloud := getattr(sample, name)) is None else cloud for sample in labeled_samples]
+            for name in ("background", "neighbors")
+        )
+        windows = np.concatenate([clip_windows(run) for run in runs])
+        return {"clips": Clips(windows=windows, background=background, neighbors=neighbors)}
 
     def _prediction_columns(self, estimates, index) -> dict:
         """Columns of the scored joints of a pose, or of person `index` of many."""
         joint_indices = self.model.skeleton.map_to(self.joints)
-        joint_values = {name: getattr(estimates, name) for name in ("confidence", "spread", "visible")}
-        joint_values = {
-            name: value[index][..., joint_indices] for name, value in joint_values.items() if value is not None
-        }
-        person_values = {name: value[index] for name in PER_PERSON if (value := getattr(estimates, name)) is not None}
+        joint_values = known_values(estimates, "confidence", "spread", "visible")
+        joint_values = {name: value[index][..., joint_indices] for name, value in joint_values.items()}
+        person_values = {name: value[index] for name, value in known_values(estimates, *PER_PERSON).items()}
         return joint_values | person_values | {"pred": estimates.joints[index][..., joint_indices, :]}
 
     def _label_columns(self, person: EvalSample) -> dict[str, Any]:

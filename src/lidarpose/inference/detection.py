@@ -200,7 +200,7 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
     # a warning of wrong axes or units suppresses others that would only follow from it
     if frame_warning := flat_along_another_axis(scan):
         warnings.append(frame_warning)
-    origin = None if scan.origin is None else scan.R_level_input @ scan.origin
+    origin = scan.level_origin
     up = estimate_up(_near(level, origin, search), origin)
     if up is not None:
         degrees = np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1, 1)))
@@ -211,7 +211,7 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
         )
         scan = replace(scan, up=up_text(up @ scan.R_level_input))
         level = _leveled(scan)
-        origin = None if scan.origin is None else scan.R_level_input @ scan.origin
+        origin = scan.level_origin
     # check units in the level frame: a tilted scan is as tall as one in wrong units
     if not frame_warning and (frame_warning := scan_unit_warning(level, count)):
         warnings.append(frame_warning)
@@ -248,7 +248,7 @@ def verify_people(places: DetectedScan, search: Search, known: KnownPlaces | Non
         return replace(scan, boxes=[], detected_rows=[])
     # boxes of a tilted scan are larger than the people in them and cannot be reused, so people are detected again
     is_tilted = not np.allclose(input_scan.R_boxes_input, scan.R_level_input)
-    origin = None if scan.origin is None else scan.R_level_input @ scan.origin
+    origin = scan.level_origin
     known_level = None if known is None or is_tilted else known.level(scan.R_level_input)
     detector = search.detector or _detector()
     detect_beside = partial(detector.detect_beside, places.level, origin, detections.ground, moving=places.moving)

@@ -17,7 +17,7 @@ from lidarpose.models.config import NetworkConfig
 from lidarpose.models.decode import decoder
 from lidarpose.models.voxelize import WINDOW
 from lidarpose.progress import Progress
-from lidarpose.sample import MIN_POINTS, PER_JOINT, PER_PERSON, Pose, center_of
+from lidarpose.sample import MIN_POINTS, PER_JOINT, PER_PERSON, Pose, center_of, known_values
 
 # decimals, in m, to which the centers of the second pass are rounded: backends differ by less than a micrometer, which
 # must not move a point to another voxel
@@ -152,9 +152,8 @@ class PoseEstimator:
             if near_count < MIN_POINTS or not np.isfinite(mean_pose.joints[k]).all():
                 poses.append(None)
                 continue
-            values = {name: getattr(mean_pose, name) for name in (*PER_JOINT, *PER_PERSON)}
-            per_person: dict[str, Any] = {name: value[k] for name, value in values.items() if value is not None}
-            poses.append(replace(mean_pose, joints=mean_pose.joints[k] + centers[k], **per_person))
+            values = {name: value[k] for name, value in known_values(mean_pose, *PER_JOINT, *PER_PERSON).items()}
+            poses.append(replace(mean_pose, joints=mean_pose.joints[k] + centers[k], **values))
         return poses
 
     def _recenter_on_boxes(
@@ -175,8 +174,7 @@ class PoseEstimator:
         centers[rows] = np.round(box_centers[rows], _CENTER_DECIMALS)
         second_pass = self._transformed(self._first, [clouds[row] for row in rows], centers[rows], origin, None)
         changes: dict[str, Any] = {}
-        for name in ("joints", *PER_JOINT, *PER_PERSON):
-            if (value := getattr(first_pass, name)) is not None:
-                changes[name] = value.copy()
-                changes[name][rows] = getattr(second_pass, name)
+        for name, value in known_values(first_pass, "joints", *PER_JOINT, *PER_PERSON).items():
+            changes[name] = value.copy()
+            changes[name][rows] = getattr(second_pass, name)
         return centers, replace(first_pass, **changes)

@@ -135,9 +135,7 @@ def predictor_of(model: "Predictor | str | os.PathLike | Callable[[], Predictor]
     return predictor
 
 
-@lru_cache(maxsize=len(BUNDLED))
-def _bundled(name: str) -> Predictor:
-    return load(name)
+_bundled = lru_cache(maxsize=len(BUNDLED))(load)
 
 
 def _needs_nothing(function: Callable) -> bool:

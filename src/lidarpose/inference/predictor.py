@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal, Protocol, TypedDict, Unpack, overload
 
 import numpy as np
 
-from lidarpose.errors import InputError, check_int, check_name, first_names, missing_extra
+from lidarpose.errors import InputError, check_int, check_name, first_names, needs_extra
 from lidarpose.inference.backend import Backend, OnnxBackend, bundled_backend, exported_beside
 from lidarpose.inference.checks import (
     UPSIDE_DOWN,
@@ -127,10 +127,8 @@ def load(
 def _torch_backend(path: Path, device: str, compile: bool) -> Backend:
     # report a bad file even if torch is not installed
     read_header(path)
-    try:
+    with needs_extra(f"running {path.name} with torch"):
         from lidarpose.inference.torch_backend import torch_backend
-    except ModuleNotFoundError as error:
-        raise missing_extra(error, f"running {path.name} with torch") from None
     return torch_backend(path, device=device, compile=compile)
 
 

@@ -57,6 +57,11 @@ class Scan:
         return rotation_from_up(self.up)
 
     @property
+    def level_origin(self) -> np.ndarray | None:
+        """The sensor position (3,) m in the level frame; None if it is unknown."""
+        return None if self.origin is None else self.R_level_input @ self.origin
+
+    @property
     def upright_axis(self) -> str:
         """The axis of the input that is nearest to vertical, "x", "y" or "z"."""
         return upright_axis(self.up)[-1]
@@ -120,7 +125,7 @@ def pose_scan(
     if warning := origin_warning(scan):
         warnings.append(warning)
         scan = replace(scan, origin=None)
-    origin = None if scan.origin is None else scan.R_level_input @ scan.origin
+    origin = scan.level_origin
     if scan.boxes:
         pelvises = None if scan.pelvises is None else scan.pelvises @ scan.R_level_input.T
         # not needed if the pelvises are known

@@ -13,7 +13,7 @@ import numpy as np
 
 from lidarpose.errors import check_int
 from lidarpose.models.voxelize import view_features
-from lidarpose.sample import PER_JOINT, PER_PERSON, Pose
+from lidarpose.sample import PER_JOINT, PER_PERSON, Pose, known_values
 
 # a prediction is weighted by its mean confidence to this power, so that one of four with a flipped heading is outvoted
 _POWER = 8
@@ -73,15 +73,15 @@ def invert(poses: Pose, transform: TTATransform) -> Pose:
     if not transform.mirrored:
         return poses
     flip = np.array(poses.skeleton.flip)
-    flipped_values: dict[str, Any] = {name: value[:, flip] for name, value in _values(poses).items()}
-    return replace(poses, **flipped_values)
+    values = known_values(poses, "joints", *PER_JOINT)
+    return replace(poses, **{name: value[:, flip] for name, value in values.items()})
 
 
 def average(poses: list[Pose]) -> Pose:
     """The mean of several predictions for B people, weighted per person by confidence if the network predicts it."""
     if len(poses) == 1:
         return poses[0]
-    names = [*_values(poses[0]), *(name for name in PER_PERSON if getattr(poses[0], name) is not None)]
+    names = known_values(poses[0], "joints", *PER_JOINT, *PER_PERSON)
     stacks = {name: np.stack([getattr(pose, name) for pose in poses]).astype(float) for name in names}
     weight = np.ones(stacks["joints"].shape[:2])
     if "confidence" in stacks:
@@ -96,9 +96,3 @@ def average(poses: list[Pose]) -> Pose:
         # majority vote
         values["in_range"] = values["in_range"] > 0.5
     return replace(poses[0], **values)
-
-
-def _values(poses: Pose) -> dict[str, np.ndarray]:
-    """The joints and all per-joint values that are known, by name."""
-    values = {name: getattr(poses, name) for name in ("joints", *PER_JOINT)}
-    return {name: value for name, value in values.items() if value is not None}

@@ -55,10 +55,6 @@ _NOBODY = 1 / 3
 _DECIMALS = 4
 
 
-def _bundled(name: str) -> Backend:
-    return bundled_backend(name)
-
-
 def verification_features(detections: Detections, points: np.ndarray, origin: np.ndarray | None) -> np.ndarray:
     """Features (D, 3) of the final score of detections in points (n, 3) m in the level frame, in the order of
     `FEATURES`. origin (3,) m: sensor position, None if unknown. The verifier's log odds are NaN for fewer than 5
@@ -126,22 +122,17 @@ class Crops:
         sits in a wheelchair; the verifier's values are NaN for too few points."""
         logits = np.full((len(self.detections), 2), np.nan)
         centers, all_rows = self.detections.centers, np.arange(len(self.detections))
-        for rows, raw in _run(self.columns, centers, self.origin, all_rows, _bundled(VERIFIER)):
+        for rows, raw in _run(self.columns, centers, self.origin, all_rows, bundled_backend(VERIFIER)):
             logits[rows] = raw.person
         odds = np.clip(logits[:, 0], -_MOST_ODDS, _MOST_ODDS) + _BEYOND_MOST * logits[:, 0]
         log_points = np.log1p([len(column) for column in self.columns])
         return np.column_stack([self.detections.logit, odds, log_points]), sigmoid(logits[:, 1])
 
-    def poses(self, rows: np.ndarray) -> Pose:
-        """Poses of the given rows (C,) by the default network: joints (D, 26, 3) m, NaN for other rows and for too few
-        points."""
-        return _posed(self.columns, self.detections.centers, self.origin, rows)
-
 
 def _posed(clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None, rows: np.ndarray) -> Pose:
     """Poses of the given rows (C,) of clouds (n, 3) m around centers (D, 3) m by the default network: joints
     (D, 26, 3) m, NaN for other rows and for too few points."""
-    backend = _bundled(DEFAULT)
+    backend = bundled_backend(DEFAULT)
     skeleton = backend.header.skeleton
     joints = np.full((len(centers), len(skeleton), 3), np.nan)
     for batch, raw in _run(clouds, centers, origin, rows, backend):
@@ -290,7 +281,7 @@ def _score_detections(
     posed_rows = new_rows[scores[new_rows] >= posed_from[new_rows]]
     if max_people is not None:
         posed_rows = posed_rows[_surest_first(scores[posed_rows], logits[posed_rows])][: _PLACES * max_people]
-    poses = crops.poses(posed_rows)
+    poses = _posed(crops.columns, detections.centers, origin, posed_rows)
     pelvises = poses.joints[:, poses.skeleton.index("pelvis")].copy()
     return _ScoredDetections(
         scores=scores, logits=logits, mounted=mounted, joints=poses.joints, pelvises=pelvises, near_rows=near_rows
@@ -328,7 +319,7 @@ def _on_people(
     """(n,) bool: whether a point is on the body of one of the people from `_fit_boxes`, or in the box of a known
     one."""
     is_body = np.zeros(len(points), bool)
-    starts, ends = np.array(_bundled(DEFAULT).header.skeleton.bones).T
+    starts, ends = np.array(bundled_backend(DEFAULT).header.skeleton.bones).T
     for row, _, own_rows in people:
         if row not in known_boxes:
             own_rows, joints = places.near_rows[row], places.joints[row]
@@ -376,7 +367,7 @@ def _fit_boxes(
     own; known_boxes: expected boxes of known people, by row.
     """
     scores, pelvises = places.scores, places.pelvises
-    skeleton = _bundled(DEFAULT).header.skeleton
+    skeleton = bundled_backend(DEFAULT).header.skeleton
     person_rows = surest_rows(scores, pelvises, places.logits)
     is_owned = np.zeros(len(points), bool)
     people: list[_FittedBox] = []

@@ -8,7 +8,7 @@ import struct
 
 import numpy as np
 
-from lidarpose.errors import missing_extra
+from lidarpose.errors import needs_extra
 from lidarpose.io.files import FormatError, check_unpacked
 from lidarpose.io.text import check_bytes
 
@@ -22,8 +22,8 @@ _LASZIP = (b"laszip encoded", 22204)
 _WITH_TIME, _WITH_COLOR = (1, 3, 4, 5, 6, 7, 8, 9, 10), (2, 3, 5, 7, 8, 10)
 
 
-def parse_las(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
-    """x y z (n, 3) float64 in the file's unit, the column names, and an empty tuple of warnings; raises FormatError."""
+def parse_las(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
+    """x y z (n, 3) float64 in the file's unit and the column names; raises FormatError."""
     if len(data) < _HEADER or data[:4] != b"LASF":
         raise FormatError("a LAS header", f"an unknown or damaged one in {len(data)} bytes", "copy it again")
     version = tuple(data[24:26])
@@ -44,7 +44,7 @@ def parse_las(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]
     steps = np.frombuffer(data, record, num_points, start)["xyz"]
     names = ["x", "y", "z", "intensity", "classification"]
     names += ["gps_time"] * (kind in _WITH_TIME) + ["red", "green", "blue"] * (kind in _WITH_COLOR)
-    return steps * scale + shift, tuple(names), ()
+    return steps * scale + shift, tuple(names)
 
 
 class _Unseekable(io.RawIOBase):
@@ -60,10 +60,8 @@ class _Unseekable(io.RawIOBase):
 def _unpack(data: bytes, start: int, size: int, num_points: int) -> bytes:
     """The point records of a LAZ file, decompressed as in a LAS file. lazrs does not validate the sizes that a file
     announces, so this module does."""
-    try:
+    with needs_extra("reading .laz"):
         import lazrs
-    except ModuleNotFoundError as error:
-        raise missing_extra(error, "reading .laz") from None
     offset = struct.unpack_from("<H", data, 94)[0]
     for _ in range(struct.unpack_from("<I", data, 100)[0]):
         if offset + 54 > min(start, len(data)):

@@ -27,8 +27,8 @@ def _columns(data: bytes, num_points: int, types: Sequence[str], starts: Sequenc
     return np.stack([np.ndarray(num_points, kind, data, start, step) for kind, start, step in layouts], axis=-1)
 
 
-def parse_pcd(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
-    """x y z (n, 3), the field names, and an empty tuple of warnings; raises FormatError."""
+def parse_pcd(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
+    """x y z (n, 3) and the field names; raises FormatError."""
     header, encoding, start = _pcd_header(data)
     names = tuple(header.get("FIELDS") or header.get("COLUMNS") or ())
     # older versions of the format have no COUNT
@@ -48,10 +48,10 @@ def parse_pcd(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]
     if encoding not in ("ascii", "binary", "binary_compressed"):
         raise FormatError("PCD DATA ascii, binary or binary_compressed", f"{encoding!r}", "export it again")
     if not num_points:
-        return np.empty((0, 3)), names, ()
+        return np.empty((0, 3)), names
     if encoding == "ascii":
         cells = [sum(counts[:i]) for i in xyz_indices]
-        return parse_rows(decode(data[start:]), num_points, cells, sum(counts)), names, ()
+        return parse_rows(decode(data[start:]), num_points, cells, sum(counts)), names
     widths = [int(s) * c for s, c in zip(sizes, counts, strict=True)]
     offsets, row_size = [sum(widths[:i]) for i in xyz_indices], sum(widths)
     if encoding == "binary":
@@ -61,7 +61,7 @@ def parse_pcd(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]
         # stored field by field: all x, then all y
         data = _decompress(data, start, num_points * row_size, num_points)
         starts, steps = [num_points * offset for offset in offsets], [widths[i] for i in xyz_indices]
-    return _columns(data, num_points, [f"<{formats[i]}" for i in xyz_indices], starts, steps), names, ()
+    return _columns(data, num_points, [f"<{formats[i]}" for i in xyz_indices], starts, steps), names
 
 
 def _pcd_header(data: bytes) -> tuple[dict[str, list[str]], str, int]:
@@ -96,8 +96,8 @@ def _decompress(data: bytes, start: int, size: int, num_points: int) -> bytes:
     return body
 
 
-def parse_ply(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
-    """x y z (n, 3) of the vertices, their property names, and an empty tuple of warnings; raises FormatError."""
+def parse_ply(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
+    """x y z (n, 3) of the vertices and their property names; raises FormatError."""
     encoding, elements, body_start = _ply_header(data)
     start, skip_lines = body_start, 0
     for name, num_points, properties in elements:
@@ -116,12 +116,12 @@ def parse_ply(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]
     names = tuple(name for name, _ in properties)
     xyz_indices = pick_xyz(names)
     if not num_points:
-        return np.empty((0, 3)), names, ()
+        return np.empty((0, 3)), names
     if encoding == "ascii":
-        return parse_rows(decode(data[body_start:]), num_points, xyz_indices, len(names), skip=skip_lines), names, ()
+        return parse_rows(decode(data[body_start:]), num_points, xyz_indices, len(names), skip=skip_lines), names
     check_bytes(data, start, num_points * sum(widths), num_points)
     starts = [start + sum(widths[:i]) for i in xyz_indices]
-    return _columns(data, num_points, [types[i] for i in xyz_indices], starts, [sum(widths)] * 3), names, ()
+    return _columns(data, num_points, [types[i] for i in xyz_indices], starts, [sum(widths)] * 3), names
 
 
 def _ply_header(data: bytes) -> tuple[str, list[tuple[str, int, list[tuple[str, str]]]], int]:

@@ -5,8 +5,7 @@ rotated or scaled). They are float64, since float32 rounds map coordinates such 
 than x, y and z are listed in `Cloud.fields` and otherwise ignored.
 
 The sizes in a header are checked against the file before numpy, pandas or LZF decode it. A parser takes a file's bytes
-and returns x y z (n, 3), the column names and warnings; it raises `FormatError`, to which `read_points` adds the file
-name.
+and returns x y z (n, 3) and the column names; it raises `FormatError`, to which `read_points` adds the file name.
 """
 
 import os
@@ -119,11 +118,12 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
         # silences warnings about invalid numbers, which are dropped and counted below, and about files of Python 2
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
+            notes: tuple[str, ...] = ()
             if suffix == ".bin":
                 columns = 5 if columns is None and name.endswith(".pcd.bin") else columns
                 points, fields, notes = _parse_bin(data, columns)
             else:
-                points, fields, notes = _PARSERS[suffix](data)
+                points, fields = _PARSERS[suffix](data)
             points = np.ascontiguousarray(points, dtype=np.float64)
             is_finite = np.isfinite(points).all(axis=1)
         num_dropped = len(points) - int(is_finite.sum())
@@ -267,7 +267,7 @@ def _points_of(array: np.ndarray, label: str):
         parts = [array[names[i]] for i in pick_xyz(names)]
         if any(part.ndim != 1 or part.dtype.kind not in "fiu" for part in parts):
             raise FormatError(f"(n,) records with numbers x, y, z in {label}", array.shape, "save (n, 3) floats")
-        return np.stack([part.astype(np.float64) for part in parts], axis=-1), names, ()
+        return np.stack([part.astype(np.float64) for part in parts], axis=-1), names
     if array.dtype.kind not in "fiu":
         raise FormatError(f"numbers in {label}", f"dtype {array.dtype}", "save a float array")
     if array.ndim != 2 or array.shape[1] < 3 or is_transposed(array.shape) or is_image(array.shape):
@@ -279,7 +279,7 @@ def _points_of(array: np.ndarray, label: str):
         elif array.ndim > 2 and array.shape[-1] >= 3:
             remedy = f"save points.reshape(-1, {array.shape[-1]})"
         raise FormatError(f"{label} to have the shape (n, 3+)", array.shape, remedy)
-    return array[:, :3].astype(np.float64), numbered(array.shape[1]), ()
+    return array[:, :3].astype(np.float64), numbered(array.shape[1])
 
 
 _PARSERS = {

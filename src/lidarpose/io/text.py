@@ -90,8 +90,8 @@ def parse_rows(text: str, num_rows: int, columns: list[int], num_cells: int, *, 
         raise _wrong_line(rows, columns, error, where=" of the points") from None
 
 
-def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...]]:
-    """x y z (n, 3), the column names, and an empty tuple of warnings; raises FormatError."""
+def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
+    """x y z (n, 3) and the column names; raises FormatError."""
     # .pts and other formats begin with the number of points
     text = re.sub(r"\A[0-9]{1,18}[ \t]*\n(?=[ \t]*[-+.\d]\S*(?:[ \t,;]+[-+.\d]\S*){2})", "\n", decode(data))
     names, num_skipped, has_header, separator, decimal = _find_columns(text)
@@ -113,7 +113,7 @@ def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...], tuple[str, ...
     if not has_header and is_transposed((len(points), len(names))):
         actual = f"{len(points)} lines of {len(names)} values"
         raise FormatError("a line of x y z for each point", actual, "save its transpose")
-    return points, tuple(names), ()
+    return points, tuple(names)
 
 
 def _find_columns(text: str) -> tuple[Sequence[str], int, bool, str | None, str]:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from lidarpose._version import __version__
-from lidarpose.errors import InputError, LidarPoseError, check_name, missing_extra
+from lidarpose.errors import InputError, LidarPoseError, check_name, needs_extra
 from lidarpose.io.files import atomic_path, check_not_input, check_suffix, check_writable, content_digest, write_atomic
 from lidarpose.models import weights_path
 from lidarpose.models.checkpoint import DIGEST, ENTRY, Header, load_checkpoint
@@ -84,9 +84,8 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
     program = trace(network)
     module = program.module()
     check(network, lambda arrays: [value.detach().numpy() for value in module(*map(torch.as_tensor, arrays.values()))])
-    with atomic_path(out) as path:
-        with path.open("wb") as file:
-            torch.export.save(program, file, extra_files=metadata)
+    with atomic_path(out) as path, path.open("wb") as file:
+        torch.export.save(program, file, extra_files=metadata)
 
 
 def export_detector(network: DetectorNet, out: str | os.PathLike, *, card: dict) -> None:
@@ -144,11 +143,9 @@ def module_to_onnx(
 ) -> bytes:
     """A module with tensor arguments as the content of an ONNX file. axes: of each argument, the dynamic axes and their
     names. Raises MissingExtra without onnx or onnxscript."""
-    try:
+    with needs_extra("export to ONNX"):
         import onnx
         import onnxscript  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise missing_extra(error, "export to ONNX") from None
     with _silence(), torch.no_grad():
         program = torch.onnx.export(
             module.eval(),

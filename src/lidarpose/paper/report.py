@@ -90,7 +90,7 @@ def write_table(
 ) -> dict[str, Any]:
     """Writes OUT/TABLE.json and OUT/TABLE.md from the existing results, and the JSON of each finished cell."""
     failed = failed or {}
-    entries = [_entry(table, cell, out, failed.get(k, "")) for k, cell in enumerate(selected)]
+    entries = [_entry(cell, out, failed.get(k, "")) for k, cell in enumerate(selected)]
     for cell, entry in zip(selected, entries, strict=True):
         entry |= _difference(cell, _reference(table, cell, selected), out) if entry["state"] == "done" else {}
     content = {
@@ -109,7 +109,7 @@ def write_table(
     return content
 
 
-def _entry(table: Table, cell: Cell, out: Path, failure: str) -> dict[str, Any]:
+def _entry(cell: Cell, out: Path, failure: str) -> dict[str, Any]:
     """A cell as JSON. state: done, failed, not run or not possible; finished cells also have their results."""
     steps = list(cell.evaluation.all()) if cell.evaluation else []
     entry: dict[str, Any] = {"row": cell.row, "column": cell.column, "seed": cell.seed, "published": cell.published}

@@ -6,7 +6,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
-from lidarpose.errors import missing_extra
+from lidarpose.errors import needs_extra
 from lidarpose.io.files import atomic_path, encodable
 from lidarpose.sample import JOINT_COLUMNS
 
@@ -37,10 +37,8 @@ def write_result(path: Path, lines: Iterable[dict[str, Any]]) -> None:
 def check_format(path: Path) -> None:
     """Raises MissingExtra if the format cannot be written; called before any work is done."""
     if path.suffix.lower() == ".parquet":
-        try:
+        with needs_extra("writing Parquet", "synth"):
             import pyarrow.parquet  # noqa: F401
-        except ModuleNotFoundError as error:
-            raise missing_extra(error, "writing Parquet", "synth") from None
 
 
 def _write_parquet(path: Path, lines: Iterable[dict[str, Any]]) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from lidarpose.geometry import inverse_transform, transform_points
 from lidarpose.recording.coordinates import FixedFrame, rounded_points
-from lidarpose.sample import Pose
+from lidarpose.sample import Pose, known_values
 from lidarpose.skeleton import Skeleton
 from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.smoothing import MAX_LATE, smooth
@@ -72,11 +72,9 @@ def _steady(poses: dict[int, Pose], times: np.ndarray) -> Iterator[tuple[int, Po
 
 def _entry(pose: Pose, T_sensor_fixed: np.ndarray) -> dict[str, Any]:
     """The entries of a line for a smoothed pose."""
-    arrays = {name: (getattr(pose, name), digits) for name, digits in _SMOOTHED.items()}
     values = {
-        name: value.astype(np.float32).astype(float).round(digits).tolist()
-        for name, (value, digits) in arrays.items()
-        if value is not None
+        name: value.astype(np.float32).astype(float).round(_SMOOTHED[name]).tolist()
+        for name, value in known_values(pose, *_SMOOTHED).items()
     }
     return values | {"joints": rounded_points(T_sensor_fixed, pose.joints)}
 
@@ -88,11 +86,5 @@ def _with_steady(people: list[dict[str, Any]], entries: dict[int, dict[str, Any]
     for id, entry in sorted(entries.items()):
         person_entry: dict[str, Any] = {"id": id, "num_points": 0}
         person_entry |= dict.fromkeys(("box", "score", "mounted", "person", "second_person", "joints"))
-        empty_values: dict[str, list] = {
-            "confidence": [],
-            "spread": [],
-            "visible": [],
-            "out_of_range": [],
-            "warnings": [],
-        }
-        yield person_entry | empty_values | {"track": id} | entry
+        person_entry |= {name: [] for name in ("confidence", "spread", "visible", "out_of_range", "warnings")}
+        yield person_entry | {"track": id} | entry

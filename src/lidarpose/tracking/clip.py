@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.errors import InputError
-from lidarpose.sample import Pose
+from lidarpose.sample import Pose, known_values
 from lidarpose.skeleton import Skeleton
 
 # optional values per joint of a track
@@ -34,9 +34,8 @@ class TrackPoses:
         shape = (len(self.times), len(self.skeleton))
         if self.joints.shape != (*shape, 3):
             raise InputError(f"TrackPoses.joints must be {(*shape, 3)}, got {self.joints.shape}")
-        for name in _PER_JOINT:
-            value = getattr(self, name)
-            if value is not None and value.shape != shape:
+        for name, value in known_values(self, *_PER_JOINT).items():
+            if value.shape != shape:
                 raise InputError(f"TrackPoses.{name} must be {shape}, one per joint, got {value.shape}")
         if not (np.isfinite(self.times).all() and (np.diff(self.times) > 0).all()):
             raise InputError("TrackPoses.times must be finite seconds, each later than the one before")
@@ -69,8 +68,7 @@ class TrackPoses:
         """The pose of a frame, None without joints."""
         if not np.isfinite(self.joints[row]).all():
             return None
-        values = {name: getattr(self, name) for name in _PER_JOINT}
-        frame_values: dict[str, Any] = {name: None if value is None else value[row] for name, value in values.items()}
+        frame_values = {name: value[row] for name, value in known_values(self, *_PER_JOINT).items()}
         return Pose(joints=self.joints[row], skeleton=self.skeleton, **frame_values)
 
     def poses(self) -> list[Pose | None]:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidarpose.sample import CONFIDENCE_RADIUS
+from lidarpose.sample import CONFIDENCE_RADIUS, known_values
 from lidarpose.tracking.bones import keep_lengths, length_statistics, lengths_of, rigid_bones
 from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.facing import swapped_frames
@@ -93,11 +93,10 @@ def with_facing_corrected(track: TrackPoses) -> TrackPoses:
     confidence = None if track.confidence is None else track.confidence[rows]
     flipped_rows = rows[swapped_frames(track.times[rows], track.joints[rows], variance, confidence, track.skeleton)]
     flip = np.array(track.skeleton.flip)
-    values = {name: getattr(track, name) for name in ("joints", "spread", "visible", "confidence")}
+    values = known_values(track, "joints", "spread", "visible", "confidence")
     for name, value in values.items():
-        if value is not None:
-            values[name] = value.copy()
-            values[name][flipped_rows] = value[flipped_rows][:, flip]
+        values[name] = value.copy()
+        values[name][flipped_rows] = value[flipped_rows][:, flip]
     return replace(track, **values)
 
 

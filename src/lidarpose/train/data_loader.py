@@ -24,7 +24,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
-from torch.utils.data import DataLoader, IterableDataset, get_worker_info
+from torch.utils.data import DataLoader, IterableDataset
 
 from lidarpose.arrays import evenly_spaced
 from lidarpose.data.writer import end_with_parent
@@ -47,7 +47,7 @@ from lidarpose.train.augment import (
     people_in,
 )
 from lidarpose.train.objectives.objective import Objective
-from lidarpose.train.torch_dataset import InMemoryDataset
+from lidarpose.train.torch_dataset import InMemoryDataset, this_worker
 
 # batches per chunk
 BATCHES = 8
@@ -237,9 +237,8 @@ class Chunks(IterableDataset):
     ranks: int = 1
 
     def __iter__(self) -> Iterator[list[Any]]:
-        worker = get_worker_info()
-        offset, stride = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        for chunk in range(self.start + offset, chunks_of(self.steps), stride):
+        worker, workers = this_worker()
+        for chunk in range(self.start + worker, chunks_of(self.steps), workers):
             yield self.batches_of(chunk)
 
     def batches_of(self, chunk: int) -> list[Any]:

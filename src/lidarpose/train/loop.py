@@ -219,7 +219,7 @@ class _Run:
             _warn(f"{self.folder} has no {STATE}, it was stopped before the first one was saved: the run starts over")
         if self.is_main:
             run_dir.cut_log(self.folder, self.seen)
-        entries = run_dir.read_log(self.folder) if (self.folder / LOG).is_file() else []
+        entries = run_dir.read_log(self.folder)
         self._losses = [(entry["people"], _loss(entry)) for entry in entries if entry["people"] <= self.seen]
 
     @property

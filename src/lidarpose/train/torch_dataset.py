@@ -231,7 +231,7 @@ class SyntheticPeople(IterableDataset):
 
     def __iter__(self) -> Iterator[Sample]:
         generator = self._generator()
-        worker, workers = _worker()
+        worker, workers = this_worker()
         for run in count(worker, workers):
             first = self.start + run * self.batch
             if self.stop is not None and first >= self.stop:
@@ -241,7 +241,7 @@ class SyntheticPeople(IterableDataset):
                 yield generator.person(self.seed, index, hard=self.hard).sample
 
 
-def _worker() -> tuple[int, int]:
+def this_worker() -> tuple[int, int]:
     """The index of this DataLoader worker, and the number of workers."""
     info = get_worker_info()
     return (0, 1) if info is None else (info.id, info.num_workers)

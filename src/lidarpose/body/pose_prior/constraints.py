@@ -317,10 +317,9 @@ def _level_feet(
     leg_vector = joints[:, _ANKLES] - joints[:, _HIPS]
     reach = np.linalg.norm(leg_vector, axis=-1)
     steepness = np.maximum(-leg_vector[..., 2] / reach, 0.5)
-    knee, fold = _triangle(reach, thigh, shank)
-    new_knee, new_fold = _triangle(
-        np.clip(reach - lift / steepness, least_reach, 0.9985 * (thigh + shank)), thigh, shank
-    )
+    knee, fold = np.degrees(leg_angles(reach, thigh, shank))
+    new_reach = np.clip(reach - lift / steepness, least_reach, 0.9985 * (thigh + shank))
+    new_knee, new_fold = np.degrees(leg_angles(new_reach, thigh, shank))
     knee, fold = np.where(lift != 0, new_knee - knee, 0), np.where(lift != 0, new_fold - fold, 0)
     angles[:, _KNEE] += knee
     angles[:, _HIP] += fold
@@ -328,10 +327,10 @@ def _level_feet(
     return angles
 
 
-def _triangle(reach: np.ndarray, thigh: float, shank: float) -> tuple[np.ndarray, np.ndarray]:
-    """Knee flexion and angle between thigh and the line hip -> ankle, degrees, at a hip-ankle distance `reach` m."""
+def leg_angles(reach: np.ndarray, thigh: float, shank: float) -> tuple[np.ndarray, np.ndarray]:
+    """Knee flexion and angle between thigh and the line hip -> ankle, rad, at a hip-ankle distance `reach` m."""
     bend = np.arccos(np.clip((reach**2 - thigh**2 - shank**2) / (2 * thigh * shank), -1, 1))
-    return np.degrees(bend), np.degrees(np.arctan2(shank * np.sin(bend), thigh + shank * np.cos(bend)))
+    return bend, np.arctan2(shank * np.sin(bend), thigh + shank * np.cos(bend))
 
 
 def _lean(

@@ -13,6 +13,7 @@ import numpy as np
 from numpy import ndarray
 
 from lidarpose.body.pose_prior.activities import ANGLE_INDEX, TABLES
+from lidarpose.body.pose_prior.constraints import leg_angles
 
 _GAITS = TABLES["gaits"]
 GAITS = tuple(_GAITS)
@@ -209,8 +210,8 @@ def _place_feet(
     reach = np.hypot(x, z)
     shortening = np.minimum(1, _STRAIGHT / reach)
     x, z, reach = x * shortening, z * shortening, reach * shortening
-    bend = np.arccos(np.clip((reach**2 - _THIGH**2 - _SHANK**2) / (2 * _THIGH * _SHANK), -1, 1))
-    thigh = np.arctan2(x, -z) + np.arctan2(_SHANK * np.sin(bend), _THIGH + _SHANK * np.cos(bend))
+    bend, fold = leg_angles(reach, _THIGH, _SHANK)
+    thigh = np.arctan2(x, -z) + fold
     hip, knee = thigh - _THIGH_REST, bend - _THIGH_REST + _SHANK_REST
     return np.degrees(hip), np.degrees(knee), np.degrees(pitch - hip + knee)
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from lidarpose.data.readers import base
 from lidarpose.data.readers.base import Reader, Skipped
-from lidarpose.errors import InputError, missing_extra
+from lidarpose.errors import InputError, needs_extra
 from lidarpose.io.files import file_error, one_line
 from lidarpose.sample import HIDDEN, SEEN, UNLABELED, LabeledSample
 from lidarpose.skeleton import ITOP14
@@ -171,10 +171,8 @@ def _ids(file: Any) -> list[str]:
 @contextmanager
 def _opened(root: Path, part: str) -> Iterator[tuple[Any, Any]]:
     """Labels and clouds of a part, checked except for their values. Raises InputError, MissingExtra without h5py."""
-    try:
+    with needs_extra("reading ITOP"):
         import h5py
-    except ModuleNotFoundError as error:
-        raise missing_extra(error, "reading ITOP") from None
     paths = [_path(root, part, kind) for kind in _DATASETS]
     with ExitStack() as stack:
         files, ids = [], []

@@ -60,14 +60,14 @@ def draw_missed(result: DetectorResult, scans: ScanSet) -> bytes | None:
 def _crop(scan: LabeledScan, box: Box, label_parts: Sequence[str]) -> _Crop:
     points = scan.points[(np.abs(scan.points[:, :2] - box.center[:2]) < 1.5 * _REACH).all(1)]
     num_inside = int(box.contains(points).sum())
-    people = [person for person in scan.boxes if np.hypot(*(person.center - box.center)[:2]) < _REACH]
+    people = [other for other in scan.boxes if other is not box and np.hypot(*(other.center - box.center)[:2]) < _REACH]
     towards = (np.zeros(3) if scan.origin is None else scan.origin)[:2] - box.center[:2]
-    where = shorten(" ".join((scan.name, scan.sensor, scan.kind)), 36)
+    where = shorten(f"{scan.name} {scan.sensor} {scan.kind}", 36)
     label = " · ".join(filter(None, label_parts)) + f"\n{where} · {num_inside} inside"
     return _Crop(
         points=points[evenly_spaced(len(points), _MAX_POINTS)],
         box=box,
-        people=[person for person in people if person is not box],
+        people=people,
         towards=towards / max(float(np.linalg.norm(towards)), 1e-9),
         label=label,
     )

@@ -29,9 +29,9 @@ def open_kitti(folder: Path) -> IndexedRecording | None:
     """
     folder = folder.absolute()
     for drive in (folder, *folder.parents[:2]):
-        if drive / "velodyne_points" / "data" in (folder, folder / "velodyne_points" / "data", folder / "data"):
-            if (drive / "velodyne_points" / "data").is_dir():
-                return _open_drive(drive)
+        scans = drive / "velodyne_points" / "data"
+        if scans in (folder, folder / "velodyne_points" / "data", folder / "data") and scans.is_dir():
+            return _open_drive(drive)
     for sequence in (folder, folder.parent):
         if sequence / "velodyne" in (folder, folder / "velodyne") and (sequence / "velodyne").is_dir():
             if any((sequence / name).is_file() for name in ("calib.txt", "times.txt", "poses.txt")):

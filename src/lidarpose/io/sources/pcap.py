@@ -29,7 +29,7 @@ _VLAN = (0x8100, 0x88A8, 0x9100)
 # link type: offset of the EtherType in its header, and the header's length; raw IP has no header
 _ETHERNET = 1
 _LINKS = {_ETHERNET: (12, 14), 113: (14, 16), 276: (0, 20), 0: (None, 4), 108: (None, 4), 101: (None, 0)}
-_LINKS |= {link: (None, 0) for link in (12, 14, 228, 229)}
+_LINKS |= dict.fromkeys((12, 14, 228, 229), (None, 0))
 _IP = (0x0800, 0x86DD)
 
 
@@ -87,12 +87,11 @@ class Capture:
         if part is None:
             return None
         source, key, offset, has_more, data, length = part
-        is_whole = len(data) >= length
-        if is_whole and (offset or has_more):
-            data = self._reassembled(key, offset, has_more, bytes(data), pending)
-        if is_whole and len(data) < 8:
-            return None
-        if is_whole:
+        if len(data) >= length:
+            if offset or has_more:
+                data = self._reassembled(key, offset, has_more, bytes(data), pending)
+            if len(data) < 8:
+                return None
             _, port, size = struct.unpack_from(">HHH", data)
             if size <= len(data):
                 return Datagram(time, (source, port), bytes(data[8 : size or len(data)]))

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.errors import InputError, missing_extra
+from lidarpose.errors import InputError, needs_extra
 from lidarpose.geometry import quaternion_to_matrix, rigid_transform
 from lidarpose.io.files import FormatError, file_error, shorten, unreadable
 from lidarpose.io.sources.containers import McapFile, Message, RecordFile, Ros1File, SqliteFile, Topic
@@ -235,10 +235,8 @@ class _Cloud:
 @cache
 def _decoders() -> dict[str, Callable[[bytes, str], Any]]:
     """The function that decodes messages, for each encoding."""
-    try:
+    with needs_extra("reading a ROS recording"):
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-    except ModuleNotFoundError as error:
-        raise missing_extra(error, "reading a ROS recording") from None
     ros1, ros2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
     ros1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", _TRANSFORMS[0]))
     return {"cdr": ros2.deserialize_cdr, "ros1": ros1.deserialize_ros1}

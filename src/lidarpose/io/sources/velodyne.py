@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.errors import InputError, missing_extra
+from lidarpose.errors import InputError, needs_extra
 from lidarpose.io.files import file_error, shorten
 from lidarpose.io.sources.frame import ReadingOptions, Sweep
 from lidarpose.io.sources.pcap import Capture, Datagram, PacketRecording
@@ -50,10 +50,8 @@ class VelodyneRecording(PacketRecording):
     """
 
     def __init__(self, path: Path):
-        try:
+        with needs_extra("reading a Velodyne recording"):
             import velodyne_decoder
-        except ModuleNotFoundError as error:
-            raise missing_extra(error, "reading a Velodyne recording") from None
         super().__init__(path, PACKET_BYTES)
         self._library = velodyne_decoder
         self._num_damaged = self._num_lost = 0

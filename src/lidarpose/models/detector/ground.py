@@ -48,17 +48,16 @@ TILTED = 10.0
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ground:
-    """Heights (X, Y) float32 m of the ground at cells' centers; corner (2,) m: of the first cell; cell: size, m."""
+    """Heights (X, Y) float32 m of the ground at cells' centers; corner (2,) m: of the first cell."""
 
     corner: np.ndarray
     heights: np.ndarray
-    cell: float = CELL
 
     def at(self, xy: np.ndarray) -> np.ndarray:
         """Height (n,) float32 m of the ground at xy (n, 2) m: bilinear; outside the map, the height at its border."""
         (rows, columns), xy = self.heights.shape, np.asarray(xy)
         x, y = (
-            np.clip((xy[:, i] - (self.corner[i] + self.cell / 2)) / self.cell, 0, count - 1).astype(np.float32)
+            np.clip((xy[:, i] - (self.corner[i] + CELL / 2)) / CELL, 0, count - 1).astype(np.float32)
             for i, count in enumerate((rows, columns))
         )
         i, j = (np.minimum(position.astype(np.int32), max(n - 2, 0)) for position, n in ((x, rows), (y, columns)))
