@@ -85,7 +85,7 @@ def test_picture_of_scan_has_view_from_above(monkeypatch, tmp_path):
         np.testing.assert_allclose(panel.sensor, origin[:2])
         assert np.abs(panel.boxes[0].center - center).max() < (1e-9 if up in UP_AXES else 0.3)
     alone = Poses(people=(), skeleton=SMPL24, scan=scan, source="a.pcd").picture()
-    assert len(alone) < len(sheet) and panels[-1].sensor is None and panels[-1].label == "no people found"
+    assert len(alone) < len(sheet) and panels[-1].sensor is None and panels[-1].label == "no people"
 
 
 def test_person_pose_html_matches_poses_html(tmp_path):

@@ -212,8 +212,9 @@ def check_suffix(path: str | os.PathLike, *suffixes: str) -> None:
     except TypeError as error:
         raise file_error(repr(path), f"expected the path of a file to write ({error})") from None
     if not name.endswith(suffixes):
-        formats, endings = (" or ".join(words) for words in ([s[1:].upper() for s in suffixes], suffixes))
-        raise file_error(path, f"is written as {formats}: give a name that ends in {endings}")
+        # .htm is no format of its own
+        formats = " or ".join(s[1:].upper() for s in suffixes if not any(t != s and t.startswith(s) for t in suffixes))
+        raise file_error(path, f"is written as {formats}: give a name that ends in {' or '.join(suffixes)}")
 
 
 @contextmanager
