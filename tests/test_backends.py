@@ -57,6 +57,7 @@ def ties(model, clouds, centers, origin):
     return highest[..., -1] - highest[..., -2] < 1e-5
 
 
+@pytest.mark.long
 def test_backends_agree_for_crops_of_all_sizes(models):
     # each size once: all centered crops of one point are the same, and their ties would count several times
     sizes = np.unique(np.geomspace(1, 5000, 290).round().astype(int))

@@ -246,6 +246,7 @@ def test_export_chooses_output_file(tmp_path, monkeypatch, capsys, words, name, 
     assert f"{name}.safetensors -> {out} (1.50 MB)" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_predict_with_imported_released_weights(crop, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run("import", DAPT, "mine.safetensors") == 0

@@ -104,6 +104,7 @@ def people(*sizes, seed=1):
 SIZES = [(1,), (5000, 1, 20, 0), (0,), (40, 40), (3, 700, 90, 8, 15, 2, 1)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sizes", SIZES, ids=str)
 def test_export_torch_program_matches_network(program, sizes):
     network, module, entry = program

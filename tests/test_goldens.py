@@ -293,6 +293,7 @@ def losses():
     return {"tiny": {name: [line[name] for line in lines] for name in lines[0] if name not in ("people", "seconds")}}
 
 
+@pytest.mark.long
 def test_pretrain_matches_golden_losses():
     golden, found = recorded("losses")["tiny"], losses()["tiny"]
     assert set(golden) <= set(found) and len(golden["joints"]) == 10
