@@ -16,11 +16,11 @@ from lidarpose.models import DEFAULT, NAMES
 # io.point_cloud.SUFFIXES, which is not imported just for a help text
 _FILES = ".pcd .ply .las .laz .npy .npz .csv .xyz .txt .bin"
 # advice if no person was found although there is one
-_NOBODY = (
+_ADVICE = (
     "if there should be: points need meters and z up (--up), a lower --min-score finds more, and predict --crop "
     "treats all points as one person"
 )
-# parts of the warnings that state why no person was found: wrong axes, units or background
+# parts of the warnings that state why no person was detected: wrong axes, units or background
 _CAUSES = ("try up", "all coordinates by", "on the background")
 # maximum characters of an id in a warning
 _LONGEST_ID = 40
@@ -171,14 +171,14 @@ def _detect(options: argparse.Namespace) -> None:
     for line in boxes.warnings:
         tell(f"lidarpose: warning: {line}")
     destination = f" -> {result}" if result else ""
-    found = f"{counted(len(boxes), 'person', 'people')} found{destination}"
-    tell(found if boxes else _none_found(destination, boxes.warnings))
+    summary = f"{counted(len(boxes), 'person', 'people')} found{destination}"
+    tell(summary if boxes else _none_found(destination, boxes.warnings))
 
 
 def _none_found(destination: str, warnings: Sequence[str]) -> str:
     """The line for a scan without people, with advice unless a warning states the likely cause."""
     is_explained = any(cause in warning for cause in _CAUSES for warning in warnings)
-    return f"no people found{destination}" + ("" if is_explained else f"; {_NOBODY}")
+    return f"no people found{destination}" + ("" if is_explained else f"; {_ADVICE}")
 
 
 def _reading(options: argparse.Namespace) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """dataset.json: the contents of a dataset and how it was made."""
 
 import json
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -81,7 +80,7 @@ _OPTIONAL = ("frame", "about", "summary")
 def read_card(folder: str | Path) -> DatasetCard:
     """The card of a dataset's folder. Raises InputError if it is missing, damaged or of another schema."""
     path = Path(folder) / CARD
-    if not os.path.exists(folder):
+    if not Path(folder).exists():
         raise file_error(folder, "is not a dataset: there is no such folder; write one with lidarpose synth or prepare")
     if not path.is_file():
         raise file_error(folder, f"is not a dataset: {CARD} is missing; write one with lidarpose synth or prepare")

@@ -217,10 +217,9 @@ def check_scan(scan: Scan, people: Poses) -> list[str]:
         return []
     # detected boxes need no check, and detection has already checked the axes
     is_given = scan.detected_rows is None
-    warnings = {check: check(scan, people) for check in SCAN_CHECKS if scan.boxes and is_given}
-    if are_boxes_in_other_units(scan.boxes or []):
-        # other problems of the boxes follow from this one
-        warnings = {box_units: warnings[box_units]} if box_units in warnings else {}
+    # other problems of boxes in wrong units follow from the units
+    checks = (box_units,) if are_boxes_in_other_units(scan.boxes or []) else SCAN_CHECKS
+    warnings = {check: check(scan, people) for check in checks if scan.boxes and is_given}
     # warn of a wrong axis only once; people who are cut off by wrong boxes only appear to lie
     axis = flat_along_another_axis(scan) if is_given else None
     if not (axis or warnings.get(wide_boxes) or warnings.get(boxes_at_feet)):

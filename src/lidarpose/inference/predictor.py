@@ -364,6 +364,9 @@ class Predictor(PoseEstimator):
                 notes.append(warning)
             elif pelvises is None and check_upside_down and looks_unsure(pose, part):
                 unsure_rows.append(i)
+        # detected people share one up axis: a few of many who look upside down are no sign of a wrong one
+        least = len(best_poses) // 2 + 1 if is_scored else 1
+        unsure_rows = unsure_rows if len(unsure_rows) >= least else []
         # pose the few uncertain clouds again upside down; if pelvises are known, people were upright in earlier frames
         flipped_clouds = [best_poses[i][1] * UPSIDE_DOWN for i in unsure_rows]
         flipped_poses = self.poses(flipped_clouds, None if origin is None else origin * UPSIDE_DOWN)
@@ -373,8 +376,7 @@ class Predictor(PoseEstimator):
             for i, flipped_pose in zip(unsure_rows, flipped_poses, strict=True)
             if (warning := upside_down_warning(best_poses[i][0], flipped_pose)) and not is_lying(*best_poses[i])
         }
-        # detected people share one up axis: a few of many who look upside down are no sign of a wrong one
-        if not is_scored or 2 * len(flipped_warnings) > len(best_poses):
+        if len(flipped_warnings) >= least:
             for i, warning in flipped_warnings.items():
                 cleaned_clouds[i][1].append(warning)
         people = tuple(
