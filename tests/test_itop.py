@@ -77,7 +77,7 @@ def test_itop_side_view_removes_room_without_labels(raw):
             np.testing.assert_array_equal(person.centers["joints_box"], person.box.center)
 
 
-def test_person_of_room_keeps_outstretched_arms():
+def test_person_of_room_keeps_arms_and_detached_feet():
     rng = np.random.default_rng(0)
 
     def blob(count, *place):
@@ -86,9 +86,12 @@ def test_person_of_room_keeps_outstretched_arms():
     # x right, y up, z away; fewer points below, so that there is no floor
     body = np.stack([rng.uniform(-0.2, 0.2, 4000), 1.4 * rng.random(4000) ** 0.5 - 1, rng.uniform(2.8, 3, 4000)], 1)
     arms = np.concatenate([blob(50, 0.1, 0.2, 2.1), blob(50, 0.0, 0.7, 2.9)])
+    feet = blob(50, 0.1, -1.3, 2.9)
     others = np.concatenate([blob(50, 0.0, 0.0, 3.4), blob(50, 0.6, 0.0, 2.9), blob(9, 0.0, 0.2, 2.4)])
-    found = itop.person_of_room(np.concatenate([others, arms, body]))
-    np.testing.assert_array_equal(found, np.concatenate([arms, body]))
+    # below, but beside or behind
+    others = np.concatenate([others, blob(50, 0.3, -1.3, 2.9), blob(50, 0.1, -1.3, 3.4)])
+    person = np.concatenate([arms, feet, body])
+    np.testing.assert_array_equal(itop.person_of_room(np.concatenate([others, person])), person)
 
 
 def test_itop_detects_mirrored_files(tmp_path, smpl, monkeypatch):

@@ -127,6 +127,15 @@ def test_load_motion_amc_finds_its_asf(tmp_path):
         (tmp_path / name).unlink()
     written(tmp_path, ASF, "other.asf")
     refused(path, "there are any.asf, other.asf")
+    # of several people's skeletons the one whose name begins the file's, also in the folder above
+    for folder in (tmp_path / "a", tmp_path / "a/walk"):
+        folder.mkdir()
+        written(folder, AMC, "HDM_bd_walk_01_120.amc")
+    written(tmp_path / "a", "nonsense", "HDM_bk.asf")
+    refused(tmp_path / "a/walk/HDM_bd_walk_01_120.amc", "put HDM_bd.asf or HDM_bd_walk_01_120.asf beside it")
+    written(tmp_path / "a", ASF, "HDM_bd.asf")
+    for folder in (tmp_path / "a", tmp_path / "a/walk"):
+        np.testing.assert_array_equal(load_motion(folder / "HDM_bd_walk_01_120.amc").rotations, expected)
 
 
 def changed(text, old, new, count=1):

@@ -432,7 +432,8 @@ def test_corpus_entry_in_other_format_is_skipped(tmp_path, smpl):
     entries[4]["gt"] = np.zeros(71)
     path.write_bytes(pickle.dumps(entries))
     items, skipped = everything("freemotion", tmp_path, smpl)
-    assert reasons(skipped) == {"no shape": 1, "no T_2": 1, "entry in another format": 2} and len(items) == 4
+    assert reasons(skipped) == {"no T_2": 1, "entry in another format": 2} and len(items) == 7
+    assert [item.source for item in items] == ["freemotion/mean shape"] * 3 + ["freemotion"] * 4
     path.unlink()
     files.write_lipd(tmp_path, smpl)
     path = tmp_path / "LIPD_train.pkl"
@@ -443,6 +444,26 @@ def test_corpus_entry_in_other_format_is_skipped(tmp_path, smpl):
     items, skipped = everything("lipd", tmp_path, smpl)
     assert len(items) == 3 and reasons(skipped) == {"entry in another format": 5, "no pc": 1}
     assert "y.bin is not in" in skipped[0].where
+
+
+def test_noisemotion_placement_is_the_one_nearer_to_the_points(tmp_path, smpl):
+    # as of SMPL itself, the pelvis of the body at rest is not at the origin
+    model = dict(np.load(smpl, allow_pickle=False))
+    model["v_template"] = model["v_template"] + [0.3, 0.0, 0.0]
+    shifted = tmp_path / "shifted.npz"
+    np.savez(shifted, **model)
+    truth = files.write_freemotion(tmp_path, shifted, name="FreeMotion_train.pkl", noise=True)
+    path = tmp_path / "FreeMotion_train.pkl"
+    entries = pickle.loads(path.read_bytes())
+    for entry in entries:
+        pelvis = SmplJoints(shifted, "")(entry["shape"][1:2], entry["gt"][1:2], np.zeros((1, 3)))[0, 0]
+        entry["T_1"], entry["T_3"] = entry["T_1"] - pelvis, entry["T_3"] - pelvis
+    path.write_bytes(pickle.dumps(entries))
+    items, skipped = everything("noisemotion", tmp_path, shifted)
+    assert not skipped and len(items) == len(truth)
+    for item in items:
+        assert item.source == f"noisemotion/T is {'the pelvis' if item.track == '2' else 'trans'}"
+        np.testing.assert_allclose(item.joints, truth[item.sequence, item.frame, item.track], atol=1e-5)
 
 
 def test_noisemotion_without_poses_names_authors_script(tmp_path, smpl):

@@ -4,7 +4,7 @@
     clips            .npz of this package's joint positions (see `body.mocap.motion`); retargeted
     amass            .npz of SMPL, SMPL+H or SMPL-X poses
     bvh              .bvh of any skeleton with common joint names; retargeted
-    amc              .amc beside its .asf; retargeted
+    amc              .amc, its .asf beside it or in the folder above; retargeted
     sloper4d         SLOPER4D's _labels.pkl
     corpus           .pkl of LIPD, FreeMotion or NoiseMotion
     lidarhuman26m    a folder of numbered pose .json files

@@ -190,15 +190,29 @@ def read_amc(path: str | os.PathLike) -> tuple[JointTree, np.ndarray, float]:
 
 
 def _skeleton_of(path: Path) -> Path:
-    skeletons = {file.name.lower(): file for file in path.parent.iterdir() if file.suffix.lower() == ".asf"}
-    subject = path.stem.partition("_")[0]
-    for stem in (path.stem, path.stem.rpartition("_")[0], subject):
-        if f"{stem}.asf".lower() in skeletons:
-            return skeletons[f"{stem}.asf".lower()]
-    if len(skeletons) == 1:
-        return next(iter(skeletons.values()))
-    hint = f" (there are {', '.join(sorted(skeletons))})" if skeletons else ""
-    raise file_error(path, f"an AMC file needs its skeleton: put {subject}.asf or {path.stem}.asf beside it{hint}")
+    """The ASF file whose name begins the AMC file's, as 02.asf of 02_01.amc or HDM_bd.asf of HDM_bd_walk_120.amc, or
+    the only one beside it, or one in the folder above. Raises InputError."""
+    words = path.stem.split("_")
+    stems = ["_".join(words[:count]) for count in range(len(words), 0, -1)]
+    skeletons = _skeletons_in(path.parent)
+    skeleton = _first_of(skeletons, stems)
+    if skeleton is None and len(skeletons) == 1:
+        skeleton = next(iter(skeletons.values()))
+    # HDM05's cut clips lie in a folder for each movement below the skeletons
+    skeleton = skeleton or _first_of(_skeletons_in(path.parent / ".."), stems)
+    if skeleton is None:
+        hint = f" (there are {', '.join(f'{name}.asf' for name in sorted(skeletons))})" if skeletons else ""
+        expected = f"{'_'.join(words[:2]) if words[0] == 'HDM' else words[0]}.asf or {path.stem}.asf"
+        raise file_error(path, f"an AMC file needs its skeleton: put {expected} beside it{hint}")
+    return skeleton
+
+
+def _skeletons_in(folder: Path) -> dict[str, Path]:
+    return {file.stem.lower(): file for file in folder.glob("*") if file.suffix.lower() == ".asf"}
+
+
+def _first_of(skeletons: dict[str, Path], stems: list[str]) -> Path | None:
+    return next((skeletons[stem.lower()] for stem in stems if stem.lower() in skeletons), None)
 
 
 def _words_of_lines(path: Path, expected: str) -> list[list[str]]:

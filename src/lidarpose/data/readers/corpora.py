@@ -2,7 +2,8 @@
 
     lipd            *.pkl: a list of dicts seq_path, pc (n, 3) m or a path of float32, gt_joint (24, 3) m, trans
     freemotion      *.pkl: a list of dicts motion_id or seq_path, gt (72) rad, shape (10), and for up to three LiDARs
-                    pc_1 ... (or pc) and T_1 ...: the points, m, and the pelvis in their frame
+                    pc_1 ... (or pc) and T_1 ...: the points, m, and the pelvis, along the first LiDAR's axes
+                    about each LiDAR
     noisemotion     the .pkl that the authors' dataloader_NoiseMotion.py makes from the raw clouds and SURREAL's poses:
                     like freemotion, with gt (3, 72) and shape (3, 10)
 
@@ -135,7 +136,9 @@ class FreeMotion(_Corpus):
 
     def _entry(self, entry: _Entry) -> Iterator[LabeledSample | Skipped]:
         pose = entry.numbers("gt", (self._poses, 72))[self._which]
-        betas = entry.numbers("shape", (self._poses, 10))[self._which]
+        has_shape = entry.content.get("shape") is not None
+        betas = entry.numbers("shape", (self._poses, 10))[self._which] if has_shape else np.zeros(10)
+        source = self.name if has_shape else f"{self.name}/mean shape"
         joints = self._smpl(betas[None], pose[None], np.zeros((1, 3)))[0]
         for view in (1, 2, 3):
             cloud = "pc" if view == 1 and "pc_1" not in entry.content else f"pc_{view}"
@@ -145,11 +148,16 @@ class FreeMotion(_Corpus):
                 yield Skipped(f"no T_{view}", entry.where)
                 continue
             try:
-                points, pelvis = entry.points(cloud), entry.numbers(f"T_{view}", (3,))
+                points, position = entry.points(cloud), entry.numbers(f"T_{view}", (3,))
             except InputError as error:
                 yield Skipped("entry in another format", str(error))
                 continue
-            yield entry.sample(points, joints - joints[0] + pelvis, track=str(view), source=self.name)
+            placed, words = self._place(points, joints, position)
+            yield entry.sample(points, placed, track=str(view), source=source + words)
+
+    def _place(self, points: np.ndarray, joints: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, str]:
+        """Joints (24, 3), of SMPL with trans 0, at a LiDAR's T, and what to add to the source."""
+        return joints - joints[0] + position, ""
 
 
 class NoiseMotion(FreeMotion):
@@ -158,6 +166,12 @@ class NoiseMotion(FreeMotion):
     name = "noisemotion"
     # the files do not say which of the three poses belongs to the points; the middle one is off by at most 33 ms
     _poses, _which = 3, 1
+
+    def _place(self, points: np.ndarray, joints: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, str]:
+        """The script writes SURREAL's trans, LiveHPS's loader expects the pelvis: whichever is nearer to the points."""
+        candidates = {"/T is the pelvis": joints - joints[0] + position, "/T is trans": joints + position}
+        words = min(candidates, key=lambda name: _apart(points, candidates[name]) if len(points) else 0.0)
+        return candidates[words], words
 
     def parts(self, root: Path) -> list[str]:
         """The pickles. Raises InputError if there are only raw clouds, which have no poses."""

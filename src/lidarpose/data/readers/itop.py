@@ -206,7 +206,7 @@ def person_of_room(points: np.ndarray) -> np.ndarray:
     """points (n, 3) m in the camera's axes, y up -> those of the person (k, 3), k = 0 if no person is found.
 
     Uses no labels and follows SPiKE's preprocessing: crop a fixed region of the room, remove the floor, keep the
-    largest cluster and the clusters around and in front of it. Clusters are connected cells; SPiKE uses DBSCAN.
+    largest cluster and the clusters around, in front of and below it. Clusters are connected cells; SPiKE uses DBSCAN.
     """
     points = points[((points >= _REGION[0]) & (points <= _REGION[1])).all(1)]
     points = points[points[:, 1] >= _floor(points[:, 1])]
@@ -218,9 +218,16 @@ def person_of_room(points: np.ndarray) -> np.ndarray:
     low, high = largest_cluster.min(0) - _NEAR, largest_cluster.max(0) + _NEAR
     # extended up and toward the camera, for raised and outstretched arms
     low[2], high[1] = _REGION[0, 2], high[1] + _NEAR
-    is_outside = ((points < low) | (points > high)).any(1)
-    is_person = (np.bincount(cluster, is_outside) == 0) & (counts >= _LEAST_POINTS)
+    is_around = _all_inside(points, cluster, low, high)
+    # detached shins and feet: not beside the largest cluster, and at any depth below it
+    low[0], high[0], low[1] = low[0] + _NEAR, high[0] - _NEAR, -np.inf
+    is_person = (is_around | _all_inside(points, cluster, low, high)) & (counts >= _LEAST_POINTS)
     return points[is_person[cluster]]
+
+
+def _all_inside(points: np.ndarray, cluster: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """(clusters,) bool: whether all points of a cluster lie within the limits."""
+    return np.bincount(cluster, ((points < low) | (points > high)).any(1)) == 0
 
 
 def _floor(heights: np.ndarray) -> float:

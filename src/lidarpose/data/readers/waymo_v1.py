@@ -1,4 +1,4 @@
-"""Waymo Open Dataset, Perception, version 1.4 (1.3.2 and later have keypoints): frames as protobuf in TFRecords.
+"""Waymo Open Dataset, Perception, version 1.4 (1.3.0 and later have keypoints): frames as protobuf in TFRecords.
 
     ROOT/{training,validation}/segment-NAME_with_camera_labels.tfrecord
 
