@@ -10,6 +10,7 @@ import struct
 import zipfile
 
 import laspy
+import lazrs
 import numpy as np
 import pytest
 from hypothesis import strategies as st
@@ -109,10 +110,28 @@ def las(points=POINTS, *, version="1.2", kind=0, packed=False, step=1e-3, shift=
     return file.getvalue()
 
 
+def laz_of_chunks(points=POINTS, sizes=(1, 2)) -> bytes:
+    """A LAZ file whose chunks have different numbers of points, as in COPC."""
+    plain, packed = las(points), las(points, packed=True)
+    start, plain_start = (struct.unpack_from("<I", data, 96)[0] for data in (packed, plain))
+    old, new = (lazrs.LazVlr.new_for_compression(0, 0, variable).record_data() for variable in (False, True))
+    file = io.BytesIO(packed[:start].replace(old, new))
+    file.seek(0, 2)
+    compressor = lazrs.LasZipCompressor(file, lazrs.LazVlr(new))
+    records = plain[plain_start:]
+    for size in sizes:
+        compressor.compress_many(records[: 20 * size])
+        compressor.finish_current_chunk()
+        records = records[20 * size :]
+    compressor.done()
+    return file.getvalue()
+
+
 POINT_FILES = {
     "a.las": las(),
     "b.las": las(version="1.4", kind=6),
     "a.laz": las(np.tile(POINTS, (99, 1)), kind=1, packed=True),
+    "b.laz": laz_of_chunks(),
     "a.pcd": pcd_header() + POINTS.tobytes(),
     "b.pcd": pcd_header(data="ascii") + _TEXT.encode(),
     "c.pcd": pcd_header(data="binary_compressed") + lzf_body(POINTS.T.tobytes()),

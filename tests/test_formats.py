@@ -10,7 +10,19 @@ import sys
 import laspy
 import numpy as np
 import pytest
-from hostile_files import POINTS, las, lzf_body, npy, npy_header, npz, pcd_header, ply_header, refusal, zipped
+from hostile_files import (
+    POINTS,
+    las,
+    laz_of_chunks,
+    lzf_body,
+    npy,
+    npy_header,
+    npz,
+    pcd_header,
+    ply_header,
+    refusal,
+    zipped,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -126,6 +138,17 @@ def test_read_las_and_laz_all_point_formats(folder, packed, points, kind, shift)
         np.testing.assert_allclose(cloud.points, expected, rtol=0, atol=1e-9)
     has = set(laspy.PointFormat(kind).dimension_names) & {"classification", "gps_time", "red", "green", "blue"}
     assert cloud.fields[:4] == ("x", "y", "z", "intensity") and set(cloud.fields[4:]) == has
+
+
+@pytest.mark.parametrize("sizes", [(3, 1, 2), (6,)])
+def test_read_laz_of_chunks_of_different_sizes(folder, sizes):
+    points = np.concatenate([POINTS, POINTS + 5])
+    content = laz_of_chunks(points, sizes)
+    np.testing.assert_allclose(read(folder, "a.laz", content).points, points[:, :3], atol=6e-4)
+    (table,) = struct.unpack_from("<q", content, struct.unpack_from("<I", content, 96)[0])
+    # a table that is not in the file, or has more chunks than bytes
+    for damaged in (content[:table], with_bytes(content, table + 4, struct.pack("<I", 10**9))):
+        refusal(read, folder, "a.laz", damaged, words=["damaged or cut off"])
 
 
 def test_read_laz_needs_extra_and_las_does_not(folder, monkeypatch):
@@ -372,6 +395,41 @@ def test_read_text_skips_point_count_line(folder, mark):
     same(read(folder, "a.xyz", f"3\n{rows}\n"), fields=None)
 
 
+@pytest.mark.parametrize("header", ["//X Y Z\n3\n", "3\n//X Y Z\n", '"x" "y" "z"\n3\n'])
+def test_read_text_skips_point_count_line_of_cloudcompare(folder, header):
+    same(read(folder, "a.asc", f"{header}1.5 -2.25 0.125\n10 20 -1\n3 4 5\n"))
+    # a later row with a single number is an incomplete point
+    assert read(folder, "a.txt", "x y z\n1.5 -2.25 0.125\n3\n3 4 5\n").num_dropped == 1
+
+
+def test_read_text_knows_columns_of_ouster_sdk(folder):
+    header = "# frame num: 0\n# TIMESTAMP (ns), ROW, RANGE (mm), X1 (m), Y1 (m), Z1 (m)\n"
+    rows = "100, 0, 9, 1.5, -2.25, 0.125\n200, 1, 9, 10, 20, -1\n300, 2, 9, 3, 4, 5\n"
+    same(read(folder, "a.csv", header + rows))
+    for names in (header.replace("(m)", "(mm)"), "# row, lon, lat, height, a, b\n"):
+        refusal(read, folder, "a.csv", names + rows, words=["columns x, y and z"])
+
+
+@pytest.mark.parametrize("word", ["-nan(ind)", "nan(snan)", "1.#QNAN", "-1.#IND", "1.#INF00"])
+def test_read_points_knows_nan_of_microsofts_libraries(folder, word):
+    for name, header in (
+        ("a.csv", "x,y,z\n"),
+        ("a.pcd", pcd_header(data="ascii")),
+        ("a.ply", ply_header(form="ascii")),
+    ):
+        row, mark = (f"{word} 2 3", ",") if name == "a.csv" else (f"{word} 2 3 0", " ")
+        rest = "\n".join(" ".join(map(str, point[: 3 if mark == "," else 4])) for point in POINTS[1:].tolist())
+        text = f"{row}\n{rest}\n".replace(" ", mark)
+        cloud = read(folder, name, (header.encode() if isinstance(header, str) else header) + text.encode())
+        same(cloud, POINTS[1:])
+        assert cloud.num_dropped == 1
+
+
+def test_read_pcd_without_sizes_and_types(folder):
+    header = "# .PCD v.5 - Point Cloud Data file format\nFIELDS x y z i\nPOINTS 3\nDATA binary\n"
+    same(read(folder, "a.pcd", header.encode() + POINTS.tobytes()))
+
+
 def test_read_bin_assumes_four_columns_if_ambiguous(folder):
     """If all columns are alike, it takes KITTI's four and warns if another number fits better by chance."""
     warned = 0
@@ -474,6 +532,9 @@ def with_bytes(content, place, new):
 BAD = {
     "empty": ("a.pcd", b"", ["empty"]),
     "unknown suffix": ("a.las2", ROWS, ["'.las2'", *SUFFIXES]),
+    "livox recording": ("a.lvx2", ROWS, ["'.lvx2'", "Livox Viewer"]),
+    "ouster recording": ("a.osf", ROWS, ["'.osf'", "ouster-cli source FILE.osf save FILE.pcap"]),
+    "e57": ("a.e57", ROWS, ["'.e57'", ".las or .ply"]),
     "no suffix": ("cloud", ROWS, ["suffix ''", ".pcd"]),
     "las as ply": ("a.ply", las(), ["rename it to .las"]),
     "las cut off": ("a.las", las()[:-1], ["cut off", "expected 60", "got 59"]),

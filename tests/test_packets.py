@@ -13,7 +13,7 @@ import pytest
 from hostile_files import with_changed_bytes
 
 from lidarpose.errors import InputError
-from lidarpose.io.sources import DamagedFrame, open_source
+from lidarpose.io.sources import DamagedFrame, open_source, pcap
 from lidarpose.io.sources.ouster import OusterFormat
 from lidarpose.io.sources.pcap import Capture
 
@@ -243,6 +243,25 @@ def test_capture_joins_fragments_and_counts_incomplete_ones(tmp_path):
     assert [datagram.payload for datagram in capture] == [payload] and capture.num_cut == 200
 
 
+def test_capture_joins_fragments_whose_length_is_that_of_the_first(tmp_path):
+    payload = bytes(range(256)) * 20
+    first, *others = ip4(payload, mtu=1000)
+    # the UDP length, after an IP header of 24 bytes
+    first = first[:28] + struct.pack(">H", 1000) + first[30:]
+    assert [datagram.payload for datagram in Capture(write(tmp_path / "a.pcap", [first, *others]))] == [payload]
+
+
+def test_pcapng_skips_packets_of_other_interfaces(tmp_path, monkeypatch):
+    ips = [ip4(bytes([k]))[0] for k in range(4)]
+    path = write_ng(tmp_path / "a.pcapng", ips)
+    assert len(list(Capture(path))) == 4
+    monkeypatch.delitem(pcap._LINKS, 101)
+    assert [datagram.payload for datagram in Capture(path)] == [b"\0", b"\2"]
+    monkeypatch.delitem(pcap._LINKS, 1)
+    with pytest.raises(InputError, match="link type 1"):
+        list(Capture(path))
+
+
 # ---- Ouster
 
 
@@ -322,6 +341,32 @@ def test_open_source_accepts_path_of_metadata(tmp_path):
         assert np.array_equal(named.points, beside[0])
     with pytest.raises(InputError, match="other.json: no such file"):
         open_source(path, meta=tmp_path / "other.json")
+
+
+def test_ouster_metadata_may_have_the_recorders_number(tmp_path):
+    path = tmp_path / "walk.pcap"
+    (frame,) = ouster(path, [ip for payload in packets_of([0]) for ip in ip4(payload)])
+    path.with_suffix(".json").rename(tmp_path / "walk_0.json")
+    (numbered,) = open_source(path)
+    assert np.array_equal(numbered.points, frame.points)
+
+
+@pytest.mark.parametrize(
+    ("product", "offset"), [("OS-0-128", 27.67), ("OS-1-64", 15.806), ("OS-2-32", 13.762), ("OS-DOME", 12.163)]
+)
+def test_ouster_beam_origin_depends_on_product_if_missing(tmp_path, product, offset):
+    content = metadata(prod_line=product)
+    del content["lidar_origin_to_beam_origin_mm"]
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    (frame,) = open_source(write(tmp_path / "a.pcap", [ip4(payload)[0] for payload in packets_of([0])]))
+    np.testing.assert_allclose(decoded(frame), expected_points(ranges_of(0), along=offset), atol=1e-9)
+
+
+@pytest.mark.parametrize(("vendor", "preamble"), [("Hesai", b"\xee\xff\x01"), ("RoboSense", b"\x55\xaa\x05")])
+def test_open_source_names_other_vendors(tmp_path, vendor, preamble):
+    ips = [ip4(preamble + bytes(1077))[0]] * 9
+    with pytest.raises(InputError, match=f"packets of a {vendor} sensor.*{vendor}'s driver"):
+        open_source(write(tmp_path / "a.pcap", ips))
 
 
 def test_open_source_reports_bad_captures_and_metadata(tmp_path):
@@ -420,3 +465,31 @@ def test_velodyne_packets_become_frames(tmp_path):
         open_source(write(tmp_path / "d.pcap", hdl64))
     with pytest.raises(InputError, match="Velodyne model that can be decoded"):
         open_source(write(tmp_path / "c.pcap", [ip4(bytes(1206))[0]] * 9))
+
+
+def hdl64e_packets(year=16):
+    """Packets of an HDL-64E S2, whose last bytes are its state and its calibration, one byte each."""
+    lasers = b"".join(struct.pack("<B9hBB", k, 10 * k - 500, *(0,) * 8, 10, 255) + bytes(7) for k in range(64))
+    date = bytes([year, 1, 2, 3, 4, 5]) if year else b"\xff" * 6
+    content = b"UNIT#" + bytes(2) + lasers[:-7] + date + bytes(20) + struct.pack("<H", 1820)
+    assert len(content) == 1820
+    states = [*((ord(letter), 1) for letter in "HMSDNYGTV"), *((0x30 + k % 7, byte) for k, byte in enumerate(content))]
+    return [vlp16(k * 480 % 36000, k, model=byte)[:-2] + bytes([kind, byte]) for k, (kind, byte) in enumerate(states)]
+
+
+def test_velodyne_hdl64e_calibration_is_read_from_any_capture(tmp_path):
+    pytest.importorskip("velodyne_decoder", reason="the extra recordings is not installed")
+    ips = [ip4(payload)[0] for payload in hdl64e_packets()]
+    counts = [
+        len(list(open_source(path))) for path in (write(tmp_path / "a.pcap", ips), write_ng(tmp_path / "a.pcapng", ips))
+    ]
+    assert counts[0] == counts[1] > 20
+    with pytest.raises(InputError, match="calibration not set in the sensor"):
+        list(open_source(write(tmp_path / "b.pcap", [ip4(payload)[0] for payload in hdl64e_packets(year=0)])))
+
+
+def test_velodyne_capture_beside_another_json_is_read(tmp_path):
+    pytest.importorskip("velodyne_decoder", reason="the extra recordings is not installed")
+    path = write(tmp_path / "a.pcap", [ip4(vlp16(k * 480 % 36000, k * 1330))[0] for k in range(80)], period=1330)
+    path.with_suffix(".json").write_text("[]")
+    assert len(list(open_source(path))) == 2

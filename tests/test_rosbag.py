@@ -11,7 +11,8 @@ from hostile_files import with_changed_bytes
 from lidarpose.cli import main
 from lidarpose.errors import InputError
 from lidarpose.inference.background import is_static, learn_background
-from lidarpose.io.sources import DamagedFrame, open_source
+from lidarpose.io.files import FormatError
+from lidarpose.io.sources import DamagedFrame, livox, open_source
 from lidarpose.io.sources.rosbag import decode_cloud
 from lidarpose.recording.predict_recording import predict_recording
 
@@ -88,8 +89,9 @@ def write(path, messages, *, compression=None):
         plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
         writer = Writer2(path.with_suffix(""), version=9, storage_plugin=plugin)
         if compression:
-            mode = CompressionMode.STORAGE if path.suffix == ".mcap" else CompressionMode.MESSAGE
-            writer.set_compression(mode, getattr(CompressionFormat, compression.upper()))
+            is_message = path.suffix == ".db3" or "messages" in compression
+            mode = CompressionMode.MESSAGE if is_message else CompressionMode.STORAGE
+            writer.set_compression(mode, CompressionFormat.ZSTD)
     connections = {}
     with writer:
         for topic, message, time in messages:
@@ -124,6 +126,7 @@ def clouds(suffix, count=6, n=40):
 CONTAINERS = [
     (".mcap", None),
     (".mcap", "zstd"),
+    (".mcap", "zstd, messages"),
     (".db3", None),
     (".db3", "zstd"),
     (".bag", None),
@@ -209,6 +212,63 @@ def test_decode_cloud_reads_all_field_layouts(name):
     got, got_ring = decode_cloud(ROS2.deserialize_cdr(ROS2.serialize_cdr(message, CLOUD), CLOUD))
     assert np.array_equal(got, points, equal_nan=True)
     assert np.array_equal(got_ring, ring) if "ring" in name else got_ring is None
+
+
+@pytest.mark.parametrize("row_step", [0, 10, 40 * 16])
+def test_decode_cloud_ignores_row_steps_that_do_not_fit(row_step):
+    """As published by drivers that leave it 0, or set it to the number of points or to the size of the whole cloud."""
+    message = cloud(points_of(3), height=4)
+    message.row_step = row_step
+    assert np.array_equal(decode_cloud(message)[0], points_of(3))
+    message.data = message.data[:-1]
+    with pytest.raises(FormatError, match="cut off"):
+        decode_cloud(message)
+
+
+LIVOX_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line"
+LIVOX = "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points"
+for livox_store in (ROS1, ROS2):
+    livox_store.register(get_types_from_msg(LIVOX_POINT, "livox_ros_driver2/msg/CustomPoint"))
+    livox_store.register(get_types_from_msg(LIVOX, "livox_ros_driver2/msg/CustomMsg"))
+
+
+def livox_message(points, store, stamp, frame="livox_frame"):
+    types = store.types
+    custom_points = [
+        types["livox_ros_driver2/msg/CustomPoint"](k, *map(float, xyz), reflectivity=5, tag=16, line=k % 4)
+        for k, xyz in enumerate(points)
+    ]
+    head = header(store, stamp, frame)
+    rest = {"timebase": 7, "point_num": len(points), "lidar_id": 1, "rsvd": np.zeros(3, np.uint8)}
+    return types["livox_ros_driver2/msg/CustomMsg"](header=head, **rest, points=custom_points)
+
+
+@pytest.mark.parametrize("frame", ["livox", "livox_frame"])
+@pytest.mark.parametrize("suffix", [".mcap", ".db3", ".bag"])
+def test_livox_messages_become_frames(tmp_path, suffix, frame):
+    store = store_of(suffix)
+    messages = [
+        ("/livox/lidar", livox_message(points_of(k, 39 + k), store, START + k * 10**8, frame), START + k * 10**8)
+        for k in range(3)
+    ]
+    source = open_source(write(tmp_path / f"walk{suffix}", messages))
+    frames = list(source)
+    assert source.count == len(frames) == 3 and not source.warnings
+    for k, sweep in enumerate(frames):
+        assert np.array_equal(sweep.points, points_of(k, 39 + k)) and sweep.time == START / 1e9 + k / 10
+        assert np.array_equal(sweep.ring, np.arange(39 + k) % 4) and np.array_equal(sweep.origin, np.zeros(3))
+
+
+def test_decode_livox_refuses_cut_and_reads_big_endian_messages():
+    name = "livox_ros_driver2/msg/CustomMsg"
+    message = livox_message(points_of(1), ROS2, START)
+    for is_little in (True, False):
+        data = bytes(ROS2.serialize_cdr(message, name, little_endian=is_little))
+        assert np.array_equal(livox.decode_cloud(data, "cdr").points, points_of(1))
+        with pytest.raises(FormatError, match="cut off"):
+            livox.decode_cloud(data[:-4], "cdr")
+    empty = bytes(ROS1.serialize_ros1(livox_message([], ROS1, START), name))
+    assert livox.decode_cloud(empty, "ros1").points.shape == (0, 3)
 
 
 def test_invalid_returns_are_dropped_with_their_rings(tmp_path):

@@ -14,7 +14,7 @@ from lidarpose.errors import InputError, counted, first_names
 from lidarpose.models import DEFAULT, NAMES
 
 # io.point_cloud.SUFFIXES, which is not imported just for a help text
-_FILES = ".pcd .ply .las .laz .npy .npz .csv .xyz .txt .bin"
+_FILES = ".pcd .ply .las .laz .npy .npz .csv .xyz .txt .asc .pts .bin"
 # advice if no person was found although there is one
 _ADVICE = (
     "if there should be: points need meters and z up (--up), a lower --min-score finds more, and predict --crop "

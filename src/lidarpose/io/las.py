@@ -19,6 +19,8 @@ _POINT_FORMATS = range(11)
 _PACKED = 0x80
 # user id and record id of the record that describes the compression
 _LASZIP = (b"laszip encoded", 22204)
+# size of the chunks in that record if they differ
+_VARIABLE = b"\xff\xff\xff\xff"
 _WITH_TIME, _WITH_COLOR = (1, 3, 4, 5, 6, 7, 8, 9, 10), (2, 3, 5, 7, 8, 10)
 
 
@@ -57,6 +59,16 @@ class _Unseekable(io.RawIOBase):
         return self._file.readinto(buffer)
 
 
+def _check_chunk_table(data: bytes, start: int) -> None:
+    """Raises FormatError if the chunk table has more chunks than the file has room for: lazrs would allocate them."""
+    (table,) = struct.unpack_from("<q", data, start)
+    if table == -1:
+        # a writer that could not seek appended the position
+        (table,) = struct.unpack_from("<q", data, len(data) - 8)
+    if not start < table <= len(data) - 8 or struct.unpack_from("<I", data, table + 4)[0] > len(data) // 8:
+        raise FormatError("is damaged or cut off: copy it again")
+
+
 def _unpack(data: bytes, start: int, size: int, num_points: int) -> bytes:
     """The point records of a LAZ file, decompressed as in a LAS file. lazrs does not validate the sizes that a file
     announces, so this module does."""
@@ -72,7 +84,13 @@ def _unpack(data: bytes, start: int, size: int, num_points: int) -> bytes:
             points = bytearray(num_points * size)
             try:
                 record_data = data[offset - length : offset]
-                lazrs.LasZipDecompressor(_Unseekable(data[start:]), record_data).decompress_many(points)
+                stream: io.IOBase = _Unseekable(data[start:])
+                if record_data[12:16] == _VARIABLE:
+                    # as in COPC: without the chunk table the chunks' numbers of points are unknown
+                    _check_chunk_table(data, start)
+                    stream = io.BytesIO(data)
+                    stream.seek(start)
+                lazrs.LasZipDecompressor(stream, record_data).decompress_many(points)
             # a damaged file may make lazrs panic, which raises an error that is not an Exception
             except BaseException as error:
                 if isinstance(error, KeyboardInterrupt | SystemExit):

@@ -31,8 +31,9 @@ def parse_pcd(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
     """x y z (n, 3) and the field names; raises FormatError."""
     header, encoding, start = _pcd_header(data)
     names = tuple(header.get("FIELDS") or header.get("COLUMNS") or ())
-    # older versions of the format have no COUNT
-    sizes, types, count_words = (header.get(key, ["1"] * len(names)) for key in ("SIZE", "TYPE", "COUNT"))
+    # older versions of the format have no COUNT, the oldest no SIZE and TYPE
+    defaults = {"SIZE": "4", "TYPE": "F", "COUNT": "1"}
+    sizes, types, count_words = (header.get(key, [word] * len(names)) for key, word in defaults.items())
     if not len(sizes) == len(types) == len(count_words) == len(names):
         actual = f"{len(names)} fields, {len(sizes)} sizes, {len(types)} types and {len(count_words)} counts"
         raise FormatError("a PCD header with as many SIZE, TYPE, COUNT as FIELDS", actual, "export it again")

@@ -55,6 +55,10 @@ _FOREIGN = {
     rb"(?i)\s*<(!doctype html|html|\?xml)": "is a web page or XML: expected a point cloud; download it again",
     rb"version https://git-lfs": "is a Git LFS pointer, not the data: run `git lfs pull`",
 }
+# how to convert files of other formats
+_CONVERTED = dict.fromkeys((".lvx", ".lvx2", ".lvx3"), "export it with Livox Viewer as .las or .csv")
+_CONVERTED |= {".osf": "convert it (ouster-cli source FILE.osf save FILE.pcap)"}
+_CONVERTED |= dict.fromkeys((".e57", ".ptx", ".fls"), "export it as .las or .ply (CloudCompare does)")
 _MAGIC = {
     ".npy": rb"\x93NUMPY",
     ".ply": rb"ply[ \t]*[\r\n]",
@@ -95,9 +99,9 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
 
     .pcd (ascii, binary, binary_compressed), .ply (the vertices; ascii, binary of either byte order), .las, .laz (all
     point formats), .npy ((n, 3+) or records with x, y, z), .npz (`points`, else `xyz`, else its only (n, 3+) array),
-    .csv .xyz .txt (with or without a header; commas, semicolons, tabs or blanks; # starts a comment), .bin (rows of
-    `columns` float32). Points that are NaN or infinite are dropped with a warning; `predict` and `detect` also drop
-    those beyond 1e9 m and, if there is more than one of them, at 0,0,0.
+    .csv .xyz .txt .asc .pts (with or without a header; commas, semicolons, tabs or blanks; # starts a comment), .bin
+    (rows of `columns` float32). Points that are NaN or infinite are dropped with a warning; `predict` and `detect` also
+    drop those beyond 1e9 m and, if there is more than one of them, at 0,0,0.
 
     Args:
         columns: values per row of a .bin file, x y z first; other formats ignore it. With None, rows have 4 values
@@ -165,7 +169,8 @@ def _refuse_foreign(data: bytes, suffix: str) -> None:
             "one scan", f"a recording ({suffix})", "read it with lidarpose predict, in Python with predict_recording"
         )
     if suffix not in SUFFIXES:
-        raise FormatError(f"one of {' '.join(SUFFIXES)}", f"the suffix {suffix!r}", "convert or rename the file")
+        remedy = _CONVERTED.get(suffix, "convert or rename the file")
+        raise FormatError(f"one of {' '.join(SUFFIXES)}", f"the suffix {suffix!r}", remedy)
 
 
 # ---- raw float32 rows
@@ -292,5 +297,7 @@ _PARSERS = {
     ".csv": parse_text,
     ".xyz": parse_text,
     ".txt": parse_text,
+    ".asc": parse_text,
+    ".pts": parse_text,
 }
 SUFFIXES = (*_PARSERS, ".bin")

@@ -15,6 +15,9 @@ from lidarpose.io.files import FormatError, shorten
 FEW_ROWS, _MANY_COLUMNS = 5, 50
 # how the usual exports write a missing value, in lower or upper case
 _MISSING = ("", "na", "n/a", "nan", "-nan", "+nan", "null", "none", "<na>")
+# .pts and other formats begin with the number of points; CloudCompare also writes it after the header
+_COUNT = r"""(?x) \A ([ \t]* (?: // | \# )? [ \t]* "? [A-Za-z] [^\n]* \n)? [0-9]{1,18} [ \t]* \n
+    (?= [ \t]* (?: // | [-+.\d] \S* (?: [ \t,;]+ [-+.\d] \S* ){2} ))"""
 
 
 def pick_xyz(names: Sequence[str]) -> list[int]:
@@ -32,12 +35,15 @@ def has_xyz(names: Sequence[str]) -> bool:
 
 
 def _plain(names: Sequence[str]) -> list[str]:
-    """Column names in lower case, without units ("x [m]"); the axis names of ParaView and VeloView as x, y and z."""
+    """Column names in lower case, without units ("x [m]"); the axis names of ParaView and VeloView, and those of the
+    first return of Ouster's SDK, as x, y and z."""
     plain_names = []
     for name in names:
         name = re.sub(r" ?[\[(]m[\])]$", "", name.strip().lower())
         axis = re.fullmatch(r"points(?:_m_xyz)?:([0-2])", name)
         plain_names.append("xyz"[int(axis[1])] if axis else name)
+    if "x" not in plain_names and {"x1", "y1", "z1"} <= set(plain_names):
+        plain_names = [name.removesuffix("1") if name in ("x1", "y1", "z1") else name for name in plain_names]
     return plain_names
 
 
@@ -76,7 +82,7 @@ def parse_rows(text: str, num_rows: int, columns: list[int], num_cells: int, *, 
 
     Blank lines do not count. Raises FormatError if there are fewer lines, and for the first line that does not fit.
     """
-    lines = (" ".join(line.split()) for line in io.StringIO(text))
+    lines = (" ".join(line.split()) for line in io.StringIO(_with_plain_nan(text)))
     rows = list(itertools.islice(filter(None, lines), skip, skip + num_rows))
     if len(rows) < num_rows:
         raise FormatError(f"is cut off: expected {num_rows} points, got {len(rows)}; copy or export it again")
@@ -92,8 +98,7 @@ def parse_rows(text: str, num_rows: int, columns: list[int], num_cells: int, *, 
 
 def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
     """x y z (n, 3) and the column names; raises FormatError."""
-    # .pts and other formats begin with the number of points
-    text = re.sub(r"\A[0-9]{1,18}[ \t]*\n(?=[ \t]*[-+.\d]\S*(?:[ \t,;]+[-+.\d]\S*){2})", "\n", decode(data))
+    text = re.sub(_COUNT, r"\1\n", _with_plain_nan(decode(data)))
     names, num_skipped, has_header, separator, decimal = _find_columns(text)
     # lines with only a comment would count as rows without values; the lookbehind keeps the regular expression from
     # starting at every blank of a long run
@@ -114,6 +119,11 @@ def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
         actual = f"{len(points)} lines of {len(names)} values"
         raise FormatError("a line of x y z for each point", actual, "save its transpose")
     return points, tuple(names)
+
+
+def _with_plain_nan(text: str) -> str:
+    """The text with the forms of NaN and infinity that Microsoft's libraries write, -nan(ind) and 1.#QNAN, as nan."""
+    return re.sub(r"[-+]?(?:nan\(\w*\)|1\.#(?:QNAN|SNAN|IND|INF)\w*)", "nan", text, flags=re.I)
 
 
 def _find_columns(text: str) -> tuple[Sequence[str], int, bool, str | None, str]:
@@ -138,9 +148,13 @@ def _find_columns(text: str) -> tuple[Sequence[str], int, bool, str | None, str]
     if len(cells) < 3:
         raise FormatError("at least 3 columns x y z", f"{len(cells)} {where}", "export x, y and z")
     # a comment above the rows is their header if it has as many words, among them x, y and z, as numpy.savetxt writes
-    for words in (_split(comment, mark) for mark in (None, ",", ";")):
+    for mark in (None, ",", ";"):
+        words = _split(comment, mark)
         if len(words) == len(cells) and has_xyz(words):
             return words, num_skipped, False, separator, decimal
+        if mark and len(words) == len(cells) > 3 and not any(_is_number(word, decimal) for word in words):
+            # names of other columns: the first three need not be x, y and z
+            pick_xyz(words)
     return numbered(len(cells)), num_skipped, False, separator, decimal
 
 

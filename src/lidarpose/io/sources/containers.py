@@ -21,7 +21,7 @@ from lidarpose.io.files import FormatError, check_unpacked, shorten
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _CUT_OFF = "is cut off: the part before the cut is read, if there is any"
-# maximum bytes of a message in SQLite, compressed or not
+# maximum bytes of a message in SQLite, and of a decompressed message
 _MAX_MESSAGE = 2**28
 
 _TABLES = "SELECT COUNT(*) FROM sqlite_master WHERE type = 'table' AND name IN ('messages', 'topics')"
@@ -64,6 +64,15 @@ def unpack(data: bytes, compression: str, size: int) -> bytes:
         return decompressor.decompress(data, max_length=size)
     except Exception as error:
         raise FormatError(f"cannot be unpacked ({shorten(str(error))})") from None
+
+
+def unpacked_message(data: bytes) -> bytes:
+    """A message's bytes, decompressed if rosbag2 compressed them. One that cannot be decompressed stays as it is, and
+    decoding it fails later."""
+    if data.startswith(_ZSTD):
+        with suppress(FormatError):
+            return unpack(data, "zstd", _MAX_MESSAGE)
+    return data
 
 
 class _Bytes:
@@ -317,10 +326,6 @@ class SqliteFile:
             with closing(self._connect()) as connection:
                 for name, time, data in connection.execute(query, tuple(topics)):
                     data = data if isinstance(data, bytes) else b""
-                    if data.startswith(_ZSTD):
-                        # a message that cannot be unpacked stays as it is, and decoding it fails later
-                        with suppress(FormatError):
-                            data = unpack(data, "zstd", _MAX_MESSAGE)
                     yield Message(str(name), time if isinstance(time, int) else 0, data)
         except sqlite3.Error as error:
             raise FormatError(f"is damaged ({shorten(str(error))}): the part before the damage is read") from None

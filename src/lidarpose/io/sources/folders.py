@@ -12,7 +12,7 @@ from lidarpose.io.point_cloud import SUFFIXES, read_points
 from lidarpose.io.sources.frame import IndexedRecording, ReadingOptions, Sweep
 
 # text files may be notes, tables or labels: they are read as points only if the folder has no other points
-_TEXT = (".csv", ".txt", ".xyz")
+_TEXT = (".csv", ".txt", ".xyz", ".asc", ".pts")
 # the number of columns of .bin files is taken from the first readable one among at most this many
 _MOST_TRIED = 10
 

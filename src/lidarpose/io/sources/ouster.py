@@ -39,6 +39,8 @@ _PIXEL_BYTES = {
 _MAX_COLUMNS, _MAX_BEAMS, _MAX_PACKET, _MAX_NUMBER = 4096, 256, 65507, 1e9
 # lidar_to_sensor_transform, mm, of sensors whose metadata does not contain it
 _LIDAR_TO_SENSOR = (-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 36.18, 0, 0, 0, 1)
+# lidar_origin_to_beam_origin_mm of sensors whose metadata does not contain it, by product line, and of others
+_BEAM_ORIGINS, _BEAM_ORIGIN = {"OS-0-": 27.67, "OS-1-": 15.806, "OS-2-": 13.762}, 12.163
 _COLUMNS_PER_PACKET = 16
 # number of datagrams that are searched for the port in the metadata
 _NUM_PEEKED = 2000
@@ -47,14 +49,18 @@ _NUM_PEEKED = 2000
 def open_recording(path: Path, options: ReadingOptions) -> Recording:
     """Opens a capture of an Ouster sensor, or, if there is no metadata, of a Velodyne sensor.
 
-    The Ouster metadata is the JSON file `meta`, else the one next to the capture with the same stem.
+    The Ouster metadata is the JSON file `meta`, else the one next to the capture with the same stem, or with the number
+    that Ouster's recorder appends (STEM_0.json).
 
     Raises:
         InputError: The file is not a capture, is of another sensor, or is of an Ouster sensor without metadata.
         MissingExtra: The capture is of a Velodyne sensor, and the library that decodes it is not installed.
     """
-    metadata = options.meta or path.with_suffix(".json")
-    if options.meta is None and not metadata.exists():
+    if options.meta is not None:
+        return OusterRecording(path, options.meta)
+    candidates = (path.with_suffix(".json"), path.with_name(f"{path.stem}_0.json"))
+    metadata = next((file for file in candidates if file.exists()), None)
+    if metadata is None or velodyne.is_capture_of(path):
         return velodyne.open_recording(path, options)
     return OusterRecording(path, metadata)
 
@@ -129,7 +135,9 @@ class OusterFormat:
         beam_to_lidar = _numbers(metadata, "beam_to_lidar_transform", np.eye(4)).reshape(4, 4)
         radial_offset, vertical_offset = beam_to_lidar[0, 3], beam_to_lidar[2, 3]
         if "beam_to_lidar_transform" not in metadata:
-            radial_offset = float(_numbers(metadata, "lidar_origin_to_beam_origin_mm", 0.0))
+            product = str(metadata.get("prod_line", ""))
+            default = next((mm for name, mm in _BEAM_ORIGINS.items() if product.startswith(name)), _BEAM_ORIGIN)
+            radial_offset = float(_numbers(metadata, "lidar_origin_to_beam_origin_mm", default))
         self.reach = float(np.hypot(radial_offset, vertical_offset))
         T_sensor_lidar = _numbers(metadata, "lidar_to_sensor_transform", _LIDAR_TO_SENSOR).reshape(4, 4)
         R, self.origin = T_sensor_lidar[:3, :3], T_sensor_lidar[:3, 3] / 1000

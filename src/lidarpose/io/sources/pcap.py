@@ -93,8 +93,10 @@ class Capture:
             if len(data) < 8:
                 return None
             _, port, size = struct.unpack_from(">HHH", data)
+            # segmentation offload leaves the size 0; in some captures it is that of the first fragment only
+            size = len(data) if not size or ((offset or has_more) and size < len(data)) else size
             if size <= len(data):
-                return Datagram(time, (source, port), bytes(data[8 : size or len(data)]))
+                return Datagram(time, (source, port), bytes(data[8:size]))
         self.num_cut += 1
         return None
 
@@ -202,13 +204,15 @@ def _read_pcapng(file: BinaryIO) -> Iterator[tuple[float, int, bytes]]:
         (number,) = struct.unpack(order + "I", kind)
         if number == 1 and len(body) >= 8:
             link = struct.unpack_from(order + "H", body)[0]
-            _check_link(link)
             interfaces.append((link, _ticks(body[8:], order)))
         elif number == 6 and len(body) >= 20:
             interface, high, low, size, _ = struct.unpack_from(order + "5I", body)
             if interface < len(interfaces):
                 link, ticks = interfaces[interface]
-                yield (high * 2**32 + low) / ticks, link, body[20 : 20 + size]
+                if link in _LINKS:
+                    yield (high * 2**32 + low) / ticks, link, body[20 : 20 + size]
+                elif not any(other in _LINKS for other, _ in interfaces):
+                    _check_link(link)
 
 
 def _ticks(options: bytes, order: str) -> float:

@@ -1,4 +1,5 @@
-"""Point clouds in ROS recordings: sensor_msgs/PointCloud2 in MCAP, ROS 1 bags and rosbag2's SQLite files.
+"""Point clouds in ROS recordings: sensor_msgs/PointCloud2 and Livox's CustomMsg in MCAP, ROS 1 bags and rosbag2's
+SQLite files.
 
 Messages are decoded with the library rosbags. The sensor pose comes from the recording's transforms (tf), if they
 connect the clouds' frame to a world frame.
@@ -17,7 +18,16 @@ import numpy as np
 from lidarpose.errors import InputError, needs_extra
 from lidarpose.geometry import quaternion_to_matrix, rigid_transform
 from lidarpose.io.files import FormatError, file_error, shorten, unreadable
-from lidarpose.io.sources.containers import McapFile, Message, RecordFile, Ros1File, SqliteFile, Topic
+from lidarpose.io.sources import livox
+from lidarpose.io.sources.containers import (
+    McapFile,
+    Message,
+    RecordFile,
+    Ros1File,
+    SqliteFile,
+    Topic,
+    unpacked_message,
+)
 from lidarpose.io.sources.folders import natural_key
 from lidarpose.io.sources.frame import LazyFrame, ReadingOptions, Sweep
 
@@ -109,11 +119,12 @@ class BagRecording:
         clouds = {
             key: entry.count
             for key, entry in self.topics.items()
-            if entry.type in _CLOUD and entry.encoding in _decoders()
+            if entry.type in (*_CLOUD, *livox.TYPES) and entry.encoding in _decoders()
         }
         if not clouds:
             topics = ", ".join(f"{key} ({entry.type}, {entry.encoding})" for key, entry in self.topics.items())
-            problem = f"has no point clouds (expected a topic of {_CLOUD[0]}); its topics are"
+            expected = f"{_CLOUD[0]} or Livox's CustomMsg"
+            problem = f"has no point clouds (expected a topic of {expected}); its topics are"
             raise file_error(self.name, f"{problem} {shorten(topics, 1000) or 'none'}")
         names = ", ".join(f"{key} ({count})" for key, count in clouds.items())
         if topic is not None and topic not in clouds:
@@ -173,9 +184,13 @@ class BagRecording:
 
     def _decode(self, message: Message) -> Any:
         """The content of a message, or None if it is damaged."""
+        topic = self.topics[message.topic]
+        data = unpacked_message(message.data)
         name = _CLOUD[0] if message.topic == self.topic else _TRANSFORMS[0]
         try:
-            return _decoders()[self.topics[message.topic].encoding](message.data, name)
+            if topic.type in livox.TYPES:
+                return livox.decode_cloud(data, topic.encoding)
+            return _decoders()[topic.encoding](data, name)
         except Exception:
             return None
 
@@ -226,8 +241,9 @@ class _Cloud:
 
     def decode(self, T_world_sensor: np.ndarray | None) -> Sweep:
         if self.content is None:
-            raise FormatError("cannot be decoded as a PointCloud2: the message is damaged")
-        points, ring = decode_cloud(self.content)
+            raise FormatError("cannot be decoded as a point cloud: the message is damaged")
+        is_livox = isinstance(self.content, livox.LivoxCloud)
+        points, ring = (self.content.points, self.content.ring) if is_livox else decode_cloud(self.content)
         origin = None if self.frame_id in _NO_SENSORS else np.zeros(3)
         return Sweep(points=points, T_world_sensor=T_world_sensor, origin=origin, ring=ring)
 
@@ -266,10 +282,12 @@ def decode_cloud(cloud: Any) -> tuple[np.ndarray, np.ndarray | None]:
     formats = [order + _DATATYPES[names[name].datatype] for name in field_names]
     offsets = [names[name].offset for name in field_names]
     point = np.dtype({"names": field_names, "formats": formats, "offsets": offsets, "itemsize": cloud.point_step})
-    # the row step of a single row is often not set
-    row_step = cloud.row_step if cloud.height > 1 else cloud.width * cloud.point_step
-    required_bytes = row_step * (cloud.height - 1) + cloud.width * cloud.point_step
-    if row_step < cloud.width * cloud.point_step or required_bytes > len(cloud.data):
+    row_bytes = cloud.width * cloud.point_step
+    row_step = cloud.row_step
+    if row_step < row_bytes or row_step * (cloud.height - 1) + row_bytes > len(cloud.data):
+        # many drivers do not set the row step, or set it to the size of the whole cloud
+        row_step = row_bytes
+    if row_bytes * cloud.height > len(cloud.data):
         layout = f"{cloud.height} rows of {cloud.width} points of {cloud.point_step} bytes"
         raise FormatError(layout, f"{len(cloud.data)} bytes", "the cloud is cut off")
     shape, strides = (cloud.height, cloud.width), (row_step, cloud.point_step)

@@ -15,6 +15,8 @@ from lidarpose.io.sources.frame import ReadingOptions, Sweep
 from lidarpose.io.sources.pcap import Capture, Datagram, PacketRecording
 
 PACKET_BYTES = 1206
+# first bytes of other vendors' packets with points
+_OTHERS = {"Hesai": b"\xee\xff", "RoboSense": b"\x55\xaa"}
 # column of the ring in the decoder's rows
 _RING = 6
 # number of packets that are searched for those of a Velodyne, and of packets that are checked for a model number in
@@ -29,18 +31,34 @@ def open_recording(path: Path, options: ReadingOptions) -> "VelodyneRecording":
         InputError: The file is not a capture, or is of another sensor.
         MissingExtra: The library that decodes it is not installed.
     """
-    sizes: list[int] = []
-    try:
-        sizes += (len(datagram.payload) for datagram in islice(Capture(path), _NUM_TRIED))
-    except InputError:
-        if not sizes:
-            raise
+    payloads = _first_payloads(path)
+    sizes = [len(payload) for payload in payloads]
     if PACKET_BYTES in sizes:
         return VelodyneRecording(path)
     if not sizes:
         raise file_error(path, "has no UDP packets; expected packets of an Ouster or Velodyne sensor")
+    for vendor, preamble in _OTHERS.items():
+        if sum(payload.startswith(preamble) for payload in payloads) > len(payloads) / 4:
+            problem = f"has packets of a {vendor} sensor; expected those of an Ouster or Velodyne sensor"
+            raise file_error(path, f"{problem}: convert it to a ROS bag with {vendor}'s driver, or to .pcd files")
     problem = f"an Ouster recording needs its metadata {path.stem}.json beside it, or the path of another file (meta)"
     raise file_error(path, f"{problem} (a Velodyne's packets have {PACKET_BYTES} bytes, these have up to {max(sizes)})")
+
+
+def is_capture_of(path: Path) -> bool:
+    """Whether a capture has packets of a Velodyne sensor. Raises InputError if it cannot be read."""
+    return any(len(payload) == PACKET_BYTES for payload in _first_payloads(path))
+
+
+def _first_payloads(path: Path) -> list[bytes]:
+    """Raises InputError if the capture is damaged before its first datagram."""
+    payloads: list[bytes] = []
+    try:
+        payloads += (datagram.payload for datagram in islice(Capture(path), _NUM_TRIED))
+    except InputError:
+        if not payloads:
+            raise
+    return payloads
 
 
 class VelodyneRecording(PacketRecording):
@@ -73,12 +91,24 @@ class VelodyneRecording(PacketRecording):
             return config, ends.most_common(1)[0][0]
         # the last bytes vary: they are pieces of an HDL-64E's calibration
         try:
-            config.model, config.calibration = self._library.hdl64e.detect_hdl64e(self.name)
+            config.model, config.calibration = self._calibration()
         except Exception as error:
             reason = shorten(str(error))
             problem = f"is from an HDL-64E, but has no calibration in it ({reason}); record it for longer"
             raise file_error(self.name, problem) from None
         return config, b""
+
+    def _calibration(self) -> tuple[Any, Any]:
+        """Model and calibration that an HDL-64E sends in the last bytes of its packets. Raises ValueError."""
+        import yaml
+
+        hdl64e, models = self._library.hdl64e, self._library.Model
+        content = hdl64e.status_info_to_calib_dict(hdl64e.read_status_info(packet.payload for packet in self.packets()))
+        laser_ids = [laser["laser_id"] for laser in content["lasers"]]
+        if content["status"]["Calibration Time"] is None or laser_ids != list(range(len(laser_ids))):
+            raise ValueError("calibration not set in the sensor")
+        model = models.HDL64E_S2 if content["status"]["Model"] == "S2" else models.HDL64E_S3
+        return model, self._library.Calibration.from_string(yaml.dump(content))
 
     def sweeps(self) -> Iterator[tuple[float, Callable[[], Sweep]]]:
         config, end = self._model()
