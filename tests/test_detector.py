@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from lidarpose.models.detector import proposals
 from lidarpose.models.detector.detector import SAME, Detector
 from lidarpose.synth.street import street
 from tests.test_proposals import column, nearest, plane
@@ -105,6 +106,36 @@ def test_detector_accepts_scans_without_people(cloud):
     detections = Detector(upright).detect(cloud, ORIGIN)
     assert len(detections) == 0 and detections.centers.shape == (0, 3)
     assert detections.has_ground == (len(cloud) > 3)
+
+
+def test_detector_finds_people_at_map_heights(points):
+    """The level frame of a tilted sensor in map coordinates."""
+    shift = np.array([3e5, -2e5, 2_282_121.0])
+    near, far = (Detector(upright).detect(points + way, ORIGIN + way) for way in (np.zeros(3), shift))
+    np.testing.assert_allclose(far.centers - shift, near.centers, atol=5e-3)
+    people, rows = np.array([[5.0, 0.0]]), np.arange(len(points))
+    near, far = (
+        Detector(upright).detect_beside(points + way, ORIGIN + way, found.ground, rows, people + way[:2])
+        for way, found in ((np.zeros(3), near), (shift, far))
+    )
+    assert len(near)
+    np.testing.assert_allclose(far.centers - shift, near.centers, atol=5e-3)
+
+
+def test_detector_limits_grow_with_the_area_of_a_map(points):
+    tile = np.concatenate([points, plane(reach=40, step=1.0)])
+    tiles = [tile + [500.0 * k, 0, 0] for k in range(3)]
+    for cloud, count in ((tile, 1), (np.concatenate(tiles), 3)):
+        assert len(Detector(upright).detect(cloud, None, limit=1)) == count
+        # with a known sensor the range limits the area
+        assert len(Detector(upright).detect(cloud, ORIGIN, limit=1)) == 1
+
+
+def test_detector_columns_beyond_the_range_do_not_displace_others(points, monkeypatch):
+    monkeypatch.setattr(proposals, "_MOST", 4)
+    crowd = [column(42 + 0.2 * k, 3.0 * k - 20, seed=k, count=900) for k in range(12)]
+    detections = Detector(upright).detect(np.concatenate([points, *crowd]), ORIGIN)
+    assert [nearest(detections.centers, *place) < 0.3 for place in ((5, 0), (5, 0.5), (-8, 3))] == [True] * 3
 
 
 def test_detector_works_without_ground():

@@ -113,6 +113,28 @@ def test_estimate_ground_finds_indoor_floor():
     assert np.abs(ground.at(np.array([[0.8, 0.4], [-2, 1.5], [0, -2]])) + 1.1).max() < 0.12
 
 
+@pytest.mark.parametrize("spread", [0.0, 0.05])
+def test_estimate_ground_ignores_small_patch_far_below(spread):
+    """As mirrored by a shiny floor, or seen through a stairwell."""
+    patch = np.stack(np.meshgrid(np.linspace(2.1, 3.9, 4), np.linspace(2.1, 3.9, 4), [-3.8]), -1).reshape(-1, 3)
+    patch[:, 2] += np.random.default_rng(0).uniform(-spread, spread, len(patch))
+    points = np.concatenate([plane(reach=8, height=-1.1, step=0.2), patch])
+    xy = np.array([[1.0, 1.0], [5.0, 4.0], [-4.0, 2.0]])
+    assert np.abs(estimate_ground(points, ORIGIN).at(xy) + 1.1).max() < 0.05
+    # a floor of the same depth as wide as a room is there
+    lower = plane(reach=3, height=-3.8, step=0.2) + [20, 0, 0]
+    assert np.abs(estimate_ground(np.concatenate([points, lower]), ORIGIN).at(np.array([[20.0, 0.0]])) + 3.8) < 0.05
+
+
+@pytest.mark.parametrize("drop", [0.8, 1.5, 3.0])
+def test_estimate_ground_reaches_to_an_edge(drop):
+    points = plane(reach=20, height=-1.8)
+    points[points[:, 0] > 6, 2] -= drop
+    ground = estimate_ground(points, ORIGIN)
+    np.testing.assert_allclose(ground.at(np.array([[4.5, 0.0], [4.5, 8.0], [0.0, 0.0]])), -1.8, atol=0.05)
+    np.testing.assert_allclose(ground.at(np.array([[9.0, 0.0], [15.0, 5.0]])), -1.8 - drop, atol=0.05)
+
+
 def test_estimate_ground_is_none_without_ground():
     rng = np.random.default_rng(0)
     assert estimate_ground(np.zeros((0, 3)), ORIGIN) is None

@@ -88,7 +88,7 @@ def test_verification_features_and_score_bound(monkeypatch):
             assert (verification.final_score(possible, header) <= highest).all()
 
 
-def fitted(monkeypatch, scores, places, mounted=0.0, sure=0.5, max_people=None, known=None):
+def fitted(monkeypatch, scores, places, mounted=0.0, sure=0.5, known=None):
     """Boxes of standing people at places (x, y), fitted to a grid of points around all of them."""
     network = SimpleNamespace(header=SimpleNamespace(skeleton=HUMAN15))
     monkeypatch.setattr(verification, "bundled_backend", lambda name: network)
@@ -99,7 +99,7 @@ def fitted(monkeypatch, scores, places, mounted=0.0, sure=0.5, max_people=None, 
         scores=np.array(scores), logits=np.array(scores), mounted=np.broadcast_to(mounted, len(scores)), joints=joints,
         pelvises=joints[:, HUMAN15.index("pelvis")], near_rows=[np.arange(len(points))] * len(scores),
     )  # fmt: skip
-    people = verification._fit_boxes(detections, points, sure, max_people, known or {})
+    people = verification._fit_boxes(detections, points, sure, known or {})
     for _, box, rows in people:
         if not known:
             np.testing.assert_array_equal(rows, np.flatnonzero(box.contains(points)))
@@ -110,7 +110,25 @@ def test_fit_boxes_keeps_score_and_mounted_without_duplicates(monkeypatch):
     people = fitted(monkeypatch, [0.6, 0.9, 0.7], [(0, 0), (0, 2), (0.2, 2)], mounted=[0.4, 0.6, 0.1])
     # the third detection duplicates the second
     assert [(row, box.score, box.mounted) for row, box, _ in people] == [(1, 0.9, True), (0, 0.6, False)]
-    assert [row for row, _, _ in fitted(monkeypatch, [0.6, 0.9], [(0, 0), (0, 2)], max_people=1)] == [1]
+
+
+def test_fit_boxes_keeps_person_whose_points_are_in_anothers_box_but_not_on_the_body(monkeypatch):
+    network = SimpleNamespace(header=SimpleNamespace(skeleton=HUMAN15))
+    monkeypatch.setattr(verification, "bundled_backend", lambda name: network)
+    joints = np.array([standing(0.0, np.array([0.0, y, 0.0])).joints for y in (0.0, 0.32)])
+    pelvises = joints[:, HUMAN15.index("pelvis")]
+    axes = np.linspace(-0.05, 0.05, 4), np.linspace(0.33, 0.38, 4), np.linspace(0.05, 0.5, 6)
+    shin = np.stack(np.meshgrid(*axes), -1).reshape(-1, 3)
+    first = joints[0].repeat(5, 0)
+    points = np.concatenate([first, shin])
+    values = {name: np.array([0.9, 0.6]) for name in ("scores", "logits", "mounted")}
+    near_rows = [np.arange(len(points))] * 2
+    places = verification._ScoredDetections(**values, joints=joints, pelvises=pelvises, near_rows=near_rows)
+    people = verification._fit_boxes(places, points, 0.5, {})
+    assert [row for row, _, _ in people] == [0, 1] and people[0][1].contains(shin).all()
+    # on the body
+    points[-len(shin) :] = joints[0, HUMAN15.index("left_shoulder")]
+    assert [row for row, _, _ in verification._fit_boxes(places, points, 0.5, {})] == [0]
 
 
 @pytest.mark.parametrize(("scores", "narrow"), [((0.9, 0.6), (1, 1)), ((0.9, 0.4), (0, 1)), ((0.4, 0.3), (0, 1))])

@@ -33,8 +33,10 @@ _ROOM, _LEAST_ROOM, _HALF_BODY = 0.15, 0.1, 0.25
 _SAME_PERSON, _CLOSE = 0.3, 0.8
 # detections posed per requested person if `max_people` is given: some are duplicates
 _PLACES = 2
-# a detection that shares more than this fraction of its box's points with higher-scoring detections is a duplicate, too
-_SHARED = 0.9
+# a detection is a duplicate, too, if more than this fraction of its box's points is on bodies of higher-scoring ones
+_SHARED = 0.75
+# or more than this fraction is in boxes of known people
+_SHARED_KNOWN = 0.9
 # features of the final score of a detection: the detector's logit, the verifier's log odds of a person, and log of
 # 1 + the number of points in the column
 FEATURES = ("logit", "verifier", "log_points")
@@ -219,8 +221,8 @@ def verified(
         places = _add_people_beside(places, known_boxes, points, origin, header, least_score, max_people, detect_beside)
         thresholds = np.append(thresholds, np.full(len(places.scores) - len(thresholds), least_score))
     places.pelvises[places.scores < thresholds] = np.nan
-    people = _fit_boxes(places, points, header.get("default_score", least_score), max_people, known_boxes)
-    people = _without_repeats(people, places, points, origin)
+    people = _fit_boxes(places, points, header.get("default_score", least_score), known_boxes)
+    people = _without_repeats(people, places, points, origin)[:max_people]
     kept_rows = [row for row, _, _ in people]
     return VerifiedPeople(
         boxes=[replace(box, id=number) for number, (_, box, _) in enumerate(people)],
@@ -301,7 +303,7 @@ def _add_people_beside(
     """Appends detections beside confident people, made in the points that remain without the points on these
     people."""
     sure_pelvises = np.where(places.scores[:, None] >= _SURE_SCORE, places.pelvises, np.nan)
-    people = _fit_boxes(replace(places, pelvises=sure_pelvises), points, _SURE_SCORE, None, known_boxes)
+    people = _fit_boxes(replace(places, pelvises=sure_pelvises), points, _SURE_SCORE, known_boxes)
     posed_rows = [row for row, _, _ in people if row not in known_boxes]
     if not posed_rows:
         return places
@@ -319,17 +321,19 @@ def _on_people(
     """(n,) bool: whether a point is on the body of one of the people from `_fit_boxes`, or in the box of a known
     one."""
     is_body = np.zeros(len(points), bool)
-    starts, ends = np.array(bundled_backend(DEFAULT).header.skeleton.bones).T
     for row, _, own_rows in people:
-        if row not in known_boxes:
-            own_rows, joints = places.near_rows[row], places.joints[row]
-            near_points, low, high = points[own_rows], joints.min(0) - _BODY, joints.max(0) + _BODY
-            # a cheap test first: it leaves far fewer points
-            own_rows = own_rows[((near_points > low) & (near_points < high)).all(1)]
-            distance = distance_to_segments(points[own_rows], joints[starts], joints[ends])
-            own_rows = own_rows[distance < _BODY]
-        is_body[own_rows] = True
+        is_known = row in known_boxes
+        is_body[own_rows if is_known else _body_rows(places.near_rows[row], points, places.joints[row])] = True
     return is_body
+
+
+def _body_rows(rows: np.ndarray, points: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    """Those of the given rows of points (n, 3) m that are near the bones of joints (J, 3) m."""
+    starts, ends = np.array(bundled_backend(DEFAULT).header.skeleton.bones).T
+    near_points, low, high = points[rows], joints.min(0) - _BODY, joints.max(0) + _BODY
+    # a cheap test first: it leaves far fewer points
+    rows = rows[((near_points > low) & (near_points < high)).all(1)]
+    return rows[distance_to_segments(points[rows], joints[starts], joints[ends]) < _BODY]
 
 
 def _without_repeats(
@@ -358,7 +362,6 @@ def _fit_boxes(
     places: _ScoredDetections,
     points: np.ndarray,
     neighbor_score: float,
-    max_people: int | None,
     known_boxes: dict[int, Box],
 ) -> list[_FittedBox]:
     """Fits boxes to the distinct people among detections with a pelvis, highest score first.
@@ -369,7 +372,8 @@ def _fit_boxes(
     scores, pelvises = places.scores, places.pelvises
     skeleton = bundled_backend(DEFAULT).header.skeleton
     person_rows = surest_rows(scores, pelvises, places.logits)
-    is_owned = np.zeros(len(points), bool)
+    # points on the bodies of people, and in the boxes of known people, whose joints are not estimated again
+    is_body, is_known = np.zeros((2, len(points)), bool)
     people: list[_FittedBox] = []
     for i in person_rows:
         if i in known_boxes:
@@ -382,9 +386,15 @@ def _fit_boxes(
             box = crop_box = box_about(pose, min(distances, default=np.inf))
             is_mounted = bool(places.mounted[i] > 0.5)
         own_rows = places.near_rows[i][crop_box.contains(points[places.near_rows[i]])]
-        if len(own_rows) < MIN_POINTS or is_owned[own_rows].mean() > _SHARED or len(people) == max_people:
+        if len(own_rows) < MIN_POINTS:
             continue
-        is_owned[own_rows] = True
+        if is_body[own_rows].mean() > _SHARED or is_known[own_rows].mean() > _SHARED_KNOWN:
+            continue
+        if i in known_boxes:
+            is_known[own_rows] = True
+        else:
+            # points in the box, but not on the body, may be those of a second person in contact with this one
+            is_body[_body_rows(own_rows, points, places.joints[i])] = True
         people.append((i, replace(box, score=float(scores[i]), mounted=is_mounted), own_rows))
     return people
 

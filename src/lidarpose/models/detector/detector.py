@@ -32,6 +32,11 @@ SAME = 0.15
 _BESIDE, _COLUMN = (0.3, 0.85), 1.0
 # points used for a candidate: radius, m; half width of its view, m, plus a margin, rad; number of direction bins
 _CONTEXT, _VIEW, _VIEW_MARGIN, _BINS = 8.0, 2.0, 0.1, 512
+# if the sensor is unknown, limits apply to each area of this size, m2, counted in squares of this side, m, with points;
+# number of points that are enough to count them
+_AREA, _SQUARE, _ENOUGH = 6400.0, 10.0, 200_000
+# heights of this magnitude, m, are shifted to 0, since float32 resolves them badly
+_HIGH = 1000.0
 # boxes: side, side for a person who is mounted, margin added to the height, m; and bounds of the network's outputs, m
 _SIDE, _MOUNTED_SIDE, _ROOM = 0.9, 1.1, 0.1
 _MOST_SHIFT, _MOST_FOOT, _HEIGHTS = 0.6, 1.0, (0.5, 2.3)
@@ -98,14 +103,15 @@ class Detector:
             points: (n, 3) m, level frame: z up.
             origin: (3,) m, sensor position; None if unknown: then the range is not limited.
             max_range: horizontal distance from the sensor up to which people are detected, m; None for no limit.
-            limit: maximum number of detections.
+            limit: maximum number of detections; if the sensor is unknown, for each 6,400 m2 with points.
             moving: (n,) bool, if a background is known: points that do not belong to it. Candidates are proposed from
                 these points alone, but rendered with all points around them.
 
         Returns:
             All candidates after suppression, without a score threshold.
         """
-        columns = list(np.asarray(points).T)
+        points, origin, base = _near_zero(points, origin)
+        columns = list(points.T)
         if origin is not None and max_range is not None:
             square_distance = (columns[0] - origin[0]) ** 2 + (columns[1] - origin[1]) ** 2
             rows = np.flatnonzero(square_distance < (max_range + BEYOND) ** 2)
@@ -119,12 +125,18 @@ class Detector:
         has_ground = ground is not None
         ground = ground or without_ground(points, origin)
         heights = heights_above(points, ground)
-        selection = slice(None) if moving is None else np.asarray(moving, bool)[rows]
-        centers = propose(points[selection], ground, heights=heights[selection])
+        is_searched = np.ones(len(rows), bool) if moving is None else np.asarray(moving, bool)[rows]
+        if origin is not None and max_range is not None:
+            # columns beyond the range must not take the places of others
+            square_distance = (points[:, 0] - origin[0]) ** 2 + (points[:, 1] - origin[1]) ** 2
+            is_searched &= square_distance < (max_range + _COLUMN) ** 2
+        areas = 1.0 if origin is not None else max(1.0, _covered_area(points) / _AREA)
+        searched_points = np.ascontiguousarray(points.T[:, is_searched]).T
+        centers = propose(searched_points, ground, heights=heights[is_searched], areas=areas)
         if origin is not None and max_range is not None:
             centers = centers[np.hypot(centers[:, 0] - origin[0], centers[:, 1] - origin[1]) < max_range]
         scene = SceneIndex(points, ground, origin, heights=heights)
-        return self._detections(scene, centers, has_ground, limit)
+        return self._detections(scene, centers, has_ground, base, None if limit is None else round(limit * areas))
 
     def detect_beside(
         self,
@@ -144,6 +156,7 @@ class Detector:
             rows: (m,) of the points that do not belong to these people.
             people: (K, 2) m, positions of the people.
         """
+        points, origin, base = _near_zero(points, origin)
         selected_rows = rows if moving is None else rows[moving[rows]]
         near_rows = rows_near(people, points[selected_rows], _BESIDE[1] + _COLUMN)
         near_points = points[selected_rows[np.unique(np.concatenate([np.zeros(0, int), *near_rows]))]]
@@ -152,9 +165,11 @@ class Detector:
         places = places[(distance > _BESIDE[0]) & (distance < _BESIDE[1])]
         # each axis contiguous in memory, as above
         points = np.ascontiguousarray(points[rows[rows_that_matter(points[rows], origin, places)]].T).T
-        return self._detections(SceneIndex(points, ground, origin), places, True, None)
+        return self._detections(SceneIndex(points, ground, origin), places, True, base, None)
 
-    def _detections(self, scene: SceneIndex, places: np.ndarray, has_ground: bool, limit: int | None) -> Detections:
+    def _detections(
+        self, scene: SceneIndex, places: np.ndarray, has_ground: bool, base: float, limit: int | None
+    ) -> Detections:
         outputs = np.zeros((len(places), 6))
         shares = [slice(k, None, self._threads) for k in range(min(self._threads, len(places)))]
         results = map_in_threads(lambda share: self._outputs(scene, places[share]), shares, self._threads)
@@ -166,7 +181,7 @@ class Detector:
         mounted = sigmoid(outputs[indices, 5])
         side = np.where(mounted > 0.5, _MOUNTED_SIDE, _SIDE)
         return Detections(
-            centers=centers[indices],
+            centers=centers[indices] + [0.0, 0.0, base],
             sizes=np.stack([side, side, heights[indices] + _ROOM], 1),
             logit=logit[indices],
             score=self.probability(logit[indices]),
@@ -188,6 +203,24 @@ class Detector:
             return sigmoid(logit)
         logits, probabilities = self.header["calibration"]
         return np.interp(logit, logits, probabilities)
+
+
+def _near_zero(points: np.ndarray, origin: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None, float]:
+    """points (n, 3) and origin (3,) m with heights that float32 resolves, and the whole meters subtracted: in the level
+    frame of a tilted sensor, map coordinates become heights."""
+    points = np.asarray(points)
+    base = float(np.round(np.median(points[:, 2]))) if len(points) else 0.0
+    if abs(base) < _HIGH:
+        return points, origin, 0.0
+    shift = np.array([0.0, 0.0, base])
+    return (points.T - shift[:, None]).T, None if origin is None else origin - shift, base
+
+
+def _covered_area(points: np.ndarray) -> float:
+    """The area, m2, of the squares of 10 m with points (n, 3) m."""
+    squares = np.floor(points[:: 1 + len(points) // _ENOUGH, :2] / _SQUARE).astype(np.int64)
+    width = 1 + np.ptp(squares[:, 1]) if len(squares) else 1
+    return _SQUARE**2 * len(np.unique(squares @ [width, 1]))
 
 
 def rows_that_matter(points: np.ndarray, origin: np.ndarray | None, places: np.ndarray) -> np.ndarray:

@@ -26,6 +26,12 @@ _OWN_SLOPE, _OWN_REACH = 0.04, 4.0
 _SUPPORT, _SUPPORT_ROOM, _SUPPORT_SLOPE = 3, 0.1, 0.15
 # or if it is nearer than this to the shared plane, m
 _NEAR_PLANE = 0.25
+# cells more than this below the plane, m, are not ground if at most this many of them are within the cone's reach
+_DEEP, _PATCH = 0.5, 9
+# a cell is level if at least this many of the cells up to some cells away in each axis are at its height, m
+_MANY_LEVEL, _LEVEL_REACH, _LEVEL = 12, 3, 0.2
+# least share of the cells far below the plane that are level if they are a lower ground
+_LEVEL_SHARE = 0.1
 # slopes of the plane: the maximum, and the width of the bins for finding the most common one
 _STEEPEST, _SLOPE_BIN = 0.9, 0.06
 # distance at which a cell has half its weight for the plane, m; minimum depth of its cells below the sensor, m, which
@@ -110,13 +116,22 @@ def estimate_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Gro
         x, y = floors.positions()
         floors = replace(floors, heights=floors.heights - (slope[0] * x + slope[1] * y))
     residual = floors.heights - height
-    is_floor = _is_supported(residual) | (np.abs(residual) < _NEAR_PLANE)
+    is_near_plane = np.abs(residual) < _NEAR_PLANE
+    is_floor = _is_supported(residual) | is_near_plane
+    # a small patch far below, as a mirrored floor or a stairwell, is not the ground
+    is_deep = is_floor & (residual < -_DEEP)
+    is_floor &= ~is_deep | (_box_sum(is_deep.astype(float), _CONE_REACH) > _PATCH)
+    # a wide level area beside a drop is above the cone of what lies below, but it is the ground, unless hardly any of
+    # that is level, as in a scan that is upside down
+    is_level = _level_count(residual) >= _MANY_LEVEL
+    is_terrace = is_floor & is_near_plane & is_level & (is_level[is_deep].sum() > _LEVEL_SHARE * is_deep.sum())
     x, y = floors.positions()
     is_floor &= _is_low(np.where(is_floor, residual, np.nan), _CONE_SLOPE)
     if origin is not None:
         # the vehicle that carries the sensor hides the ground around it: the steeper cone would accept hood and roof
         is_near = np.hypot(x - origin[0], y - origin[1]) < _OWN_REACH
         is_floor &= ~is_near | _is_low(np.where(is_floor, residual, np.nan), _OWN_SLOPE)
+    is_floor |= is_terrace
     # cells below the sensor, both heights without the slope; if the sensor is unknown, cells that are not tall
     is_low = residual < _TALL if origin is None else floors.heights < origin[2] - origin[:2] @ slope
     is_seen = np.isfinite(residual) & is_low
@@ -308,6 +323,16 @@ def _is_supported(heights: np.ndarray) -> np.ndarray:
                 neighbor = padded[2 + i : 2 + i + rows, 2 + j : 2 + j + columns]
                 support += np.abs(neighbor - heights) < _SUPPORT_ROOM + _SUPPORT_SLOPE * CELL * np.hypot(i, j)
     return support >= _SUPPORT
+
+
+def _level_count(heights: np.ndarray) -> np.ndarray:
+    """(X, Y): how many of the 7 x 7 cells about each cell are at its height."""
+    padded = np.pad(heights, _LEVEL_REACH, constant_values=np.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (2 * _LEVEL_REACH + 1,) * 2)
+    count = np.zeros(heights.shape, np.int64)
+    for i, j in np.ndindex(windows.shape[2:]):
+        count += np.abs(windows[..., i, j] - heights) < _LEVEL
+    return count
 
 
 def _is_low(heights: np.ndarray, slope: float) -> np.ndarray:

@@ -53,18 +53,19 @@ _PIECE = 16_384
 _kept = threading.local()
 
 
-def propose(points: np.ndarray, ground: Ground, *, heights: np.ndarray | None = None) -> np.ndarray:
-    """Centers (K, 3) m of columns that may be people, at most `_MOST`, likeliest first: x, y, and z of the ground.
+def propose(points: np.ndarray, ground: Ground, *, heights: np.ndarray | None = None, areas: float = 1.0) -> np.ndarray:
+    """Centers (K, 3) m of columns that may be people, likeliest first: x, y, and z of the ground.
 
     Args:
         points: (n, 3) m, z up.
         ground: under the points.
         heights: (n,) m of the points above the ground, if already computed.
+        areas: how many scans the points may extend over: of each, at most `_MOST` columns are returned.
     """
     xy, features = columns(points, heights_above(points, ground) if heights is None else heights)
     logit = _likeness(features)
     order = np.argsort(-logit, kind="stable")
-    xy = xy[order[logit[order] > _LEAST_LOGIT][:_MOST]]
+    xy = xy[order[logit[order] > _LEAST_LOGIT][: round(_MOST * areas)]]
     return np.concatenate([xy, ground.at(xy)[:, None]], 1)
 
 
