@@ -417,6 +417,25 @@ def test_load_motion_reports_bad_sloper4d(tmp_path, change, message):
 # clips of positions, folders, and files without motion
 
 
+@pytest.mark.parametrize("size", [0.8, 1.2])
+def test_load_motion_strides_are_those_of_the_mean_adult(tmp_path, size):
+    """Clips of a small or tall person who goes the same way in proportion: the body's feet do not slide."""
+    rotations, way = files.a_clip(8)
+    common = {"clip": ["a", "b"], "clip_start": [0, 5], "clip_length": [5, 3], "fps": 10.0}
+    motions = []
+    for scale in (1.0, size):
+        joints = files.joints_of(rotations, way) * scale
+        np.savez(tmp_path / "clips.npz", joints=joints, **common)
+        motions.append(load_motion(tmp_path / "clips.npz"))
+    same, other = motions
+    np.testing.assert_allclose(other.rotations, same.rotations, atol=1e-3)
+    for rows in (slice(0, 5), slice(5, 8)):
+        path, other_path = (motion.translation[rows, :2] for motion in (same, other))
+        np.testing.assert_allclose(other_path - other_path[0], path - path[0], atol=2e-3)
+        # the place remains
+        np.testing.assert_allclose(other_path.mean(0), path.mean(0) * size, atol=0.02)
+
+
 def test_load_motion_retargets_clips_of_positions(tmp_path):
     rotations, way = files.a_clip(40)
     joints, path = files.joints_of(rotations, way), tmp_path / "clips.npz"

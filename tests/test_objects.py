@@ -122,6 +122,10 @@ def test_synthetic_source_has_share_of_objects():
         assert np.isnan(example.joints).all() and (example.part == -1).all() and example.person[1] == 0
         assert example.joints.shape == (len(BODY26), 3)
     assert all(example.person[0] == 1 for example in examples if not np.isnan(example.joints).any())
+    # disturbed as people are
+    clean, noisy = (SyntheticSource(scene="wild", seed=3, objects=0.99, noise=noise).example(0) for noise in (0.0, 1.0))
+    assert clean.person[0] == noisy.person[0] == 0 and len(clean.points) == len(noisy.points)
+    assert not np.array_equal(clean.points, noisy.points)
     # without objects the number of people is unknown
     plain = SyntheticSource(scene="wild", seed=3)
     assert np.isnan(plain.example(0).person).all()

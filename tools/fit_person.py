@@ -5,8 +5,8 @@ scans, including false positives. The rest of the network is not changed.
     python tools/fit_person.py fit CROPS.npz RUN/model.safetensors OUT.safetensors
 
 `crops` creates the training data: crops of the detections in synthesized scans (family "train"), prepared as in
-`lidarpose.detect`, and equal numbers of people and objects of the scene "wide", as in pre-training. `fit` trains the
-head further on the network's features of these crops. Later weights of a network are fitted to the same crops. Needs
+`lidarpose.detect`, and equal numbers of people and objects of the scene "wide", undisturbed. `fit` trains the head
+further on the network's features of these crops. Later weights of a network are fitted to the same crops. Needs
 lidarpose[train].
 """
 

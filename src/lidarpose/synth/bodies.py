@@ -327,8 +327,8 @@ def _moving_body(
 
 
 def _stride_ratio(rest_bodies: RestBody, kinds: Sequence[str]) -> np.ndarray:
-    """(n, 1) float32: factor for each person's translation. All motion has the translation of a mean adult; it is
-    scaled with the length of the legs, or feet would slide. 1 for cyclists."""
+    """(n, 1) float32: factor for each person's translation. Motion has the strides of a mean adult (that of SMPL files
+    the recorded person's); they are scaled with the length of the legs, or feet would slide. 1 for cyclists."""
     mean_length = _leg_length(mean_adult_joints()[None])
     is_cycling = np.array([kind == "cycle" for kind in kinds])
     return np.where(is_cycling, 1.0, _leg_length(rest_bodies.joints) / mean_length)[:, None].astype(np.float32)

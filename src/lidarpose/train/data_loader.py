@@ -113,6 +113,8 @@ class SyntheticSource:
             # crops of several scans are as frequent as among people, where their frequency depends on the difficulty
             difficulty = self._difficulty(index, rng) if scene.varied else None
             object_sample, _ = draw_object(scene, self.seed, index, hard=difficulty)
+            # disturbed as people are: otherwise every blurred crop would show a person
+            object_sample = add_disturbances(object_sample, strays=self.strays, noise=self.noise, rng=rng)
             return object_example(object_sample, rng, refined=self.refined)
         difficulty = self._difficulty(index, rng)
         sample = self._generator.person(self.seed, index, hard=difficulty).sample

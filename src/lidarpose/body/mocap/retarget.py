@@ -92,12 +92,29 @@ def motion_from_joints(
     rotations = retarget_positions(joints)
     body = mean_adult_joints()[None].astype(np.float32), rotations, np.zeros((len(joints), 3), np.float32)
     origin_joints = forward_kinematics(SMPL24.parents, *body)[1]
+    translation = _hips_of_mean_adult(joints, clips["length"]) - origin_joints[:, _HIPS].mean(1)
     return Motion(
         rotations=rotations,
-        translation=(joints[:, _HIPS].mean(1) - origin_joints[:, _HIPS].mean(1)).astype(np.float32),
+        translation=translation.astype(np.float32),
         source=f"{kind}: {path}",
         **clips,
     )
+
+
+def _hips_of_mean_adult(joints: np.ndarray, length: Sequence[int]) -> np.ndarray:
+    """The middle of the hips (F, 3) m of joints (F, 24, 3) m; each clip's path is scaled about its middle by the mean
+    adult's leg length over the recorded person's: with the same rotations and other legs, feet would slide."""
+    mean_length = _leg_length(mean_adult_joints()[None])
+    hips = joints[:, _HIPS].mean(1)
+    for end, count in zip(np.cumsum(length), length, strict=True):
+        path = hips[end - count : end, :2]
+        path[:] = path.mean(0) + (path - path.mean(0)) * (mean_length / _leg_length(joints[end - count : end]))
+    return hips
+
+
+def _leg_length(joints: np.ndarray) -> float:
+    """Median length of both legs, m."""
+    return (_median_length(joints, "left_") + _median_length(joints, "right_")) / 2
 
 
 def meters_per_unit(path: object, joints: np.ndarray, unit_m: float | None = None) -> float:
