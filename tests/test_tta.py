@@ -13,7 +13,7 @@ from lidarpose.errors import InputError
 from lidarpose.inference.backend import Raw
 from lidarpose.inference.estimator import PoseEstimator
 from lidarpose.inference.tta import IDENTITY, TRANSFORMS, TTATransform, apply, average, invert, tta_transforms
-from lidarpose.sample import Pose
+from lidarpose.sample import Pose, center_of
 from lidarpose.skeleton import HUMAN15
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
@@ -133,7 +133,7 @@ def test_more_passes_reduce_error_and_are_recorded():
 
 
 def test_box_center_selects_one_of_two_people():
-    """The box matters only if the network sees two people; the pose of a single person is the same in any box."""
+    """The box matters if the network sees two people; an equally confident pose about it does not replace another."""
     rng = np.random.default_rng(0)
     clouds = [rng.normal((5, 0, 0), (0.2, 0.2, 0.5), (300, 3)), rng.normal((9, 0, 0), (0.2, 0.2, 0.5), (200, 3))]
     boxes = np.array([[5.3, 0.3, 0.0], [9.2, 0.1, 0.1]])
@@ -144,6 +144,68 @@ def test_box_center_selects_one_of_two_people():
     np.testing.assert_allclose(asked[0].joints, np.broadcast_to([5.3, 0.3, 0.0], (15, 3)), atol=0.011)
     np.testing.assert_array_equal(asked[1].joints, plain[1].joints)
     assert np.linalg.norm(plain[0].joints[0] - boxes[0]) > 0.2
+
+
+@pytest.mark.parametrize(
+    ("sure", "beside", "expected"),
+    [(0.9, 0.0, 1.0), (0.5, 0.0, 0.0), (0.5, 0.9, 1.0), (0.2, 0.9, 0.0)],
+    ids=["surer", "less sure", "less sure beside another", "far less sure beside another"],
+)
+def test_box_center_far_from_the_pose_selects_another_person(sure, beside, expected):
+    """One person stands at the middle of the points, x = 5, the other at x = 6, where the box is."""
+    cloud = np.random.default_rng(0).normal((5, 0, 0), (0.2, 0.2, 0.5), (300, 3))
+    middle = center_of(cloud)[0]
+
+    def pose_at(x):
+        # about the middle of the points, the network sees only the person there, with a confidence of 0.6
+        is_first = abs(x - middle) < 0.3
+        return (middle if is_first else middle + 1), 0.6 if is_first else sure, 0.0 if is_first else beside
+
+    estimator = PoseEstimator(PoseAt(pose_at, cloud.mean(0)[0]))
+    (pose,) = estimator.poses([cloud], np.zeros(3), box_centers=np.array([[middle + 1.1, 0, 0]]))
+    np.testing.assert_allclose(pose.joints[:, 0], middle + expected, atol=0.011)
+    # a box at the pose, and no box
+    for box_centers in (np.array([[middle + 0.1, 0, 0]]), None):
+        (pose,) = estimator.poses([cloud], np.zeros(3), box_centers=box_centers)
+        np.testing.assert_allclose(pose.joints[:, 0], middle, atol=0.011)
+
+
+@pytest.mark.parametrize(("confidence", "passes"), [(0.9, 2), (0.6, 3)])
+def test_uncertain_pose_is_averaged_with_one_about_the_box_center(confidence, passes):
+    cloud = np.random.default_rng(0).normal((5, 0, 0), (0.2, 0.2, 0.5), (300, 3))
+    middle, count = center_of(cloud)[0], iter(range(9))
+    # each pass is off by another error
+    errors = [0.0, 0.09, 0.03] if passes == 3 else [0.0, 0.03]
+    backend = PoseAt(lambda x: (middle + errors[next(count)], confidence, 0.0), cloud.mean(0)[0])
+    (pose,) = PoseEstimator(backend).poses([cloud], np.zeros(3), box_centers=np.array([[middle + 0.05, 0, 0]]))
+    np.testing.assert_allclose(pose.joints[:, 0], middle + np.mean(errors), atol=1e-4)
+    assert next(count) == passes
+
+
+class PoseAt:
+    """Fake backend. pose_at: x m of the crop's center -> x m of the joints, their confidence, and that of a second
+    person; mean_x m: of the cloud."""
+
+    name, batch = "fake", 64
+    header = SimpleNamespace(skeleton=HUMAN15, network="pose")
+
+    def __init__(self, pose_at, mean_x):
+        self.pose_at, self.mean_x = pose_at, mean_x
+
+    def run(self, clouds, view):
+        joints, confidence, person = np.zeros((len(clouds), 15, 3)), np.zeros((len(clouds), 15)), []
+        for k, cloud in enumerate(clouds):
+            center = self.mean_x - cloud[:, 0].mean()
+            x, sure, second = self.pose_at(center)
+            joints[k, :, 0], confidence[k] = x - center, logit(sure)
+            person.append([9.0, logit(second)])
+        raw = Raw.from_joints(joints)
+        each = np.zeros(confidence.shape)
+        return replace(raw, confidence=confidence, log_spread=each, visible=each, person=np.array(person))
+
+
+def logit(probability):
+    return np.log((probability + 1e-9) / (1 - probability + 1e-9))
 
 
 class TwoPeople:

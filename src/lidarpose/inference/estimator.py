@@ -23,8 +23,13 @@ from lidarpose.sample import MIN_POINTS, PER_JOINT, PER_PERSON, Pose, center_of,
 # must not move a point to another voxel
 _CENTER_DECIMALS = 2
 _CENTER_STEP = 10**-_CENTER_DECIMALS
-# `second_person` above which a cloud is centered on its box
+# `second_person` above which a cloud shows two people
 _TWO_PEOPLE = 0.2
+# pelvises farther apart than this, m, are of different people; the same for the pelvis and the center of the box
+_SAME_PERSON = 0.2
+# mean confidence above which a pose is not repeated about the box center, and the fraction of another pose's confidence
+# that is enough for a pose beside a second person
+_SURE, _LESS_SURE = 0.7, 0.5
 
 
 class PoseEstimator:
@@ -94,7 +99,7 @@ class PoseEstimator:
             origin: (3,) m, the sensor position, None if unknown.
             clips: for networks that read clips: which clouds are frames of the same person.
             centers: (N, 3) m, approximate pelvis positions; with them, the first pass is skipped.
-            box_centers: (N, 3) m; if a cloud shows two people, the one nearer to the box center is posed.
+            box_centers: (N, 3) m; they tell which person is meant where a cloud shows two or the pose is uncertain.
             progress: whether to show a progress bar.
 
         Returns:
@@ -134,18 +139,19 @@ class PoseEstimator:
         centers: np.ndarray | None,
         box_centers: np.ndarray | None,
     ) -> list[Pose | None]:
-        first_pass = None
+        first_passes: list[Pose] = []
         if centers is None:
             centers = np.stack([center_of(points) for points in clouds])
-            first_pass = self._transformed(self._first, clouds, centers, origin, clip)
-            if box_centers is not None and first_pass.second_person is not None:
-                centers, first_pass = self._recenter_on_boxes(clouds, centers, box_centers, origin, first_pass)
-            root = first_pass.joints[:, self._middle].mean(1)
+            first_passes = [self._transformed(self._first, clouds, centers, origin, clip)]
+            if box_centers is not None and self._averaged and first_passes[0].confidence is not None:
+                centers, first_passes = self._passes_about_boxes(clouds, centers, box_centers, origin, first_passes[0])
+            root = first_passes[0].joints[:, self._middle].mean(1)
             # NaN stays NaN
             shift = np.round(np.clip(root, -WINDOW / 2, WINDOW / 2) / _CENTER_STEP) * _CENTER_STEP
-            centers, first_pass = centers + shift, replace(first_pass, joints=first_pass.joints - shift[:, None])
+            centers = centers + shift
+            first_passes = [replace(pose, joints=pose.joints - shift[:, None]) for pose in first_passes]
         tta_poses = [self._transformed(transform, clouds, centers, origin, clip) for transform in self._tta]
-        mean_pose = average([*tta_poses, first_pass] if first_pass is not None and self._averaged else tta_poses)
+        mean_pose = average([*tta_poses, *first_passes] if self._averaged else tta_poses)
         poses: list[Pose | None] = []
         for k, points in enumerate(clouds):
             near_count = (np.abs(points - centers[k]) < WINDOW).all(1).sum()
@@ -156,25 +162,53 @@ class PoseEstimator:
             poses.append(replace(mean_pose, joints=mean_pose.joints[k] + centers[k], **values))
         return poses
 
-    def _recenter_on_boxes(
+    def _passes_about_boxes(
         self,
         clouds: list[np.ndarray],
         centers: np.ndarray,
         box_centers: np.ndarray,
         origin: np.ndarray | None,
         first_pass: Pose,
-    ) -> tuple[np.ndarray, Pose]:
-        """Repeats the first pass around the box centers for clouds that show two people, so that the person nearer to
-        the box center is posed. Returns the centers and poses of all B clouds."""
-        assert first_pass.second_person is not None
-        rows = np.flatnonzero(first_pass.second_person > _TWO_PEOPLE)
+    ) -> tuple[np.ndarray, list[Pose]]:
+        """Repeats the first pass about the box centers where it may have posed another person than the box is about:
+        where it saw two people, is uncertain, or found the pelvis far from the box center.
+
+        Returns:
+            The centers (B, 3), and the poses about them: the first passes, in which the repeated pass replaces one that
+            posed another person, and the repeated passes that agree, with confidence 0 where there is none.
+        """
+        confidence, pelvis = _mean_confidence(first_pass), centers + first_pass.joints[:, self._middle].mean(1)
+        shows_two = _shows_two(first_pass)
+        distance = np.hypot(*(pelvis - box_centers)[:, :2].T)
+        rows = np.flatnonzero(shows_two | (distance > _SAME_PERSON) | (confidence < _SURE))
         if not len(rows):
-            return centers, first_pass
+            return centers, [first_pass]
+        new_centers = np.round(box_centers[rows], _CENTER_DECIMALS)
+        repeated = self._transformed(self._first, [clouds[row] for row in rows], new_centers, origin, None)
+        new_confidence, new_pelvis = _mean_confidence(repeated), new_centers + repeated.joints[:, self._middle].mean(1)
+        is_apart = np.linalg.norm(new_pelvis - pelvis[rows], axis=1) > _SAME_PERSON
+        # beside another person a correct pose may be less certain than that of the other
+        required = np.where(_shows_two(repeated), _LESS_SURE, 1.0) * confidence[rows]
+        is_other = shows_two[rows] | (is_apart & (new_confidence > required))
         centers = centers.copy()
-        centers[rows] = np.round(box_centers[rows], _CENTER_DECIMALS)
-        second_pass = self._transformed(self._first, [clouds[row] for row in rows], centers[rows], origin, None)
-        changes: dict[str, Any] = {}
+        centers[rows[is_other]] = new_centers[is_other]
+        repeated = replace(repeated, joints=repeated.joints + (new_centers - centers[rows])[:, None])
+        first_values, repeated_values = {}, {}
         for name, value in known_values(first_pass, "joints", *PER_JOINT, *PER_PERSON).items():
-            changes[name] = value.copy()
-            changes[name][rows] = getattr(second_pass, name)
-        return centers, replace(first_pass, **changes)
+            first_values[name], repeated_values[name] = value.copy(), value.copy()
+            first_values[name][rows[is_other]] = getattr(repeated, name)[is_other]
+            repeated_values[name][rows] = getattr(repeated, name)
+        is_unused = np.ones(len(clouds), bool)
+        is_unused[rows] = is_other | is_apart
+        repeated_values["confidence"][is_unused] = 0.0
+        return centers, [replace(first_pass, **values) for values in (first_values, repeated_values)]
+
+
+def _mean_confidence(pose: Pose) -> np.ndarray:
+    assert pose.confidence is not None
+    return pose.confidence.mean(1)
+
+
+def _shows_two(pose: Pose) -> np.ndarray:
+    """(B,) bool: whether clouds show two people; False if the network does not predict it."""
+    return np.zeros(len(pose.joints), bool) if pose.second_person is None else pose.second_person > _TWO_PEOPLE

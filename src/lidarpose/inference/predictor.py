@@ -330,8 +330,8 @@ class Predictor(PoseEstimator):
             clips: as in `predict`, already checked.
             pelvises: (N, 3) m, approximate pelvis positions of clouds that each show a single person. The first pass,
                 which finds the pelvis, is then skipped.
-            box_centers: (N, 3) m, centers of the boxes that cropped the clouds. If a cloud shows two people, the one
-                nearer to the box center is posed.
+            box_centers: (N, 3) m, centers of the boxes that cropped the clouds. They tell which person is meant where a
+                cloud shows two people or the pose is uncertain.
             is_scored: whether the boxes have scores, which rest on more than the points inside the box. Warnings that
                 a cloud may not show a person are then suppressed.
             check_upside_down: whether to pose clouds with uncertain poses upside down as well, in order to warn of a
