@@ -1,8 +1,8 @@
 """Runs a network on a dataset under one of two protocols, whose scores are not comparable. A protocol defines how a
 person is cropped and centered before the network sees the points.
 
-clean   what a user has: the crop is a detector's box (the labeled box, displaced, see `jittered`), the center is
-        computed from the points alone, and no sequence is in both training and test
+clean   what a user has: the crop is a detector's box (the labeled box, displaced, see `jittered`), centers are
+        computed from the points and that box, and no sequence is in both training and test
 dapt    what the paper's released code does: crop and center from the labels, a single pass, its splits
 """
 

@@ -198,8 +198,8 @@ _WITHOUT_PA = ("waymo", "humanm3")
 _BLOCKS = {
     "dapt": "Evaluated here, protocol dapt: crop and center from labels, as the released code. Nearest to the block "
     "above; the notes list the differences",
-    "clean": "Evaluated here, protocol clean: a detector's box and a center from the points alone. Not comparable with "
-    "the blocks above",
+    "clean": "Evaluated here, protocol clean: a detector's box, and centers from the points and that box. Not "
+    "comparable with the blocks above",
 }
 _OTHERS = "Evaluated here on sets that the paper does not have"
 
