@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lidarpose.models.detector import proposals
+from lidarpose.models.detector import detector, proposals
 from lidarpose.models.detector.detector import SAME, Detector
 from lidarpose.synth.street import street
 from tests.test_proposals import column, nearest, plane
@@ -122,13 +122,17 @@ def test_detector_finds_people_at_map_heights(points):
     np.testing.assert_allclose(far.centers - shift, near.centers, atol=5e-3)
 
 
-def test_detector_limits_grow_with_the_area_of_a_map(points):
+def test_detector_limits_grow_with_the_area_of_a_map(points, monkeypatch):
+    monkeypatch.setattr(detector, "_SCAN", 30_000)
     tile = np.concatenate([points, plane(reach=40, step=1.0)])
     tiles = [tile + [500.0 * k, 0, 0] for k in range(3)]
     for cloud, count in ((tile, 1), (np.concatenate(tiles), 3)):
         assert len(Detector(upright).detect(cloud, None, limit=1)) == count
         # with a known sensor the range limits the area
         assert len(Detector(upright).detect(cloud, ORIGIN, limit=1)) == 1
+    # a thin map has few points on each person
+    monkeypatch.setattr(detector, "_SCAN", 60_000)
+    assert len(Detector(upright).detect(np.concatenate(tiles), None, limit=1)) == 2
 
 
 def test_detector_columns_beyond_the_range_do_not_displace_others(points, monkeypatch):

@@ -33,8 +33,8 @@ _BESIDE, _COLUMN = (0.3, 0.85), 1.0
 # points used for a candidate: radius, m; half width of its view, m, plus a margin, rad; number of direction bins
 _CONTEXT, _VIEW, _VIEW_MARGIN, _BINS = 8.0, 2.0, 0.1, 512
 # if the sensor is unknown, limits apply to each area of this size, m2, counted in squares of this side, m, with points;
-# number of points that are enough to count them
-_AREA, _SQUARE, _ENOUGH = 6400.0, 10.0, 200_000
+# number of points that are enough to count them; least points of an area
+_AREA, _SQUARE, _ENOUGH, _SCAN = 6400.0, 10.0, 200_000, 100_000
 # heights of this magnitude, m, are shifted to 0, since float32 resolves them badly
 _HIGH = 1000.0
 # boxes: side, side for a person who is mounted, margin added to the height, m; and bounds of the network's outputs, m
@@ -103,7 +103,7 @@ class Detector:
             points: (n, 3) m, level frame: z up.
             origin: (3,) m, sensor position; None if unknown: then the range is not limited.
             max_range: horizontal distance from the sensor up to which people are detected, m; None for no limit.
-            limit: maximum number of detections; if the sensor is unknown, for each 6,400 m2 with points.
+            limit: maximum number of detections; if the sensor is unknown, for each 6,400 m2 with 100,000 points.
             moving: (n,) bool, if a background is known: points that do not belong to it. Candidates are proposed from
                 these points alone, but rendered with all points around them.
 
@@ -130,7 +130,10 @@ class Detector:
             # columns beyond the range must not take the places of others
             square_distance = (points[:, 0] - origin[0]) ** 2 + (points[:, 1] - origin[1]) ** 2
             is_searched &= square_distance < (max_range + _COLUMN) ** 2
-        areas = 1.0 if origin is not None else max(1.0, _covered_area(points) / _AREA)
+        areas = 1.0
+        if origin is None:
+            # no more than the points would give in single scans: a thinned map has few points on each person
+            areas = max(1.0, min(_covered_area(points) / _AREA, len(points) / _SCAN))
         searched_points = np.ascontiguousarray(points.T[:, is_searched]).T
         centers = propose(searched_points, ground, heights=heights[is_searched], areas=areas)
         if origin is not None and max_range is not None:
