@@ -364,15 +364,14 @@ def detector_seeds() -> str:
     results_by_file = {file: _read(file)["results"] for file in ("detector", *_DETECTOR_SEEDS)}
     rows = []
     for words, dataset, at, group, of in _SEED_ROWS:
-        cells, counts = [], set()
+        values, counts = [], set()
         for results in results_by_file.values():
             result = next(candidate for candidate in results if candidate["dataset"] == dataset)
             recall_rows = (row for row in result["rows"] if row["figure"] == "recall")
             row = next(row for row in recall_rows if (row["at"], row["group"], row["of"]) == (at, group, of))
-            cells.append(f"{row['value']:.1f}")
+            values.append(row["value"])
             counts.add(f"{row['count']:,}")
-        mean = sum(map(float, cells)) / len(cells)
-        rows.append((words, at, *counts, *cells, f"{mean:.1f}"))
+        rows.append((words, at, *counts, *(f"{value:.1f}" for value in (*values, sum(values) / len(values)))))
     seeds = [name.removeprefix("detector-").replace("-", " ") for name in _DETECTOR_SEEDS]
     return table(("recall, %", "false people a scan", "people", "bundled", *seeds, "mean"), rows)
 

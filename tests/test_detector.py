@@ -115,8 +115,8 @@ def test_detector_finds_people_at_map_heights(points):
     np.testing.assert_allclose(far.centers - shift, near.centers, atol=5e-3)
     people, rows = np.array([[5.0, 0.0]]), np.arange(len(points))
     near, far = (
-        Detector(upright).detect_beside(points + way, ORIGIN + way, found.ground, rows, people + way[:2])
-        for way, found in ((np.zeros(3), near), (shift, far))
+        Detector(upright).detect_beside(points + way, ORIGIN + way, detections.ground, rows, people + way[:2])
+        for way, detections in ((np.zeros(3), near), (shift, far))
     )
     assert len(near)
     np.testing.assert_allclose(far.centers - shift, near.centers, atol=5e-3)

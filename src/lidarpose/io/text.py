@@ -15,6 +15,8 @@ from lidarpose.io.files import FormatError, shorten
 FEW_ROWS, _MANY_COLUMNS = 5, 50
 # how the usual exports write a missing value, in lower or upper case
 _MISSING = ("", "na", "n/a", "nan", "-nan", "+nan", "null", "none", "<na>")
+# how Microsoft's libraries begin NaN and infinity, after the sign
+_MICROSOFT = ("nan(", "NaN(", "NAN(", "1.#")
 # .pts and other formats begin with the number of points; CloudCompare also writes it after the header
 _COUNT = r"""(?x) \A ([ \t]* (?: // | \# )? [ \t]* "? [A-Za-z] [^\n]* \n)? [0-9]{1,18} [ \t]* \n
     (?= [ \t]* (?: // | [-+.\d] \S* (?: [ \t,;]+ [-+.\d] \S* ){2} ))"""
@@ -123,6 +125,9 @@ def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
 
 def _with_plain_nan(text: str) -> str:
     """The text with the forms of NaN and infinity that Microsoft's libraries write, -nan(ind) and 1.#QNAN, as nan."""
+    # a search for plain words is ten times faster
+    if not any(word in text for word in _MICROSOFT):
+        return text
     return re.sub(r"[-+]?(?:nan\(\w*\)|1\.#(?:QNAN|SNAN|IND|INF)\w*)", "nan", text, flags=re.I)
 
 

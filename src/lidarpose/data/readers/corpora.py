@@ -119,7 +119,7 @@ class Lipd(_Corpus):
             trans = entry.numbers("trans", (3,))
             mean_point = points.mean(0) if len(points) else 0.0
             candidates |= {"gt_joint + trans": joints + trans, "gt_joint + trans + mean": joints + trans + mean_point}
-        best_name = min(candidates, key=lambda name: _apart(points, candidates[name]) if len(points) else 0.0)
+        best_name = _nearest(points, candidates)
         yield entry.sample(points, candidates[best_name], track="0", source=f"lipd/{best_name}", sensor_known=False)
 
 
@@ -170,7 +170,7 @@ class NoiseMotion(FreeMotion):
     def _place(self, points: np.ndarray, joints: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, str]:
         """The script writes SURREAL's trans, LiveHPS's loader expects the pelvis: whichever is nearer to the points."""
         candidates = {"/T is the pelvis": joints - joints[0] + position, "/T is trans": joints + position}
-        words = min(candidates, key=lambda name: _apart(points, candidates[name]) if len(points) else 0.0)
+        words = _nearest(points, candidates)
         return candidates[words], words
 
     def parts(self, root: Path) -> list[str]:
@@ -179,6 +179,11 @@ class NoiseMotion(FreeMotion):
             problem = "has clouds without poses, which are in SURREAL: run the authors' dataloader_NoiseMotion.py on "
             raise file_error(root, f"{problem}both and give the folder of its .pkl; get them at {self.about['get']}")
         return super().parts(root)
+
+
+def _nearest(points: np.ndarray, candidates: dict[str, np.ndarray]) -> str:
+    """The name of the joints (24, 3) nearest to the points; the first if there are none."""
+    return min(candidates, key=lambda name: _apart(points, candidates[name]) if len(points) else 0.0)
 
 
 def _apart(points: np.ndarray, joints: np.ndarray) -> float:

@@ -60,9 +60,15 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
         return OusterRecording(path, options.meta)
     candidates = (path.with_suffix(".json"), path.with_name(f"{path.stem}_0.json"))
     metadata = next((file for file in candidates if file.exists()), None)
-    if metadata is None or velodyne.is_capture_of(path):
+    if metadata is None:
         return velodyne.open_recording(path, options)
-    return OusterRecording(path, metadata)
+    try:
+        return OusterRecording(path, metadata)
+    except InputError:
+        # the JSON file may belong to something else
+        if velodyne.is_capture_of(path):
+            return velodyne.open_recording(path, options)
+        raise
 
 
 class OusterFormat:

@@ -33,7 +33,7 @@ _BESIDE, _COLUMN = (0.3, 0.85), 1.0
 # points used for a candidate: radius, m; half width of its view, m, plus a margin, rad; number of direction bins
 _CONTEXT, _VIEW, _VIEW_MARGIN, _BINS = 8.0, 2.0, 0.1, 512
 # if the sensor is unknown, limits apply to each area of this size, m2, counted in squares of this side, m, with points;
-# number of points that are enough to count them; least points of an area
+# number of points that are enough to count them, and for the median height; least points of an area
 _AREA, _SQUARE, _ENOUGH, _SCAN = 6400.0, 10.0, 200_000, 100_000
 # heights of this magnitude, m, are shifted to 0, since float32 resolves them badly
 _HIGH = 1000.0
@@ -128,8 +128,7 @@ class Detector:
         is_searched = np.ones(len(rows), bool) if moving is None else np.asarray(moving, bool)[rows]
         if origin is not None and max_range is not None:
             # columns beyond the range must not take the places of others
-            square_distance = (points[:, 0] - origin[0]) ** 2 + (points[:, 1] - origin[1]) ** 2
-            is_searched &= square_distance < (max_range + _COLUMN) ** 2
+            is_searched &= square_distance[rows] < (max_range + _COLUMN) ** 2
         areas = 1.0
         if origin is None:
             # no more than the points would give in single scans: a thinned map has few points on each person
@@ -212,7 +211,7 @@ def _near_zero(points: np.ndarray, origin: np.ndarray | None) -> tuple[np.ndarra
     """points (n, 3) and origin (3,) m with heights that float32 resolves, and the whole meters subtracted: in the level
     frame of a tilted sensor, map coordinates become heights."""
     points = np.asarray(points)
-    base = float(np.round(np.median(points[:, 2]))) if len(points) else 0.0
+    base = float(np.round(np.median(points[:: 1 + len(points) // _ENOUGH, 2]))) if len(points) else 0.0
     if abs(base) < _HIGH:
         return points, origin, 0.0
     shift = np.array([0.0, 0.0, base])

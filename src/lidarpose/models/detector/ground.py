@@ -117,14 +117,17 @@ def estimate_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Gro
         floors = replace(floors, heights=floors.heights - (slope[0] * x + slope[1] * y))
     residual = floors.heights - height
     is_near_plane = np.abs(residual) < _NEAR_PLANE
-    is_floor = _is_supported(residual) | is_near_plane
-    # a small patch far below, as a mirrored floor or a stairwell, is not the ground
-    is_deep = is_floor & (residual < -_DEEP)
-    is_floor &= ~is_deep | (_box_sum(is_deep.astype(float), _CONE_REACH) > _PATCH)
-    # a wide level area beside a drop is above the cone of what lies below, but it is the ground, unless hardly any of
-    # that is level, as in a scan that is upside down
-    is_level = _level_count(residual) >= _MANY_LEVEL
-    is_terrace = is_floor & is_near_plane & is_level & (is_level[is_deep].sum() > _LEVEL_SHARE * is_deep.sum())
+    # the cell itself is counted, too
+    is_floor = (_similar_count(residual, 2, _SUPPORT_ROOM, _SUPPORT_SLOPE) > _SUPPORT) | is_near_plane
+    is_deep, is_terrace = is_floor & (residual < -_DEEP), np.zeros(residual.shape, bool)
+    if is_deep.any():
+        # a small patch far below, as a mirrored floor or a stairwell, is not the ground
+        is_floor &= ~is_deep | (_box_sum(is_deep.astype(float), _CONE_REACH) > _PATCH)
+        # a wide level area beside a drop is above the cone of what lies below, but it is the ground, unless hardly any
+        # of that is level, as in a scan that is upside down
+        is_level = _similar_count(residual, _LEVEL_REACH, _LEVEL, 0.0) >= _MANY_LEVEL
+        if is_level[is_deep].mean() > _LEVEL_SHARE:
+            is_terrace = is_floor & is_near_plane & is_level
     x, y = floors.positions()
     is_floor &= _is_low(np.where(is_floor, residual, np.nan), _CONE_SLOPE)
     if origin is not None:
@@ -312,26 +315,16 @@ def _lowest_mode(values: np.ndarray, weights: np.ndarray) -> float:
     return float(start + step * (np.flatnonzero(pair_counts >= 0.6 * pair_counts.max())[0] + 1))
 
 
-def _is_supported(heights: np.ndarray) -> np.ndarray:
-    """Cells (X, Y) with at least `_SUPPORT` neighbors within 2 m at their height."""
-    padded = np.pad(heights, 2, constant_values=np.nan)
-    support = np.zeros(heights.shape, np.int64)
-    rows, columns = heights.shape
-    for i in range(-2, 3):
-        for j in range(-2, 3):
-            if i or j:
-                neighbor = padded[2 + i : 2 + i + rows, 2 + j : 2 + j + columns]
-                support += np.abs(neighbor - heights) < _SUPPORT_ROOM + _SUPPORT_SLOPE * CELL * np.hypot(i, j)
-    return support >= _SUPPORT
-
-
-def _level_count(heights: np.ndarray) -> np.ndarray:
-    """(X, Y): how many of the 7 x 7 cells about each cell are at its height."""
-    padded = np.pad(heights, _LEVEL_REACH, constant_values=np.nan)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (2 * _LEVEL_REACH + 1,) * 2)
+def _similar_count(heights: np.ndarray, reach: int, room: float, slope: float) -> np.ndarray:
+    """(X, Y): how many of the cells up to `reach` away in each axis, the cell itself included, are at a cell's height
+    within `room` m, and `slope` m more for each meter of distance. 0 for unknown cells."""
+    padded = np.pad(heights, reach, constant_values=np.nan)
     count = np.zeros(heights.shape, np.int64)
-    for i, j in np.ndindex(windows.shape[2:]):
-        count += np.abs(windows[..., i, j] - heights) < _LEVEL
+    rows, columns = heights.shape
+    for i in range(-reach, reach + 1):
+        for j in range(-reach, reach + 1):
+            neighbor = padded[reach + i : reach + i + rows, reach + j : reach + j + columns]
+            count += np.abs(neighbor - heights) < room + slope * CELL * np.hypot(i, j)
     return count
 
 
