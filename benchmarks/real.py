@@ -90,7 +90,7 @@ def main() -> None:
     for row, _ in people:
         print(
             f"{row['sweep']} {row['person']}  {row['points']:4d} points {row['distance']:5.1f} m"
-            f"  facing {row['turn']:5.0f} deg off the box, with four looks {row['turn_of_four']:5.0f}"
+            f"  facing {row['turn']:5.0f} deg off the box, with --tta 4 {row['turn_of_four']:5.0f}"
             f"  {row['near']:4.0%} near bones  lean {row['lean']:3.0f} deg  confidence {row['confidence']:.2f}"
         )
     tracks = list(moved(people))
