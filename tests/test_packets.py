@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hostile_files import with_changed_bytes
+from velodyne_packets import vlp16
 
 from lidarpose.errors import InputError
 from lidarpose.io.sources import DamagedFrame, open_source, pcap
@@ -435,14 +436,6 @@ def test_ouster_recordings_have_complete_frames(path):
 
 
 # ---- Velodyne
-
-
-def vlp16(first, stamp, distance=5000, model=0x22):
-    """A packet of a VLP-16: 12 blocks of 0.4 degrees each, distances in units of 2 mm."""
-    blocks = b"".join(
-        struct.pack("<HH", 0xEEFF, (first + 40 * k) % 36000) + struct.pack("<HB", distance, 7) * 32 for k in range(12)
-    )
-    return blocks + struct.pack("<IBB", stamp, 0x37, model)
 
 
 def test_velodyne_packets_become_frames(tmp_path):

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hostile_files import with_changed_bytes
+from velodyne_packets import vlp16
 
 from lidarpose.cli import main
 from lidarpose.errors import InputError
@@ -269,6 +270,43 @@ def test_decode_livox_refuses_cut_and_reads_big_endian_messages():
             livox.decode_cloud(data[:-4], "cdr")
     empty = bytes(ROS1.serialize_ros1(livox_message([], ROS1, START), name))
     assert livox.decode_cloud(empty, "ros1").points.shape == (0, 3)
+
+
+SCAN = "velodyne_msgs/msg/VelodyneScan"
+for velodyne_store in (ROS1, ROS2):
+    velodyne_store.register(
+        get_types_from_msg("time stamp\nuint8[1206] data", "velodyne_msgs/msg/VelodynePacket")
+        | get_types_from_msg("std_msgs/Header header\nVelodynePacket[] packets", SCAN)
+    )
+
+
+def velodyne_message(packets, store, stamp):
+    types = store.types
+    times = [header(store, stamp + 1_330_000 * k, "").stamp for k in range(len(packets))]
+    packet_type = types["velodyne_msgs/msg/VelodynePacket"]
+    packets = [
+        packet_type(stamp=time, data=np.frombuffer(data, np.uint8)) for time, data in zip(times, packets, strict=True)
+    ]
+    return types[SCAN](header=header(store, stamp, "velodyne"), packets=packets)
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".db3", ".bag"])
+def test_velodyne_packets_of_messages_become_frames(tmp_path, suffix):
+    pytest.importorskip("velodyne_decoder", reason="the extra recordings is not installed")
+    store = store_of(suffix)
+    turns = [[vlp16(k * 480 % 36000, k * 1330, distance) for k in range(75)] for distance in (5000, 2500)]
+    turns.append([bytes(1206)] * 75)
+    messages = [
+        ("/velodyne_packets", velodyne_message(packets, store, START + k * 10**8), START + k * 10**8)
+        for k, packets in enumerate(turns)
+    ]
+    source = open_source(write(tmp_path / f"walk{suffix}", messages))
+    first, second, damaged = list(source)
+    assert source.count == 3 and isinstance(damaged, DamagedFrame)
+    for k, (sweep, distance) in enumerate([(first, 10), (second, 5)]):
+        assert np.allclose(np.linalg.norm(sweep.points, axis=1), distance, atol=0.1)
+        assert sorted(np.unique(sweep.ring)) == list(range(16)) and sweep.time == START / 1e9 + k / 10
+        assert len(sweep.points) == 75 * 12 * 32 and np.array_equal(sweep.origin, np.zeros(3))
 
 
 def test_invalid_returns_are_dropped_with_their_rings(tmp_path):

@@ -1,5 +1,5 @@
-"""Point clouds in ROS recordings: sensor_msgs/PointCloud2 and Livox's CustomMsg in MCAP, ROS 1 bags and rosbag2's
-SQLite files.
+"""Point clouds in ROS recordings: sensor_msgs/PointCloud2, Livox's CustomMsg and packets of Velodyne sensors in MCAP,
+ROS 1 bags and rosbag2's SQLite files.
 
 Messages are decoded with the library rosbags. The sensor pose comes from the recording's transforms (tf), if they
 connect the clouds' frame to a world frame.
@@ -9,7 +9,7 @@ from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterator
 from functools import cache, partial
-from itertools import islice
+from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 from lidarpose.errors import InputError, needs_extra
 from lidarpose.geometry import quaternion_to_matrix, rigid_transform
 from lidarpose.io.files import FormatError, file_error, shorten, unreadable
-from lidarpose.io.sources import livox
+from lidarpose.io.sources import livox, velodyne
 from lidarpose.io.sources.containers import (
     McapFile,
     Message,
@@ -119,11 +119,11 @@ class BagRecording:
         clouds = {
             key: entry.count
             for key, entry in self.topics.items()
-            if entry.type in (*_CLOUD, *livox.TYPES) and entry.encoding in _decoders()
+            if entry.type in (*_CLOUD, *livox.TYPES, *velodyne.SCAN_TYPES) and entry.encoding in _decoders()
         }
         if not clouds:
             topics = ", ".join(f"{key} ({entry.type}, {entry.encoding})" for key, entry in self.topics.items())
-            expected = f"{_CLOUD[0]} or Livox's CustomMsg"
+            expected = f"{_CLOUD[0]}, Livox's CustomMsg or {velodyne.SCAN_TYPES[0]}"
             problem = f"has no point clouds (expected a topic of {expected}); its topics are"
             raise file_error(self.name, f"{problem} {shorten(topics, 1000) or 'none'}")
         names = ", ".join(f"{key} ({count})" for key, count in clouds.items())
@@ -186,11 +186,11 @@ class BagRecording:
         """The content of a message, or None if it is damaged."""
         topic = self.topics[message.topic]
         data = unpacked_message(message.data)
-        name = _CLOUD[0] if message.topic == self.topic else _TRANSFORMS[0]
+        names = (_CLOUD, velodyne.SCAN_TYPES, _TRANSFORMS)
         try:
             if topic.type in livox.TYPES:
                 return livox.decode_cloud(data, topic.encoding)
-            return _decoders()[topic.encoding](data, name)
+            return _decoders()[topic.encoding](data, next(types[0] for types in names if topic.type in types))
         except Exception:
             return None
 
@@ -242,8 +242,13 @@ class _Cloud:
     def decode(self, T_world_sensor: np.ndarray | None) -> Sweep:
         if self.content is None:
             raise FormatError("cannot be decoded as a point cloud: the message is damaged")
-        is_livox = isinstance(self.content, livox.LivoxCloud)
-        points, ring = (self.content.points, self.content.ring) if is_livox else decode_cloud(self.content)
+        ring: np.ndarray | None
+        if isinstance(self.content, livox.LivoxCloud):
+            points, ring = self.content.points, self.content.ring
+        elif hasattr(self.content, "packets"):
+            points, ring = velodyne.decode_scan(self.content.packets)
+        else:
+            points, ring = decode_cloud(self.content)
         origin = None if self.frame_id in _NO_SENSORS else np.zeros(3)
         return Sweep(points=points, T_world_sensor=T_world_sensor, origin=origin, ring=ring)
 
@@ -255,6 +260,8 @@ def _decoders() -> dict[str, Callable[[bytes, str], Any]]:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     ros1, ros2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
     ros1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", _TRANSFORMS[0]))
+    for store, (name, definition) in product((ros1, ros2), velodyne.SCAN_DEFINITIONS.items()):
+        store.register(get_types_from_msg(definition, name))
     return {"cdr": ros2.deserialize_cdr, "ros1": ros1.deserialize_ros1}
 
 

@@ -10,11 +10,17 @@ from typing import Any
 import numpy as np
 
 from lidarpose.errors import InputError, needs_extra
-from lidarpose.io.files import file_error, shorten
+from lidarpose.io.files import FormatError, file_error, shorten
 from lidarpose.io.sources.frame import ReadingOptions, Sweep
 from lidarpose.io.sources.pcap import Capture, Datagram, PacketRecording
 
 PACKET_BYTES = 1206
+# messages of the ROS driver: the packets of a turn
+SCAN_TYPES = ("velodyne_msgs/msg/VelodyneScan", "velodyne_msgs/VelodyneScan")
+SCAN_DEFINITIONS = {
+    "velodyne_msgs/msg/VelodynePacket": f"builtin_interfaces/Time stamp\nuint8[{PACKET_BYTES}] data",
+    SCAN_TYPES[0]: "std_msgs/Header header\nVelodynePacket[] packets",
+}
 # first bytes of other vendors' packets with points
 _OTHERS = {"Hesai": b"\xee\xff", "RoboSense": b"\x55\xaa"}
 # column of the ring in the decoder's rows
@@ -134,5 +140,31 @@ class VelodyneRecording(PacketRecording):
         return is_whole
 
 
+def decode_scan(packets: list[Any]) -> tuple[np.ndarray, np.ndarray]:
+    """The points (n, 3) m, float64, and the ring (n,) of each in the packets of a `SCAN_TYPES` message.
+
+    Raises:
+        MissingExtra: The library that decodes packets is not installed.
+        FormatError: They are packets of another sensor, or of an HDL-64E, whose calibration is not in one message.
+    """
+    with needs_extra("reading packets of a Velodyne sensor"):
+        import velodyne_decoder
+    times = [packet.stamp.sec + packet.stamp.nanosec / 1e9 for packet in packets]
+    packet_type, vector_type = velodyne_decoder.VelodynePacket, velodyne_decoder.PacketVector
+    try:
+        _, rows = velodyne_decoder.ScanDecoder(velodyne_decoder.Config()).decode(
+            vector_type(packet_type(time, packet.data) for time, packet in zip(times, packets, strict=True))
+        )
+    except Exception as error:
+        expected, remedy = "packets of a Velodyne model that names itself", "record the driver's PointCloud2"
+        raise FormatError(expected, shorten(str(error)), remedy) from None
+    return _points_and_ring(rows)
+
+
 def _sweep(rows: np.ndarray) -> Sweep:
-    return Sweep(points=rows[:, :3].astype(np.float64), origin=np.zeros(3), ring=rows[:, _RING].astype(np.int64))
+    points, ring = _points_and_ring(rows)
+    return Sweep(points=points, origin=np.zeros(3), ring=ring)
+
+
+def _points_and_ring(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return rows[:, :3].astype(np.float64), rows[:, _RING].astype(np.int64)
