@@ -661,5 +661,5 @@ def test_import_rejects_pickle(tmp_path, capsys):
 
 def test_advice_after_empty_detection_unless_explained():
     assert "a lower --min-score finds more" in predicting._none_found(" -> x.json", ["dropped 3 points"])
-    explained = predicting._none_found(" -> x.json", ["no people found with up z, but 4 people with up y: try up y"])
+    explained = predicting._none_found(" -> x.json", ["no people found with up z, but 4 people with up y: try --up y"])
     assert explained == "no people found -> x.json"

@@ -260,7 +260,7 @@ def test_detect_warns_of_wrong_up_axis(scene):
     # no person is detected with any up axis
     empty = scene[0][alone(scene[0])]
     (warning,) = lidarpose.detect(empty @ UP_AXES["y"]).warnings
-    assert "probably not the input's up axis: try up y" in warning
+    assert "probably not the input's up axis: try --up y" in warning
     (warning,) = lidarpose.detect(empty * [1, -1, -1], sensor_origin="unknown").warnings
     assert "no ground was found" in warning and "up axis" in warning
 
@@ -274,7 +274,7 @@ def test_detect_suggests_up_axis_that_finds_people(scene, file, up):
         (warning,) = boxes.warnings
         number = len(lidarpose.detect(points @ UP_AXES[up], up=up))
         assert not boxes and number >= 3
-        assert warning == f"no people found with up z, but {number} people with up {up}: try up {up}"
+        assert warning == f"no people found with up z, but {number} people with up {up}: try --up {up}"
     np.save(file, near @ UP_AXES[up])
     assert lidarpose.predict(file).warnings == (warning,)
 

@@ -17,7 +17,17 @@ from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
 from lidarpose.io import files
-from lidarpose.io.files import LOCK, atomic_path, check_suffix, file_error, is_unused, locked, read_bytes, write_atomic
+from lidarpose.io.files import (
+    LOCK,
+    atomic_path,
+    check_suffix,
+    file_error,
+    is_unused,
+    locked,
+    read_bytes,
+    write_all_atomic,
+    write_atomic,
+)
 from lidarpose.io.npz import read_npz
 from lidarpose.io.point_cloud import read_points
 
@@ -44,6 +54,15 @@ def test_write_atomic_uses_default_mode(tmp_path):
     write_atomic(tmp_path / "a.txt", "new")
     (tmp_path / "b.txt").write_text("plain")
     assert stat.S_IMODE((tmp_path / "a.txt").stat().st_mode) == stat.S_IMODE((tmp_path / "b.txt").stat().st_mode)
+
+
+def test_write_all_atomic_puts_files_in_place_in_their_order(tmp_path, monkeypatch):
+    replaced, replace = [], os.replace
+    monkeypatch.setattr(
+        os, "replace", lambda source, target: (replaced.append(os.path.basename(target)), replace(source, target))
+    )
+    write_all_atomic({tmp_path / name: name.encode() for name in ("scores.json", "a.png", "poses.parquet")})
+    assert replaced == ["scores.json", "a.png", "poses.parquet"]
 
 
 def test_atomic_path_keeps_suffix(tmp_path):

@@ -1,6 +1,7 @@
 """`lidarpose paper`: tables and their cells, steps that run once and can be resumed, pages, figures."""
 
 import json
+import shutil
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -14,6 +15,7 @@ from dataset_files import write_lidarhuman26m, write_sloper4d
 from matplotlib.text import Text
 from training_runs import Killed, few_to_validate_on  # noqa: F401
 
+from lidarpose.body.mocap.smpl_poses import load_betas
 from lidarpose.cli import main
 from lidarpose.cli.command_line import make_parser
 from lidarpose.data.dataset_card import DatasetCard, write_card
@@ -25,7 +27,7 @@ from lidarpose.eval.predictions import read_poses
 from lidarpose.eval.scores import published, read_scores
 from lidarpose.models.checkpoint import read_header
 from lidarpose.paper import figures, report, steps
-from lidarpose.paper.report import markdown, mean_pose_error, run_table
+from lidarpose.paper.report import markdown, mean_pose_error, run_table, write_table
 from lidarpose.paper.steps import Step, StepFailed, run_steps
 from lidarpose.paper.tables import REAL, TABLES, Options, _targets, cells, row_key
 from lidarpose.sample import center_of, facing
@@ -41,6 +43,11 @@ _TABLE = ["paper", "table4", "--people", "64", "--size", "paper-tiny", "--rows",
 
 def _content(out, name="table4"):
     return json.loads((out / f"{name}.json").read_text())
+
+
+def _chosen(content):
+    """The entries of the chosen rows."""
+    return [entry for entry in content["cells"] if row_key(entry["row"]) in _ROWS]
 
 
 # --- a table from command to page
@@ -70,12 +77,12 @@ def finished(tmp_path_factory):
 
 def test_paper_resumes_killed_table(finished):
     out, killed, before = finished
-    assert [cell["state"] for cell in killed["cells"]] == ["done", "not run"]
-    done = _content(out)["cells"]
+    assert [cell["state"] for cell in _chosen(killed)] == ["done", "not run"]
+    done = _chosen(_content(out))
     assert [cell["state"] for cell in done] == ["done", "done"]
     # the first row, the finished parts of both targets and the pre-training are not repeated
     assert len(before) >= 4 and all(path.stat().st_mtime_ns == at for path, at in before.items())
-    assert done[0].items() >= killed["cells"][0].items()
+    assert done[0].items() >= _chosen(killed)[0].items()
     (tuned,) = [log for log in (out / "runs").glob("finetune-*/log.jsonl") if "--resume" in _command(log.parent)]
     assert json.loads(tuned.read_text().splitlines()[-1])["people"] == 64
 
@@ -86,7 +93,7 @@ def _command(run):
 
 def test_paper_cell_has_cost_and_mean_pose(finished):
     out, _, _ = finished
-    scratch, masked = _content(out)["cells"]
+    scratch, masked = _chosen(_content(out))
     assert (scratch["people_seen"], masked["people_seen"]) == (64, 128)
     assert scratch["parameters"] == masked["parameters"] > 4e5 and scratch["size"] == "paper-tiny"
     assert scratch["people_scored"] == 16 and scratch["undertrained"] and scratch["mean_pose"] == masked["mean_pose"]
@@ -99,13 +106,13 @@ def test_paper_cell_has_cost_and_mean_pose(finished):
     ]
     assert scratch["mpjpe"] == read_scores(scratch["scores"]).results[0].line("mpjpe").value
     page = (out / "table4.md").read_text()
-    assert "*undertrained*" in page.split("## Cells")[0].splitlines()[-2]
+    assert page.split("## Cells")[0].count(", *undertrained* |") == 3
     assert all(command in page for command in masked["commands"])
 
 
 def test_paper_rows_are_compared_person_by_person(finished):
     out, _, _ = finished
-    scratch, reference = _content(out)["cells"]
+    scratch, reference = _chosen(_content(out))
     assert "difference" not in reference
     first, second = (
         read_poses(Path(cell["scores"]).with_name("poses.parquet")).popitem()[1].errors().mean(1)
@@ -121,6 +128,31 @@ def test_paper_rows_are_compared_person_by_person(finished):
     )
     assert heads.split(" | ")[4] == "against + laser masking"
     assert line.split(" | ")[4].startswith(f"{scratch['difference']:+.1f} [")
+
+
+def test_differences_of_few_sequences_have_no_interval(finished, monkeypatch):
+    out, _, _ = finished
+    scratch, _ = cells(TABLES["table4"], Options(people=64, size="paper-tiny"), _ROWS)
+    reference = report._reference(
+        TABLES["table4"], scratch, cells(TABLES["table4"], Options(people=64, size="paper-tiny"))
+    )
+    whole = report._difference(scratch, reference, out)
+    monkeypatch.setattr(report.aggregate, "LEAST_UNITS", 1000)
+    few = report._difference(scratch, reference, out)
+    assert few == {"difference": whole["difference"], "difference_low": None, "difference_high": None}
+    assert report._difference_text(few) == f"{whole['difference']:+.1f}"
+
+
+def test_unreadable_scores_fail_their_cell_only(finished, tmp_path):
+    out, _, _ = finished
+    copy = tmp_path / "copy"
+    shutil.copytree(out, copy)
+    options = Options(people=64, size="paper-tiny")
+    scratch, masked = cells(TABLES["table4"], options, _ROWS)
+    (masked.evaluation.product(copy) / "scores.json").write_text("{")
+    report._path(masked.evaluation, copy).unlink()
+    entries = _chosen(write_table(TABLES["table4"], options, copy))
+    assert [entry["state"] for entry in entries] == ["done", "failed"] and "scores.json" in entries[1]["reason"]
 
 
 def test_mean_pose_is_relative_to_center_of_points(finished):
@@ -139,7 +171,7 @@ def test_mean_pose_is_relative_to_center_of_points(finished):
 def test_paper_table_only_lists_finished_cells(finished, capsys):
     out, _, _ = finished
     assert main([*_TABLE, str(out), "--table-only", "--seeds", "2"]) == 0
-    assert [cell["state"] for cell in _content(out)["cells"]] == ["done", "not run"] * 2
+    assert [cell["state"] for cell in _chosen(_content(out))] == ["done", "not run"] * 2
     assert "1 of 2 seeds" in (out / "table4.md").read_text()
     assert main([*_TABLE, str(out), "--table-only"]) == 0
 
@@ -188,7 +220,9 @@ def data(tmp_path):
         folder.mkdir()
         card = DatasetCard(settings={"dataset": name}, count=1, per_shard=1, tables=("labelled",))
         write_card(folder, card)
-    poses = {name: "raw" for name in ("freemotion-poses", "lidarhuman26m-poses")}
+    raw = tmp_path / "raw"
+    (raw / "labels" / "3d" / "pose" / "5").mkdir(parents=True)
+    poses = {name: str(raw) for name in ("freemotion-poses", "lidarhuman26m-poses")}
     return {name: str(folder) for name, folder in folders.items()} | poses
 
 
@@ -242,7 +276,10 @@ def test_table_commands_follow_paper_protocol(data):
         wanted = "--options trans_center=true" if row in ("LiDARCap", "NE") else "--augment paper"
         assert ("--recipe paper" in tuned) == (row in ("PRN", "DAPT"))
         assert wanted in tuned or "--recipe paper" in tuned
-    assert "--recipe paper --size paper" in lines["DAPT", "waymo"][0] and "--motion raw" in lines["DAPT", "waymo"][0]
+    assert (
+        "--recipe paper --size paper" in lines["DAPT", "waymo"][0]
+        and f"--motion {data['lidarhuman26m-poses']}" in lines["DAPT", "waymo"][0]
+    )
     assert all(cell.evaluation for cell in cells(TABLES["table2"], options))
     # people with a corpus's poses have the body of the user's SMPL file if given, others the shipped body
     assert "--body" not in lines["DAPT", "waymo"][0]
@@ -260,8 +297,9 @@ def test_table_commands_follow_paper_protocol(data):
 
 
 def test_tables_do_not_train_on_lidarhuman26m_test_poses(tmp_path, data, smpl):
-    raw = tmp_path / "raw"
-    write_lidarhuman26m(raw, smpl, sequences=("5", "7", "24", "8"))
+    raw = tmp_path / "lidarhuman26m-raw"
+    # 9 is in no split
+    write_lidarhuman26m(raw, smpl, sequences=("5", "7", "24", "8", "9"))
     options = Options(data=data | {"lidarhuman26m-poses": str(raw)}, size="paper")
     rows = ("table1", "dapt"), ("table1", "ours"), ("table2", "lidarh26m-poses"), ("table4", "pre-training")
     for table, row in rows:
@@ -269,6 +307,25 @@ def test_tables_do_not_train_on_lidarhuman26m_test_poses(tmp_path, data, smpl):
         words = first.command(tmp_path)
         subjects = words[words.index("--subjects") + 1].split(",")
         assert set(PoseBank.from_clips(raw, tuple(subjects)).clips.names) == {"labels/3d/pose/5", "labels/3d/pose/8"}
+    for wrong in (raw / "labels", raw / "labels" / "3d" / "pose"):
+        with pytest.raises(InputError, match="expected the root of the raw dataset"):
+            cells(TABLES["table1"], replace(options, data=options.data | {"lidarhuman26m-poses": str(wrong)}))
+    shapes = [load_betas(raw, subjects), load_betas(raw / "labels" / "3d" / "pose", ["5", "8"])]
+    assert len(shapes[0]) and np.array_equal(*shapes) and len(load_betas(raw)) > len(shapes[0])
+
+
+def test_pages_of_real_sets_name_poses_of_pretraining(data, tmp_path):
+    without = {"waymo": data["waymo"]}
+    for options, told in (
+        (Options(data=data), ""),
+        (Options(data=without), "poses of pre-training: the procedural prior, not LiDARHuman26M as in the paper"),
+        (Options(data=without, motion=("b/a.npz",)), "poses of pre-training: a.npz"),
+    ):
+        content = write_table(TABLES["table1"], options, tmp_path)
+        assert content["target"].startswith("real sets") and told in content["target"]
+        assert ("pre-training" in content["target"]) == bool(told)
+    reasons = [cell.why for cell in cells(TABLES["table4"], Options(data=without)) if cell.why]
+    assert len(reasons) == 1 and "--data lidarhuman26m-poses=DIR" in reasons[0]
 
 
 def test_mean_pose_is_relative_to_center_of_protocol(tmp_path, smpl):
@@ -391,8 +448,14 @@ def test_run_table_marks_failed_cells_and_continues(tmp_path):
     told = []
     chosen = ["scratch", "laser-masking"]
     content = run_table(TABLES["table4"], Options(people=64), tmp_path / "out", chosen, execute, told.append)
-    assert [cell["state"] for cell in content["cells"]] == ["failed", "failed"]
-    assert {cell["reason"] for cell in content["cells"]} == {"unrecognized arguments: --model prn"}
+    # the page has all rows, also those that were not chosen
+    assert len(content["cells"]) == 9 and {cell["state"] for cell in content["cells"]} == {
+        "failed",
+        "not run",
+        "not possible",
+    }
+    assert [cell["state"] for cell in _chosen(content)] == ["failed", "failed"]
+    assert {cell["reason"] for cell in _chosen(content)} == {"unrecognized arguments: --model prn"}
     # the target is made once
     assert asked == ["synth", "finetune", "pretrain", "finetune"]
     assert "failed: unrecognized arguments" in (tmp_path / "out" / "table4.md").read_text()
@@ -404,7 +467,7 @@ def test_copied_cells_are_done_for_tables_but_not_for_figures(tmp_path):
         cell = cells(TABLES[name], Options(people=64), ["dapt"])[0]
         path = report._path(cell.evaluation, tmp_path)
         path.parent.mkdir(exist_ok=True)
-        path.write_text(json.dumps(_entry()))
+        path.write_text(json.dumps(_entry(row=cell.row, column=cell.column)))
         chosen = replace(TABLES[name], columns=("waymo",))
         run_table(chosen, Options(people=64), tmp_path, ["dapt"], lambda words: asked.append(words[0]) or 0, print)
         assert asked == ([] if name == "table1" else ["synth", "pretrain", "finetune", "synth", "evaluate"])
@@ -598,7 +661,7 @@ def test_paper_table1_from_raw_lidarhuman26m(tmp_path, smpl, monkeypatch):
     assert main(["prepare", "lidarhuman26m", str(raw), str(prepared), "--smpl", str(smpl)]) == 0
     words = ["--data", f"lidarhuman26m={prepared}", "--size", "paper-tiny", "--rows", "lidarcap", "--out", str(out)]
     assert main(["paper", "table1", *words]) == 0
-    (cell,) = _content(out, "table1")["cells"]
+    (cell,) = [entry for entry in _content(out, "table1")["cells"] if entry["row"] == "LiDARCap"]
     assert (cell["row"], cell["column"], cell["state"]) == ("LiDARCap", "lidarhuman26m", "done")
     assert cell["people_seen"] == 8 * 16 and cell["people_scored"] == 16 and cell["undertrained"]
     assert len(cell["joints"]) == 24 and cell["mpjpe"] > 0 and cell["mean_pose"] > 0

@@ -556,7 +556,7 @@ def test_predict_warns_of_up_axis_if_all_people_lie(model, tmp_path, points):
     (warning,) = lidarpose.predict(tmp_path / "crop.npy", model=model).warnings
     assert warning == (
         "the person lies down: if that is wrong, z is not the input's up axis: "
-        "try up y, or up -y where y points down (cameras), or up x"
+        "try --up y, or --up -y where y points down (cameras), or --up x"
     )
     assert lidarpose.predict(tmp_path / "crop.npy", up="y", model=model).warnings == ()
 
@@ -566,7 +566,7 @@ def test_predict_warns_of_up_axis_of_sweep(model, tmp_path, points):
     np.save(tmp_path / "sweep.npy", np.concatenate([points, street]) @ UP_AXES["x"])
     box = {"center": (np.median(points, axis=0) @ UP_AXES["x"]).tolist(), "size": [0.8, 0.8, 2]}
     (warning,) = lidarpose.predict(tmp_path / "sweep.npy", boxes=[box], model=model).warnings
-    assert warning.endswith("try up x")
+    assert warning.endswith("try --up x")
     assert lidarpose.predict(tmp_path / "sweep.npy", boxes=[box], up="x", model=model).warnings == ()
 
 
@@ -728,7 +728,7 @@ def test_predict_rejects_bad_model(points, wrong):
 
 def test_predict_rejects_boxes_of_other_up_axis(model, points):
     boxes = lidarpose.read_boxes({"schema": "lidarpose.boxes/1", "up": "y", "people": [box_around(points)]})
-    with pytest.raises(InputError, match="the up axis of the boxes is y, not z: give up y"):
+    with pytest.raises(InputError, match="the up axis of the boxes is y, not z: give --up y"):
         lidarpose.predict(points, boxes=boxes, up="z", model=model)
     assert lidarpose.predict(points, boxes=boxes, up=[0, 1, 1e-3], model=model).up == "0.0,1.0,0.001"
 
@@ -897,7 +897,7 @@ STREET = np.random.default_rng(0).uniform([-200, -200, -2], [200, 200, -1.9], (3
     "change, words",
     [
         *((lambda p, scale=scale: p * scale, "taller than a person: expected meters") for scale in (1 / 0.3048, 2, 10)),
-        (lambda p: p * [1, -1, -1], "try up -z"),
+        (lambda p: p * [1, -1, -1], "try --up -z"),
         (lambda p: np.concatenate([p, STREET]), "expected a crop of one person"),
         # wider than tall
         (lambda p: np.concatenate([p, p + [0, 1.7, 0]]) / 0.3048, "taller than a person: expected meters"),
@@ -920,7 +920,7 @@ def test_predict_checks_upside_down_people_in_one_batch(model, points, monkeypat
     monkeypatch.setattr(model, "poses", noted)
     people = model.predict([points * [1, -1, -1]] * 3, sensor_origin=(0.1, 0.2, 0.3))
     np.testing.assert_allclose(origins, [(0.1, 0.2, 0.3), (0.1, -0.2, -0.3)])
-    assert ["try up -z" in person.warnings[-1] for person in people] == [True] * 3
+    assert ["try --up -z" in person.warnings[-1] for person in people] == [True] * 3
     # two passes as given, two upside down
     assert batches == [3] * 4
     # the check can be disabled
@@ -930,7 +930,7 @@ def test_predict_checks_upside_down_people_in_one_batch(model, points, monkeypat
     np.testing.assert_array_equal(same.to_numpy(), people.to_numpy())
     # lying people get no warning of their own
     monkeypatch.setattr(predictor, "is_lying", lambda pose, part: True)
-    assert not any("try up" in line for line in model.predict(points * [1, -1, -1]).warnings)
+    assert not any("try --up" in line for line in model.predict(points * [1, -1, -1]).warnings)
 
 
 def test_predict_warns_once_of_boxes_in_millimeters(model, sweep):
@@ -950,9 +950,9 @@ def test_predict_warns_of_few_scored_people_upside_down_only_if_most_are(model, 
     for clouds, count in (([flipped, points, points], 0), ([flipped, flipped, points], 2)):
         centers = np.array([cloud.mean(0) for cloud in clouds])
         people = model.predict_in(clouds, None, box_centers=centers, is_scored=True)
-        assert sum("try up -z" in " ".join(person.warnings) for person in people) == count
+        assert sum("try --up -z" in " ".join(person.warnings) for person in people) == count
         people = model.predict_in(clouds, None, box_centers=centers)
-        assert sum("try up -z" in " ".join(person.warnings) for person in people) == max(count, 1)
+        assert sum("try --up -z" in " ".join(person.warnings) for person in people) == max(count, 1)
 
 
 def test_predict_rejects_objects_that_hold_points(model):

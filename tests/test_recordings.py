@@ -6,6 +6,7 @@ import os
 import threading
 import time
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +110,15 @@ def test_untracked_frame_equals_prediction_of_single_file(drive, folder, clouds,
     alone = lidarpose.predict(drive / "frame_8.npy", model=model).to_dict()
     assert [person | {"track": None, "filled": False} for person in alone["people"]] == lines[1]["people"]
     assert lines[1]["people"][0]["score"] > 0.8
+
+
+def test_first_tracked_frame_equals_prediction_of_single_file(drive, model):
+    """People who are not known yet get all passes of the network."""
+    first, second = islice(lidarpose.predict_recording(drive, track=True, model=model), 2)
+    for frame, is_known in ((first, False), (second, True)):
+        alone = lidarpose.predict(drive / f"{frame.id}.npy", model=model)
+        assert len(frame.poses) == len(alone) == 2
+        assert np.array_equal(frame.poses.to_numpy(), alone.to_numpy()) != is_known
 
 
 @pytest.mark.parametrize("flag", ["--track", "--live"])
@@ -271,7 +281,7 @@ def test_boxes_with_other_up_axis_are_rejected(drive, tmp_path, capsys):
     (tmp_path / "b.json").write_text(json.dumps([{"frame": k} | entry for k in range(2)]))
     words = ["predict", str(drive), "--end", "0.1", "--boxes", str(tmp_path / "b.json"), "--out"]
     assert main([*words, str(tmp_path / "o.jsonl")]) == 2
-    assert "the up axis of the boxes is y, not z: give up y" in capsys.readouterr().err
+    assert "the up axis of the boxes is y, not z: give --up y" in capsys.readouterr().err
     assert main([*words, str(tmp_path / "o.jsonl"), "--up", "y"]) == 0
 
 
@@ -370,7 +380,7 @@ def test_first_frame_suggests_up_axis(clouds, model, tmp_path):
     for k, points in enumerate(clouds[:3]):
         np.save(tmp_path / f"{k}.npy", points @ UP_AXES["-y"])
     first, *others = lidarpose.predict_recording(tmp_path, model=model)
-    assert not len(first.poses) and any(line.endswith("try up -y") for line in first.poses.warnings)
+    assert not len(first.poses) and any(line.endswith("try --up -y") for line in first.poses.warnings)
     assert not any("no people found" in line for frame in others for line in frame.poses.warnings)
     frames = list(lidarpose.predict_recording(tmp_path, model=model, up="-y"))
     assert [len(frame.poses) for frame in frames] == [2, 2, 2]

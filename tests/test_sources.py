@@ -192,6 +192,8 @@ def test_open_source_accepts_patterns_lists_and_recursion(tmp_path, monkeypatch)
     saved(tmp_path / "day" / "a", "f_10.npy", "f_2.npy")
     saved(tmp_path / "day" / "b", "f_2.npy")
     assert ids(open_source("day/a/f_*.npy")) == ["f_2", "f_10"]
+    Path("day/a/f_2.json").write_text("{}")
+    assert ids(open_source("day/a/*")) == ["f_2", "f_10"]
     assert ids(open_source(["day/a/f_10.npy", Path("day/a/f_2.npy")])) == ["f_2", "f_10"]
     assert ids(open_source("day/**/*.npy")) == [str(Path(p)) for p in ("a/f_2.npy", "a/f_10.npy", "b/f_2.npy")]
     folders = open_source(["day/b", "day/a"])

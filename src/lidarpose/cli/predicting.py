@@ -21,7 +21,7 @@ _ADVICE = (
     "treats all points as one person"
 )
 # parts of the warnings that state why no person was detected: wrong axes, units or background
-_CAUSES = ("try up", "all coordinates by", "on the background")
+_CAUSES = ("try --up", "all coordinates by", "on the background")
 # maximum characters of an id in a warning
 _LONGEST_ID = 40
 
@@ -58,7 +58,7 @@ $ lidarpose predict street.mcap --every 2 --format parquet
 --find  detect people even in a file under 4 m across
 {_SEARCH}
 [output]
---out PATH = .  a folder, a .json or .csv file (default: the current folder); - prints the JSON
+--out PATH = .  a folder, or a .json or .csv file (of a recording .jsonl, .csv or .parquet); - prints the JSON
 --picture  also draw STEM.poses.png, or FILE.png
 --html  also write STEM.poses.html: people and scan in 3D; a recording is played
 --skeleton NAME  smpl24, human15, waymo14, itop14 or body26 (default smpl24, else the network's own)

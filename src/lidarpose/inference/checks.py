@@ -129,7 +129,7 @@ def upside_down_warning(pose: Pose, turned: Pose | None) -> str | None:
         return None
     if turned.spread.mean() > _CLEARLY_SURER * pose.spread.mean():
         return None
-    return "the pose is more certain upside down: does the up axis point down? try up -z"
+    return "the pose is more certain upside down: does the up axis point down? try --up -z"
 
 
 def is_lying(pose: Pose, points: np.ndarray) -> bool:
@@ -237,7 +237,7 @@ def origin_warning(scan: Scan) -> str | None:
     position = ",".join(f"{value:g}" for value in scan.origin)
     return (
         f"the sensor at {position} is {distance:,.0f} m from the people, so its position is treated as unknown: "
-        "give it in the points' own frame and in meters (sensor_origin)"
+        "give it in the points' own frame and in meters (--sensor-origin)"
     )
 
 
@@ -266,9 +266,8 @@ def unlikely_origin(points: np.ndarray, origin: np.ndarray) -> str | None:
         problem = "has no ground below it"
     else:
         return None
-    return (
-        f"the sensor {problem}, so its position is treated as unknown: give it in the points' own frame (sensor_origin)"
-    )
+    remedy = "give it in the points' own frame (--sensor-origin)"
+    return f"the sensor {problem}, so its position is treated as unknown: {remedy}"
 
 
 def flat_axis(points: np.ndarray) -> str | None:
@@ -329,4 +328,4 @@ def _place(point: np.ndarray) -> str:
 
 
 def _option(axis: str) -> str:
-    return "up y, or up -y where y points down (cameras)" if axis == "y" else f"up {axis}"
+    return "--up y, or --up -y where y points down (cameras)" if axis == "y" else f"--up {axis}"

@@ -168,7 +168,7 @@ def other_up_axis(places: "DetectedScan", search: Search) -> str | None:
     if not boxes[best_axis]:
         return None
     people = counted(len(boxes[best_axis]), "person", "people")
-    return f"no people found with up {input_scan.up}, but {people} with up {best_axis}: try up {best_axis}"
+    return f"no people found with up {input_scan.up}, but {people} with up {best_axis}: try --up {best_axis}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

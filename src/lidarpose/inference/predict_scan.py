@@ -197,7 +197,7 @@ def check_up(boxes: Boxes, up: str | Sequence[float], *, most: float = _SAME_UP)
     # boxes along z may belong to a tilted scan
     most = _SAME_AXIS if boxes.up == "z" else most
     if boxes.has_up and np.linalg.norm(difference) > most:
-        raise InputError(f"the up axis of the boxes is {boxes.up}, not {up_text(up)}: give up {boxes.up}")
+        raise InputError(f"the up axis of the boxes is {boxes.up}, not {up_text(up)}: give --up {boxes.up}")
 
 
 def check_choice(boxes: object, crop: bool, searched: bool, calib: object) -> None:

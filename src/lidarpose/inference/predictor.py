@@ -328,8 +328,8 @@ class Predictor(PoseEstimator):
 
         Args:
             clips: as in `predict`, already checked.
-            pelvises: (N, 3) m, approximate pelvis positions of clouds that each show a single person. The first pass,
-                which finds the pelvis, is then skipped.
+            pelvises: (N, 3) m, approximate pelvis positions, NaN where unknown, of clouds that each show a single
+                person. The first pass, which finds the pelvis, is then skipped.
             box_centers: (N, 3) m, centers of the boxes that cropped the clouds. They tell which person is meant where a
                 cloud shows two people or the pose is uncertain.
             is_scored: whether the boxes have scores, which rest on more than the points inside the box. Warnings that
@@ -341,7 +341,8 @@ class Predictor(PoseEstimator):
         cleaned_clouds = [clean(cloud) for cloud in clouds]
         is_usable = np.array([not is_few(points) for points, _ in cleaned_clouds], bool)
         in_box = pelvises is not None or box_centers is not None
-        best_poses = self._best(cleaned_clouds, is_usable, origin, progress, clips, pelvises, box_centers)
+        is_placed = np.zeros(len(clouds), bool) if pelvises is None else np.isfinite(pelvises).all(1)
+        best_poses = self._best(cleaned_clouds, is_usable, is_placed, origin, progress, clips, pelvises, box_centers)
         poses: list[Pose | None] = [None] * len(clouds)
         unsure_rows: list[int] = []
         for i, (points, notes) in enumerate(cleaned_clouds):
@@ -356,13 +357,14 @@ class Predictor(PoseEstimator):
                 continue
             pose, part = best_poses[i]
             poses[i] = target_pose = pose.to(target_skeleton)
-            count_note = person_count_warning(pose, in_box=in_box, is_scored=is_scored)
+            # a known pelvis tells which person is meant
+            count_note = None if is_placed[i] else person_count_warning(pose, in_box=in_box, is_scored=is_scored)
             notes += filter(None, (unit_note, count_note, _range_warning(target_pose)))
             if unit_note:
                 continue
             if warning := oversize_warning(points, pose):
                 notes.append(warning)
-            elif pelvises is None and check_upside_down and looks_unsure(pose, part):
+            elif not is_placed[i] and check_upside_down and looks_unsure(pose, part):
                 unsure_rows.append(i)
         # detected people share one up axis: a few of many who look upside down are no sign of a wrong one
         least = len(best_poses) // 2 + 1 if is_scored else 1
@@ -396,10 +398,11 @@ class Predictor(PoseEstimator):
         return replace(poses, people=tuple(people))
 
     def _best(
-        self, cleaned_clouds, is_usable, origin, progress, clips, centers, box_centers
+        self, cleaned_clouds, is_usable, is_placed, origin, progress, clips, pelvises, box_centers
     ) -> dict[int, tuple[Pose, np.ndarray]]:
         """For each person with a pose, by index: the pose, and the part (n, 3) m of the cloud from which it was
-        predicted."""
+        predicted. is_placed (N,) bool: whose pelvises are known."""
+        poses: list[Pose | None]
         if clips is not None:
             # clips index all clouds, so unusable clouds stay in the list
             parts = list(enumerate(points for points, _ in cleaned_clouds))
@@ -408,14 +411,17 @@ class Predictor(PoseEstimator):
             usable_clouds = [(i, cleaned_clouds[i][0]) for i in np.flatnonzero(is_usable).tolist()]
             # the first candidate of a person is the whole cloud
             parts = [
-                (i, part) for i, cloud in usable_clouds for part in (candidates(cloud) if centers is None else [cloud])
+                (i, part) for i, cloud in usable_clouds for part in ([cloud] if is_placed[i] else candidates(cloud))
             ]
-            rows = [i for i, _ in parts]
-            part_centers, part_box_centers = (
-                None if values is None else values[rows] for values in (centers, box_centers)
-            )
-            clouds = [part for _, part in parts]
-            poses = self.poses(clouds, origin, centers=part_centers, box_centers=part_box_centers, progress=progress)
+            poses = [None] * len(parts)
+            for name, values in (("box_centers", box_centers), ("centers", pelvises)):
+                part_rows = [k for k, (i, _) in enumerate(parts) if is_placed[i] == (name == "centers")]
+                if not part_rows:
+                    continue
+                places = {name: None if values is None else values[[parts[k][0] for k in part_rows]]}
+                new_poses = self.poses([parts[k][1] for k in part_rows], origin, progress=progress, **places)
+                for k, pose in zip(part_rows, new_poses, strict=True):
+                    poses[k] = pose
         poses_by_person: dict[int, list[tuple[Pose, np.ndarray]]] = {}
         for (i, part), pose in zip(parts, poses, strict=True):
             if pose is not None:

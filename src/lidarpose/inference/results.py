@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from lidarpose.viz.person_view import Panel
 
 SCHEMA = "lidarpose.poses/1"
-# maximum characters of an id in the view from above
-_LONGEST_NAME = 12
 # decimals of the values in files, by column of tables
 _DECIMALS = {"x": 4, "y": 4, "z": 4, "confidence": 3, "spread": 4, "visible": 3}
 _DECIMALS |= {"person_probability": 4, "second_person": 4, "score": 4}
@@ -372,24 +370,25 @@ class Poses(Sequence[PersonPose]):
         return panels, None if self.scan is None else self._from_above(self.scan, upright_people)
 
     def _distance(self, person: PersonPose) -> float | None:
-        """Distance of the person from the sensor, m; NaN if the sensor position is unknown, None without a scan or
-        points."""
-        if self.scan is None or not len(person.points):
+        """Distance of the person from the sensor, m; NaN if the sensor position is unknown, None without points."""
+        if not len(person.points):
             return None
         return np.nan if self.origin is None else float(np.linalg.norm(np.median(person.points, 0) - self.origin))
 
     def _from_above(self, points: np.ndarray, people: list[PersonPose]) -> "ScanPanel":
         """The scan, points (n, 3) m in the input frame, with `people` in the level frame (z up)."""
-        from lidarpose.viz.bird_eye import ScanPanel
+        from lidarpose.viz.bird_eye import LONGEST_NAME, ScanPanel
 
         R_level_input = rotation_from_up(self.up)
         posed = [person for person in people if person.has_pose]
         label = counted(len(people), "person", "people") if people else "no people"
+        if len(posed) < len(people):
+            label += f", {len(posed)} with a pose"
         return ScanPanel(
             points=points @ R_level_input.T,
             boxes=[box for person in people if (box := person.box or _box_around(person))],
             poses=Pose(joints=np.stack([person.joints for person in posed]), skeleton=self.skeleton) if posed else None,
-            names=[shorten(str(person.id), _LONGEST_NAME) for person in posed],
+            names=[shorten(str(person.id), LONGEST_NAME) for person in posed],
             label=label,
             sensor=None if self.origin is None else tuple((R_level_input @ self.origin)[:2].tolist()),
         )

@@ -128,8 +128,10 @@ def pose_scan(
     origin = scan.level_origin
     if scan.boxes:
         pelvises = None if scan.pelvises is None else scan.pelvises @ scan.R_level_input.T
-        # not needed if the pelvises are known
-        box_centers = np.stack([scan.R_level_input @ box.center for box in scan.boxes]) if pelvises is None else None
+        if pelvises is not None and scan.verified is not None:
+            # people who were found in this scan get all passes
+            pelvises = np.where(scan.verified[:, None], np.nan, pelvises)
+        box_centers = np.stack([scan.R_level_input @ box.center for box in scan.boxes])
         is_scored = all(box.score is not None for box in scan.boxes)
         level_poses = predictor.predict_in(
             clouds, origin, skeleton, progress, pelvises=pelvises, box_centers=box_centers, is_scored=is_scored
@@ -154,7 +156,7 @@ def pose_scan(
         up=scan.up,
         # the surroundings of the boxes, for drawing
         scan=None if scan.boxes is None else scan.points,
-        origin=None if scan.boxes is None else scan.origin,
+        origin=scan.origin,
     )
 
 

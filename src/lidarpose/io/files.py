@@ -283,9 +283,11 @@ def write_atomic(path: str | os.PathLike, data: bytes | str) -> None:
 
 
 def write_all_atomic(contents: Mapping[Path, bytes]) -> None:
-    """Writes several files, either all of them or none. Raises InputError as `atomic_path` does."""
+    """Writes several files, either all of them or none; they are put in place in their order. Raises InputError as
+    `atomic_path` does."""
     with ExitStack() as stack:
-        for path, content in contents.items():
+        # the stack puts the last file in place first
+        for path, content in reversed(list(contents.items())):
             stack.enter_context(atomic_path(path)).write_bytes(content)
 
 

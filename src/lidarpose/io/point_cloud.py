@@ -216,17 +216,23 @@ def _guess_columns(data: bytes) -> tuple[int, tuple[str, ...]]:
         ring = values.reshape(-1, five)[:, -1]
         if ((ring >= 0) & (ring < _MAX_BEAMS) & (ring == np.floor(ring))).all() and ring.any():
             guess, candidates, reason = five, [five], "every fifth value is a beam number"
-    if len(candidates) > 1:
+    if candidates and guess not in candidates:
+        # neither 4 nor 5 divides the size; the columns of cut off rows of 4 or 5 would be narrower than those of 3 or 6
+        widths = {columns: _width(_whole_rows(values, columns)) for columns in (*candidates, four, five)}
+        if _SIX in widths:
+            # rows of 3 read as rows of 6 have columns of the same spread, so 6 needs a clear advantage over 3
+            widths[_SIX] += _NARROWER
+        narrowest = min(widths, key=widths.__getitem__)
+        if narrowest in candidates and widths[narrowest] < min(widths[four], widths[five]) - _NARROWER:
+            guess, alternative = narrowest, _SIX if narrowest == 3 else 3
+            reason = f"the size is a multiple of {guess} values and not of 4"
+    elif len(candidates) > 1:
         widths = {columns: _width(values.reshape(-1, columns)) for columns in candidates}
         if _SIX in widths:
             # rows of 3 read as rows of 6 have columns of the same spread, so 6 needs a clear advantage over 3
             widths[_SIX] += _NARROWER
         narrowest = min(candidates, key=widths.__getitem__)
-        if guess not in candidates:
-            # neither 4 nor 5 divides the size
-            if narrowest == _SIX:
-                guess, reason, alternative = _SIX, "rows of 3 would mix up its columns", 3
-        elif widths[narrowest] < widths[guess] - _NARROWER:
+        if widths[narrowest] < widths[guess] - _NARROWER:
             guess, reason = narrowest, f"rows of {guess} would mix up its columns"
         elif narrowest != guess:
             reason, alternative = f"nothing clearly indicates rows of {narrowest}", narrowest
@@ -235,6 +241,11 @@ def _guess_columns(data: bytes) -> tuple[int, tuple[str, ...]]:
     names = {four: " (KITTI)", five: " (nuScenes)"}
     remedy = f"give --columns {alternative}{names.get(alternative, '')} if that is wrong"
     return guess, (f"read as rows of {guess} float32{names.get(guess, '')}, since {reason}; {remedy}",)
+
+
+def _whole_rows(values: np.ndarray, columns: int) -> np.ndarray:
+    """Values (n,) as rows of `columns`, without those of an incomplete last row."""
+    return values[: len(values) // columns * columns].reshape(-1, columns)
 
 
 def _width(rows: np.ndarray) -> float:

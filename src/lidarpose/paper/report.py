@@ -29,7 +29,7 @@ from lidarpose.paper.steps import (
     length_of,
     run_steps,
 )
-from lidarpose.paper.tables import PROTOCOL, Cell, Options, Table, Target, cells, row_key
+from lidarpose.paper.tables import PROTOCOL, Cell, Options, Table, Target, cells, row_key, target_text
 from lidarpose.sample import MIN_POINTS, center_of
 
 SCHEMA = "lidarpose.paper/1"
@@ -52,23 +52,27 @@ _MEAN_POSE = 5_000
 def run_table(
     table: Table, options: Options, out: Path, chosen: Sequence[str], execute: Execute, tell: Any
 ) -> dict[str, Any]:
-    """Runs the unfinished cells of a table, rewrites it after each, and returns it.
+    """Runs the unfinished cells of a table in the chosen rows, by default in all, rewrites the table after each, and
+    returns it. The written table has all rows.
 
     A failed cell is reported and recorded, and the other cells are still run. A cell whose results exist is done, even
     if it was run elsewhere.
     """
     begin_out(out)
-    selected_cells = cells(table, options, chosen)
-    check_targets(selected_cells)
+    all_cells, chosen_cells = cells(table, options), cells(table, options, chosen)
+    check_targets(chosen_cells)
     failures: dict[int, str] = {}
-    for k, cell in enumerate(selected_cells):
+    content: dict[str, Any] = {}
+    for k, cell in enumerate(all_cells):
+        if cell not in chosen_cells:
+            continue
         if cell.evaluation is not None and not _is_there(table, cell.evaluation, out):
             try:
                 run_steps(cell.evaluation, out, execute, tell)
             except StepFailed as error:
                 failures[k] = str(error)
                 tell(f"{cell.row}, {cell.column}: failed: {error}")
-        content = write_table(table, selected_cells, options, out, failures)
+        content = write_table(table, options, out, failures)
     return content
 
 
@@ -85,20 +89,19 @@ def _is_there(table: Table, evaluation: Step, out: Path) -> bool:
     return _path(evaluation, out).is_file() and (not table.name.startswith("fig") or is_done(evaluation, out))
 
 
-def write_table(
-    table: Table, selected: Sequence[Cell], options: Options, out: Path, failed: dict[int, str] | None = None
-) -> dict[str, Any]:
-    """Writes OUT/TABLE.json and OUT/TABLE.md from the existing results, and the JSON of each finished cell."""
-    failed = failed or {}
-    entries = [_entry(cell, out, failed.get(k, "")) for k, cell in enumerate(selected)]
-    for cell, entry in zip(selected, entries, strict=True):
-        entry |= _difference(cell, _reference(table, cell, selected), out) if entry["state"] == "done" else {}
+def write_table(table: Table, options: Options, out: Path, failed: dict[int, str] | None = None) -> dict[str, Any]:
+    """Writes OUT/TABLE.json and OUT/TABLE.md from the existing results, and the JSON of each finished cell. failed:
+    number of a cell -> its error."""
+    failed, all_cells = failed or {}, cells(table, options)
+    entries = [_entry(cell, out, failed.get(k, "")) for k, cell in enumerate(all_cells)]
+    for cell, entry in zip(all_cells, entries, strict=True):
+        entry |= _difference(cell, _reference(table, cell, all_cells), out) if entry["state"] == "done" else {}
     content = {
         "schema": SCHEMA,
         "version": __version__,
         "table": table.name,
         "title": table.title,
-        "target": "real sets, the paper's protocol" if options.real else "stand-in: synthesized people",
+        "target": target_text(table, options),
         "people": options.people,
         "hours": options.hours,
         "reference": table.reference,
@@ -123,20 +126,23 @@ def _entry(cell: Cell, out: Path, failure: str) -> dict[str, Any]:
         return entry | json.loads(path.read_text())
     if not is_done(cell.evaluation, out):
         return entry | {"state": "not run", "reason": "its command was not run, or did not finish"}
-    figures = {"state": "done"} | _figures(cell, cell.evaluation, out)
+    try:
+        figures = {"state": "done"} | _figures(cell, cell.evaluation, out)
+    except LidarPoseError as error:
+        return entry | {"state": "failed", "reason": str(error)}
     write_atomic(path, json.dumps(figures, indent=1) + "\n")
     return entry | figures
 
 
-def _reference(table: Table, cell: Cell, selected: Sequence[Cell]) -> Cell | None:
+def _reference(table: Table, cell: Cell, all_cells: Sequence[Cell]) -> Cell | None:
     """The cell in the table's reference row with the same column and seed."""
     wanted = (table.reference, cell.column, cell.seed)
-    return next((other for other in selected if (other.row, other.column, other.seed) == wanted), None)
+    return next((other for other in all_cells if (other.row, other.column, other.seed) == wanted), None)
 
 
-def _difference(cell: Cell, reference: Cell | None, out: Path) -> dict[str, float]:
-    """A cell's MPJPE minus the reference's on the same people, mm, and its 95 % interval over people; empty for the
-    reference itself, for different people, or if the poses of either are missing."""
+def _difference(cell: Cell, reference: Cell | None, out: Path) -> dict[str, float | None]:
+    """A cell's MPJPE minus the reference's on the same people, mm, and its 95 % interval over people or sequences, None
+    for too few of them; empty for the reference itself, for different people, or if the poses of either are missing."""
     steps = [other.evaluation for other in (cell, reference) if other is not None and other.evaluation is not None]
     paths = [step.product(out) / POSES for step in steps]
     if len(set(paths)) < 2 or not all(path.is_file() for path in paths):
@@ -150,8 +156,8 @@ def _difference(cell: Cell, reference: Cell | None, out: Path) -> dict[str, floa
     clustered = read_scores(paths[0].with_name(FILE)).results[0].setting.clusters
     clusters = first.sequence[both] if clustered else None
     ends = aggregate.paired_interval(errors, reference_errors, np.random.default_rng(0), clusters=clusters)
-    value = aggregate.mean(errors - reference_errors)
-    return {"difference": value, "difference_low": ends.low, "difference_high": ends.high}
+    value, (low, high) = aggregate.mean(errors - reference_errors), ends.stated
+    return {"difference": value, "difference_low": low, "difference_high": high}
 
 
 def _path(evaluation: Step, out: Path) -> Path:
@@ -290,7 +296,7 @@ def _difference_text(entry: dict[str, Any]) -> str:
     if "difference" not in entry:
         return "-"
     low, high = entry["difference_low"], entry["difference_high"]
-    return f"{entry['difference']:+.1f} [{low:+.1f}, {high:+.1f}]"
+    return f"{entry['difference']:+.1f}" + ("" if low is None else f" [{low:+.1f}, {high:+.1f}]")
 
 
 def plan(table: Table, selected: Sequence[Cell], out: Path, problem: Any) -> str:

@@ -23,6 +23,8 @@ PROTOCOL = "dapt"
 REAL = ("waymo", "humanm3", "lidarhuman26m", "sloper4d")
 CORPORA = ("lipd", "freemotion", "noisemotion")
 POSES = ("freemotion-poses", "lidarhuman26m-poses")
+# the option for the poses of the paper's pre-training
+_POSES_OF_PAPER = "lidarhuman26m-poses=DIR"
 # the user's SMPL file, the body of people that are synthesized from those poses
 SMPL = "smpl"
 # on real sets all methods are trained on the crops, and about the centers, that the protocol scores with
@@ -269,8 +271,20 @@ def _motion(options: Options) -> tuple[str, ...]:
 def _corpus(options: Options, name: str) -> tuple[str, ...]:
     """Options for the poses of one corpus alone, on the user's SMPL body if available."""
     source = options.data.get(name, "")
+    subjects = _learned(source) if source and name == "lidarhuman26m-poses" else ""
     body = ("--body", options.data[SMPL]) if SMPL in options.data else ()
-    return (*_captured(source, _learned(source) if name == "lidarhuman26m-poses" else ""), *body)
+    return (*_captured(source, subjects), *body)
+
+
+def target_text(table: Table, options: Options) -> str:
+    """What a table is scored on and, for real sets, the poses of pre-training where they are not the paper's."""
+    if not options.real:
+        return "stand-in: synthesized people"
+    protocol = "real sets, the paper's protocol"
+    if "lidarhuman26m-poses" in options.data or table.rows is _corpora:
+        return protocol
+    source = Path(options.motion[0]).name if options.motion else "the procedural prior"
+    return f"{protocol}; poses of pre-training: {source}, not LiDARHuman26M as in the paper (--data {_POSES_OF_PAPER})"
 
 
 def _captured(source: str, subjects: str) -> tuple[str, ...]:
@@ -279,11 +293,14 @@ def _captured(source: str, subjects: str) -> tuple[str, ...]:
 
 
 def _learned(raw: str) -> str:
-    """The subjects of LiDARHuman26M's raw folder that are not in the test split; "" if none is in it."""
+    """The training sequences in LiDARHuman26M's raw folder, as subjects. Raises InputError if there is none."""
     sequences = sorted(path.name for path in (Path(raw) / POSE_FOLDER).glob("*") if path.is_dir())
-    rule = split_rule("lidarhuman26m", Path(raw)) if sequences else None
-    subjects = [f"{POSE_FOLDER}/{name}" for name in sequences if rule is not None and rule.of_part(name) != "test"]
-    return ",".join(subjects) if len(subjects) < len(sequences) else ""
+    rule = split_rule("lidarhuman26m", Path(raw))
+    subjects = [f"{POSE_FOLDER}/{name}" for name in sequences if rule and rule.of_part(name) == "train"]
+    if not subjects:
+        expected = f"the root of the raw dataset, with its training sequences in {POSE_FOLDER}"
+        raise InputError(f"--data lidarhuman26m-poses={raw}: expected {expected}, got {', '.join(sequences) or 'none'}")
+    return ",".join(subjects)
 
 
 def _tuned(options: Options, *words: str) -> tuple[str, ...]:
@@ -388,7 +405,8 @@ def _augmentations(options: Options) -> list[Row]:
     pretrain_recorded, pretrain_sampled = (
         _pretrained(options, *words) for words in (("--set", "recorded=1,keep=1"), ("--keep", "1"))
     )
-    why = "" if motion else "recorded positions need captured motion: give --motion FILE"
+    source = f"--data {_POSES_OF_PAPER}" if options.real else "--motion FILE"
+    why = "" if motion else f"recorded positions need captured motion: give {source}"
     rows = [
         Row(name="scratch", finetune=_random(options), published={"waymo": 59.2}),
         Row(name="+ pre-training", finetune=finetune, pretrain=pretrain_recorded, why=why, published={"waymo": 52.9}),

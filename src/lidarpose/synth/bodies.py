@@ -45,15 +45,16 @@ _JUMP = 0.06
 _SENSED, _AHEAD = (4.0, 40.0), 12.0
 
 
-def smpl_rig(body: str | Path, motion: str | Path | None = None) -> Rig:
+def smpl_rig(body: str | Path, motion: str | Path | None = None, subjects: tuple[str, ...] = ()) -> Rig:
     """The user's SMPL, SMPL+H or SMPL-X file as the body for synthesis.
 
     Args:
         body: the file.
-        motion: a file or folder of motion; its people's shapes are used, see `load_betas`. If there are none,
-            `_SHAPES` shapes are drawn from a normal distribution.
+        motion: a file or folder of motion; its people's shapes are used, of a folder those of the subjects, see
+            `load_betas`. If there are none, `_SHAPES` shapes are drawn from a normal distribution.
+        subjects: by default all.
     """
-    betas = np.zeros((0, 1)) if motion is None else load_betas(motion)
+    betas = np.zeros((0, 1)) if motion is None else load_betas(motion, subjects)
     if not len(betas):
         betas = np.clip(np.random.default_rng(0).normal(size=(_SHAPES, 10)), -2, 2)
     model = load_body(body)

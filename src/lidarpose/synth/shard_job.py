@@ -111,7 +111,7 @@ class SynthesisJob:
             raise file_error(
                 self.motion, f"no clip lasts {CLIP_FRAMES / CLIP_HZ:g} s: give longer motion, or omit --clips"
             )
-        rig = None if self.body is None else smpl_rig(self.body, self.motion)
+        rig = None if self.body is None else smpl_rig(self.body, self.motion, self.subjects or ())
         return Generator(scene=scene, bank=bank, captured=self.share, rig=rig)
 
     def card(self) -> DatasetCard:

@@ -103,7 +103,7 @@ class SyntheticSource:
         bank = PoseBank.from_clips(self.motion, self.subjects) if self.motion else None
         captured = self.captured if bank is not None else 0.0
         scene = scene_config(self.scene).changed(self.set)
-        rig = None if self.body is None else smpl_rig(self.body, self.motion)
+        rig = None if self.body is None else smpl_rig(self.body, self.motion, self.subjects)
         return Generator(scene=scene, bank=bank, captured=captured, rig=rig, measure=False)
 
     def example(self, index: int) -> Example:

@@ -366,12 +366,15 @@ def _of_clips(setup: TrainSetup, source: ClipSource) -> TrainSetup:
 def _held_out(
     recipe: Finetune, split: str | None, dataset: InMemoryDataset
 ) -> tuple[tuple[str, ...], InMemoryDataset | None]:
-    """Held-out sequences, and the validation dataset: the split val if it exists, else those sequences."""
+    """Held-out sequences, and the validation dataset: the split val if it exists, else those sequences; none if
+    `hold_out` is 0."""
+    if not recipe.hold_out:
+        return (), None
     if split not in (None, "val"):
         # the dataset may have no split val
         with suppress(InputError):
             return (), InMemoryDataset.load(recipe.data, split="val", interval=recipe.interval)
-    if not recipe.hold_out or len(dataset.sequences) < _LEAST_SEQUENCES:
+    if len(dataset.sequences) < _LEAST_SEQUENCES:
         return (), None
     count = max(round(recipe.hold_out * len(dataset.sequences)), 1)
     if count == len(dataset.sequences):

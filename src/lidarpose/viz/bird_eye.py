@@ -18,6 +18,7 @@ from lidarpose.viz.draw import SIDE_COLORS, draw_people, png_of, shortened, stac
 from lidarpose.viz.person_view import Panel, bone_pairs, bone_sides, box_edges, finite, is_known
 
 MAX_SCANS = 12
+LONGEST_NAME = 12  # characters of a person's name that are drawn in a scan
 _MAX_POINTS = 120_000  # per scan; more points would only cover each other at this size
 _DPI, _PANEL, _TITLE = 110, 7.6, 0.6  # inches
 _WIDE, _CARDS_IN_ROW = 11.5, 4  # width of a scan, inches, above the cards of at least this number of people
@@ -109,7 +110,8 @@ def draw_scans(
     )
     tracks = "; dotted: path over the frames" if any(panel.tracks for panel in panels) else ""
     limbs = "; left limbs blue, right ones orange" if any(is_known(panel.poses) for panel in panels) else ""
-    note = f"arrow: facing{tracks}{limbs}"
+    arrows = "arrow: heading of the box" if any(panel.boxes for panel in panels) else ""
+    note = f"{arrows}{tracks}{limbs}".removeprefix("; ")
     figure.text(0.15 / width, 1 - 0.42 / height, note, fontsize=8, color=_FAINT, va="top")
     for number, panel in enumerate(panels):
         row, column = divmod(number, columns)
@@ -222,7 +224,8 @@ def _draw_box(ax, box: Box, offset: tuple[float, float]) -> None:
     )
     if box.id is not None:
         ax.annotate(
-            str(box.id), box.center[:2], offset, textcoords="offset points", fontsize=9, weight="bold", color=_BOX,
-            zorder=7, parse_math=False, bbox={"fc": "white", "ec": "none", "alpha": 0.7, "pad": 0.8},
+            shortened(str(box.id), LONGEST_NAME), box.center[:2], offset, textcoords="offset points", fontsize=9,
+            weight="bold", color=_BOX, zorder=7, parse_math=False,
+            bbox={"fc": "white", "ec": "none", "alpha": 0.7, "pad": 0.8},
             ha="center", va="center", arrowprops={"arrowstyle": "-", "color": _BOX, "lw": 0.4, "shrinkB": 6},
         )  # fmt: skip

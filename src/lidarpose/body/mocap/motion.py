@@ -74,10 +74,10 @@ class Motion:
         subject without clips."""
         subjects = (subjects,) if isinstance(subjects, str) else tuple(subjects)
         for subject in subjects:
-            if not any(_is_of(name, subject) for name in self.names):
+            if not any(is_of(name, subject) for name in self.names):
                 subject_list = ", ".join(sorted({name.partition("_")[0] for name in self.names}))
                 raise InputError(f"no clip starts with {subject!r}: there are {subject_list}")
-        clip_mask = np.array([any(_is_of(name, subject) for subject in subjects) for name in self.names], bool)
+        clip_mask = np.array([any(is_of(name, subject) for subject in subjects) for name in self.names], bool)
         frame_mask = np.repeat(clip_mask, self.length)
         arrays = {"rotations": self.rotations[frame_mask], "translation": self.translation[frame_mask]}
         names = tuple(name for name, is_selected in zip(self.names, clip_mask, strict=True) if is_selected)
@@ -269,7 +269,7 @@ def usable_clips(
     return {"names": piece_names, "length": np.array(counts), "fps": float(fps), "dropped": int((~good).sum())}
 
 
-def _is_of(name: str, subject: str) -> bool:
+def is_of(name: str, subject: str) -> bool:
     """Whether a clip's name starts with `subject`. A prefix of a longer number does not match: 102_03 is not of 10, nor
     10_01 of 1."""
     return name.startswith(subject) and not (subject[-1:].isdigit() and name[len(subject) :][:1].isdigit())

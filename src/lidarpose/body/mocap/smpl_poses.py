@@ -25,12 +25,13 @@ with the same `seq_path` or `motion_id`, in order, form a clip.
 
 import os
 import reprlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lidarpose.body.mocap.motion import Motion, join, standing_axis, usable_clips
+from lidarpose.body.mocap.motion import Motion, is_of, join, standing_axis, usable_clips
 from lidarpose.body.mocap.retarget import motion_from_joints
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_from_up
 from lidarpose.io.files import FRAME_NUMBER, file_error, read_json
@@ -197,11 +198,17 @@ def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: fl
     return join(motions, source=f"corpus: {path}")
 
 
-def load_betas(path: str | os.PathLike) -> np.ndarray:
+def load_betas(path: str | os.PathLike, subjects: Sequence[str] = ()) -> np.ndarray:
     """The distinct body shapes (n, 10) in a motion file, or in all files of a folder and its subfolders: `beta` of
-    LiDARHuman26M's files and SLOPER4D's labels, `betas` of AMASS files. n is 0 if there are no shapes."""
+    LiDARHuman26M's files and SLOPER4D's labels, `betas` of AMASS files. n is 0 if there are no shapes.
+
+    subjects: see `Motion.of`; in a folder, only files whose paths in it start with one of them are read.
+    """
     path = Path(path)
-    files = sorted(path.rglob("*")) if path.is_dir() else [path]
+    files = [path]
+    if path.is_dir():
+        paths = {file: file.relative_to(path).as_posix() for file in sorted(path.rglob("*"))}
+        files = [file for file, name in paths.items() if not subjects or any(is_of(name, s) for s in subjects)]
     rows: list[np.ndarray] = []
     for file in files:
         if file.suffix.lower() == ".json" and FRAME_NUMBER.fullmatch(file.stem):

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from lidarpose.errors import InputError, check_int
 from lidarpose.io.files import file_error, listed
-from lidarpose.io.point_cloud import RECORDINGS
+from lidarpose.io.point_cloud import RECORDINGS, SUFFIXES
 from lidarpose.io.sources.folders import list_folder, natural_key, open_files, scan_files
 from lidarpose.io.sources.frame import (
     ChainedRecording,
@@ -101,6 +101,8 @@ def _matches(path: str | os.PathLike) -> list[Path]:
         return [Path(path)]
     pattern = os.fspath(path)
     paths = sorted(map(Path, glob.glob(pattern, recursive=True)), key=natural_key)
+    # as in a folder, files of other formats, such as labels, are left out
+    paths = [p for p in paths if p.is_dir() or p.suffix.lower() in (*SUFFIXES, *RECORDINGS)] or paths
     if not paths:
         problem = "no file matches the pattern" if glob.has_magic(pattern) else "no such file or folder"
         raise file_error(path, f"{problem}; expected point files, a folder of them or a recording: check the path")
