@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose import Box, InputError
-from lidarpose.tracking.assignment import assign, assign_plain
+from lidarpose.tracking.assignment import assign
 from lidarpose.tracking.tracker import POSITION_SD, SPEED_CHANGE, SPEED_SD, Tracker
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -27,30 +27,6 @@ def crowd(rng, people, frames, drop=0.3):
 
 
 # ---- assignment
-
-
-@given(seed=SEEDS, rows=st.integers(0, 8), columns=st.integers(0, 8), ties=st.booleans())
-@settings(max_examples=150, deadline=None)
-def test_assign_plain_matches_scipy(seed, rows, columns, ties):
-    optimize = pytest.importorskip("scipy.optimize")
-    rng = np.random.default_rng(seed)
-    costs = rng.integers(-3, 3, (rows, columns)).astype(float) if ties else rng.normal(0, 5, (rows, columns))
-    own, theirs = assign_plain(costs), optimize.linear_sum_assignment(costs)
-    assert len(own[0]) == min(rows, columns) and len(set(own[1])) == len(own[1]) and (np.diff(own[0]) > 0).all()
-    assert costs[own].sum() == pytest.approx(costs[theirs].sum())
-    if not ties:
-        np.testing.assert_array_equal(own, theirs)
-
-
-@pytest.mark.parametrize("n, m", [(40, 60), (60, 40), (50, 50)])
-def test_assign_plain_is_optimal_for_large_costs(n, m):
-    rng = np.random.default_rng(n)
-    # costs with a known optimum: reduced costs are 0 for its pairs and positive for others
-    extra, order = rng.uniform(0.01, 1, (n, m)), rng.permutation(max(n, m))
-    pairs = [(i, order[i]) for i in range(n)] if n <= m else [(order[j], j) for j in range(m)]
-    extra[tuple(np.transpose(pairs))] = 0.0
-    found = assign_plain(extra + rng.normal(size=(n, 1) if n <= m else (1, m)))
-    np.testing.assert_array_equal(np.transpose(found), sorted(pairs))
 
 
 def test_assign_makes_only_pairs_of_negative_cost():

@@ -10,12 +10,12 @@ from dataclasses import astuple, dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import linear_sum_assignment
 
 from lidarpose.errors import InputError
 from lidarpose.eval.metrics.aggregate import Score, as_flags, as_numbers, check_positive, mean
 from lidarpose.eval.metrics.joint_errors import checked_poses, joint_errors
 from lidarpose.skeleton import WAYMO14, Skeleton, as_skeleton
-from lidarpose.tracking.assignment import assign_plain
 
 # spread of each joint in units of the box's scale: twice COCO's sigmas; head_center is derived by the same method
 SIGMAS = {"nose": 0.052, "head_center": 0.158, "shoulder": 0.158, "elbow": 0.144, "wrist": 0.124}
@@ -285,7 +285,7 @@ def match_people(
     is_near = np.linalg.norm(pred[None] - np.where(labeled[..., None], true, np.inf)[:, None], axis=-1) < penalty
     is_near_label = (is_near & predicted[None]).any((0, 2))
     num_inside = np.where(~has_label[:, None] & ~is_near_label, (distance < _WITHIN).sum(-1), 0)
-    rows, columns = assign_plain(-num_inside)
+    rows, columns = linear_sum_assignment(-num_inside)
     excused = columns[num_inside[rows, columns] > 0]
 
     is_free = np.any(predicted, axis=1)
@@ -297,7 +297,7 @@ def match_people(
     # joints that are neither labeled nor predicted cost nothing, so that the mean is over all J
     total = np.nan_to_num(cost).mean(-1)
     total[distance[np.ix_(people, candidates)].min(-1, initial=np.inf) > penalty] = penalty
-    rows, columns = assign_plain(total)
+    rows, columns = linear_sum_assignment(total)
     is_match = total[rows, columns] < penalty
     pairs = np.stack([people[rows[is_match]], candidates[columns[is_match]]], -1)
     missed, extra = np.setdiff1d(people, pairs[:, 0]), np.setdiff1d(candidates, pairs[:, 1])
