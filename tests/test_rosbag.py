@@ -1,5 +1,6 @@
 """Point clouds of ROS recordings written with rosbags: containers, field layouts, transforms and damaged files."""
 
+import json
 import struct
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hostile_files import with_changed_bytes
+from ouster_packets import decoded, expected_points, metadata, packets_of, ranges_of
 from velodyne_packets import vlp16
 
 from lidarpose.cli import main
@@ -14,7 +16,7 @@ from lidarpose.errors import InputError
 from lidarpose.inference.background import is_static, learn_background
 from lidarpose.io.files import FormatError
 from lidarpose.io.sources import DamagedFrame, livox, open_source
-from lidarpose.io.sources.rosbag import decode_cloud
+from lidarpose.io.sources.ros_messages import decode_cloud
 from lidarpose.recording.predict_recording import predict_recording
 
 rosbags = pytest.importorskip("rosbags", reason="the extra recordings is not installed")
@@ -307,6 +309,51 @@ def test_velodyne_packets_of_messages_become_frames(tmp_path, suffix):
         assert np.allclose(np.linalg.norm(sweep.points, axis=1), distance, atol=0.1)
         assert sorted(np.unique(sweep.ring)) == list(range(16)) and sweep.time == START / 1e9 + k / 10
         assert len(sweep.points) == 75 * 12 * 32 and np.array_equal(sweep.origin, np.zeros(3))
+
+
+PACKET = "ouster_sensor_msgs/msg/PacketMsg"
+for ouster_store in (ROS1, ROS2):
+    ouster_store.register(get_types_from_msg("uint8[] buf", PACKET))
+
+
+def ouster_messages(store, *, text):
+    """Two turns of an Ouster sensor, packet by packet, among packets of its IMU, and its metadata."""
+    types = store.types
+    payloads = packets_of([7, 8])
+    times = [START + k * 10**6 for k in range(len(payloads))]
+    packet_type = types[PACKET]
+    messages = [
+        ("/ouster/lidar_packets", packet_type(buf=np.frombuffer(payload, np.uint8)), time)
+        for payload, time in zip(payloads, times, strict=True)
+    ]
+    messages.append(("/ouster/imu_packets", packet_type(buf=np.zeros(48, np.uint8)), START + 10**7))
+    if text:
+        messages.append(("/ouster/metadata", types["std_msgs/msg/String"](data=text), START))
+    return messages
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".db3", ".bag"])
+def test_ouster_packets_of_messages_become_frames(tmp_path, suffix):
+    text = json.dumps(metadata())
+    source = open_source(write(tmp_path / f"walk{suffix}", ouster_messages(store_of(suffix), text=text)))
+    frames = list(source)
+    assert len(frames) == 2 and source.warnings == ()
+    for frame, number in zip(frames, (7, 8), strict=True):
+        np.testing.assert_allclose(decoded(frame), expected_points(ranges_of(number)), atol=1e-9)
+    # the metadata may be in a file
+    path = write(tmp_path / f"no{suffix}", ouster_messages(store_of(suffix), text=""))
+    (tmp_path / "meta.json").write_text(text)
+    assert len(list(open_source(path, meta=tmp_path / "meta.json"))) == 2
+    with pytest.raises(InputError, match=r"no topic with its metadata: give the sensor's JSON file \(--meta\)"):
+        open_source(path)
+    # clouds come first, but the topic of the packets can be named
+    both = [*clouds(suffix, count=2), *ouster_messages(store_of(suffix), text=text)]
+    path = write(tmp_path / f"both{suffix}", both)
+    assert len(next(iter(open_source(path))).points) == 40
+    (first, _) = open_source(path, topic="/ouster/lidar_packets")
+    assert np.array_equal(first.points, frames[0].points)
+    with pytest.raises(InputError, match="expected lidar packets of"):
+        open_source(path, topic="/ouster/imu_packets")
 
 
 def test_invalid_returns_are_dropped_with_their_rings(tmp_path):

@@ -18,7 +18,7 @@ from lidarpose.errors import InputError
 from lidarpose.io.files import FormatError, file_error, read_bytes, shorten
 from lidarpose.io.sources import velodyne
 from lidarpose.io.sources.frame import ReadingOptions, Recording, Sweep
-from lidarpose.io.sources.pcap import PacketRecording
+from lidarpose.io.sources.pcap import Datagrams, PacketRecording
 
 # bytes of a pixel, by profile. The range comes first: for RNG15 in 15 bits and steps of 8 mm, for others in 19 bits
 # (LEGACY 20) and mm
@@ -36,12 +36,17 @@ _PIXEL_BYTES = {
     "RNG15_RFL8_WIN8": 4,
     "FUSA_RNG15_RFL8_NIR8_DUAL": 8,
 }
+# ROS packages of the driver, of different versions
+_PACKAGES = ("ouster_sensor_msgs", "ouster_ros")
 _MAX_COLUMNS, _MAX_BEAMS, _MAX_PACKET, _MAX_NUMBER = 4096, 256, 65507, 1e9
 # lidar_to_sensor_transform, mm, of sensors whose metadata does not contain it
 _LIDAR_TO_SENSOR = (-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 36.18, 0, 0, 0, 1)
 # lidar_origin_to_beam_origin_mm of sensors whose metadata does not contain it, by product line, and of others
 _BEAM_ORIGINS, _BEAM_ORIGIN = {"OS-0-": 27.67, "OS-1-": 15.806, "OS-2-": 13.762}, 12.163
 _COLUMNS_PER_PACKET = 16
+# messages of the ROS driver, each with one packet
+PACKET_TYPES = tuple(f"{package}/{folder}PacketMsg" for package in _PACKAGES for folder in ("msg/", ""))
+PACKET_DEFINITION = "uint8[] buf"
 # number of datagrams that are searched for the port in the metadata
 _NUM_PEEKED = 2000
 
@@ -72,7 +77,8 @@ def open_recording(path: Path, options: ReadingOptions) -> Recording:
 
 
 class OusterFormat:
-    """The layout of a sensor's packets and the directions of its beams, from the sensor's metadata.
+    """The layout of a sensor's packets and the directions of its beams, from the sensor's metadata: a JSON file, or its
+    content.
 
     columns: columns of a frame; columns_per_packet: columns of a packet; beams: beams of a column; window: first and
     last column that is sent; serial: the sensor's serial number or None; packet: dtype of a packet with `columns`, each
@@ -82,8 +88,8 @@ class OusterFormat:
         InputError: The file is not a sensor's metadata.
     """
 
-    def __init__(self, path: Path):
-        data = read_bytes(path, expected="the sensor's metadata (JSON)", most=2**24)
+    def __init__(self, path: Path, content: bytes | str | None = None):
+        data = read_bytes(path, expected="the sensor's metadata (JSON)", most=2**24) if content is None else content
         try:
             metadata = json.loads(data)
             if not isinstance(metadata, dict):
@@ -198,14 +204,16 @@ class OusterRecording(PacketRecording):
     """A capture of an Ouster sensor's packets, decoded with the sensor's metadata.
 
     Args:
-        path: the capture.
-        metadata: the sensor's JSON file.
+        path: the capture, or another recording.
+        metadata: the sensor's JSON file, or the recording that contains it.
+        content: of the JSON file, if it is in a recording.
+        datagrams: the packets, if they are in another recording.
     """
 
-    def __init__(self, path: Path, metadata: Path):
+    def __init__(self, path: Path, metadata: Path, *, content: str | None = None, datagrams: Datagrams | None = None):
         self.metadata = metadata
-        self.format = OusterFormat(metadata)
-        super().__init__(path, self.format.packet.itemsize)
+        self.format = OusterFormat(metadata, content)
+        super().__init__(path, self.format.packet.itemsize, datagrams)
         self.flow = self._find_flow()
         self._num_lost = self._num_sent = 0
         self._serial: int | None = None

@@ -7,7 +7,7 @@ import struct
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple, Protocol
 
 from lidarpose.errors import InputError
 from lidarpose.io.files import FormatError, file_error, unreadable
@@ -116,19 +116,29 @@ class Capture:
         return b"".join(parts[offset][0] for offset in sorted(parts))
 
 
+class Datagrams(Protocol):
+    """Recorded datagrams. num_cut: number of those that cannot be read, after iteration. Iteration raises InputError
+    behind the last readable datagram of a damaged recording."""
+
+    num_cut: int
+
+    def __iter__(self) -> Iterator[Datagram]: ...
+
+
 class PacketRecording(ABC):
     """A capture of one sensor's packets. A `Recording`; a frame is one revolution of the sensor.
 
     Args:
         path: the capture.
         packet_bytes: the size of the sensor's packets; by default those of the first flow with this size are read.
+        datagrams: the packets if `path` is another recording.
     """
 
     count = None
 
-    def __init__(self, path: Path, packet_bytes: int):
+    def __init__(self, path: Path, packet_bytes: int, datagrams: Datagrams | None = None):
         self.name = str(path)
-        self.capture = Capture(path)
+        self.capture: Datagrams = Capture(path) if datagrams is None else datagrams
         self.packet_bytes = packet_bytes
         self.flow: tuple[bytes, int] | None = None
         self.num_other = 0

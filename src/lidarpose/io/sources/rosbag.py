@@ -1,5 +1,5 @@
-"""Point clouds in ROS recordings: sensor_msgs/PointCloud2, Livox's CustomMsg and packets of Velodyne sensors in MCAP,
-ROS 1 bags and rosbag2's SQLite files.
+"""Point clouds in ROS recordings: sensor_msgs/PointCloud2, Livox's CustomMsg and packets of Velodyne and Ouster sensors
+in MCAP, ROS 1 bags and rosbag2's SQLite files.
 
 Messages are decoded with the library rosbags. The sensor pose comes from the recording's transforms (tf), if they
 connect the clouds' frame to a world frame.
@@ -7,18 +7,18 @@ connect the clouds' frame to a world frame.
 
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Iterator
-from functools import cache, partial
-from itertools import islice, product
+from collections.abc import Iterator
+from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lidarpose.errors import InputError, needs_extra
+from lidarpose.errors import InputError
 from lidarpose.geometry import quaternion_to_matrix, rigid_transform
 from lidarpose.io.files import FormatError, file_error, shorten, unreadable
-from lidarpose.io.sources import livox, velodyne
+from lidarpose.io.sources import livox, ouster_bag, velodyne
 from lidarpose.io.sources.containers import (
     McapFile,
     Message,
@@ -29,15 +29,10 @@ from lidarpose.io.sources.containers import (
     unpacked_message,
 )
 from lidarpose.io.sources.folders import natural_key
-from lidarpose.io.sources.frame import LazyFrame, ReadingOptions, Sweep
+from lidarpose.io.sources.frame import LazyFrame, ReadingOptions, Recording, Sweep
+from lidarpose.io.sources.ros_messages import CLOUD_TYPES, FRAME_TYPES, TRANSFORM_TYPES, decode_cloud, decoders
 
 _FILES: dict[str, type[RecordFile] | type[SqliteFile]] = {".mcap": McapFile, ".bag": Ros1File, ".db3": SqliteFile}
-_CLOUD = ("sensor_msgs/msg/PointCloud2", "sensor_msgs/PointCloud2")
-_TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf2_msgs/TFMessage", "tf/tfMessage")
-# data types of a PointField
-_DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-# names of the fields in which drivers publish a point's beam
-_RING = ("ring", "channel", "line", "laser_id")
 # fixed frames; the first is preferred (REP 105)
 _WORLDS = ("map", "world", "odom")
 # frames of the vehicle or the world, whose origin is not the sensor position
@@ -55,10 +50,10 @@ _MIN_NORM = 1e-3
 _MAX_KEPT = 1000
 
 
-def open_recording(path: Path, options: ReadingOptions) -> "BagRecording":
+def open_recording(path: Path, options: ReadingOptions) -> Recording:
     """Opens a .mcap, .bag or .db3 file, or a folder that rosbag2 wrote.
 
-    By default, the topic is the one with most clouds.
+    By default, the topic is the one with most clouds, or if there are none, those with packets of an Ouster sensor.
 
     Raises:
         InputError: The recording does not exist, has no point clouds, or does not have the topic.
@@ -74,10 +69,11 @@ def open_recording(path: Path, options: ReadingOptions) -> "BagRecording":
     return open_parts(str(path), files, options)
 
 
-def open_parts(name: str, files: list[Path], options: ReadingOptions) -> "BagRecording":
+def open_parts(name: str, files: list[Path], options: ReadingOptions) -> Recording:
     """Opens consecutive files of one recording. Raises the same errors as `open_recording`."""
-    _decoders()
-    return BagRecording(name, [_open_file(file) for file in files], options.topic)
+    decoders()
+    opened_files = [_open_file(file) for file in files]
+    return ouster_bag.open_packets(name, opened_files, options) or BagRecording(name, opened_files, options.topic)
 
 
 def _open_file(path: Path) -> RecordFile | SqliteFile:
@@ -108,7 +104,7 @@ class BagRecording:
         self.topics = topics
         self.topic = self._choose(topic)
         self._transforms = {
-            key for key, entry in topics.items() if entry.type in _TRANSFORMS and entry.encoding in _decoders()
+            key for key, entry in topics.items() if entry.type in TRANSFORM_TYPES and entry.encoding in decoders()
         }
         self._world: str | None = None
         self._has_stamps = True
@@ -119,11 +115,11 @@ class BagRecording:
         clouds = {
             key: entry.count
             for key, entry in self.topics.items()
-            if entry.type in (*_CLOUD, *livox.TYPES, *velodyne.SCAN_TYPES) and entry.encoding in _decoders()
+            if entry.type in FRAME_TYPES and entry.encoding in decoders()
         }
         if not clouds:
             topics = ", ".join(f"{key} ({entry.type}, {entry.encoding})" for key, entry in self.topics.items())
-            expected = f"{_CLOUD[0]}, Livox's CustomMsg or {velodyne.SCAN_TYPES[0]}"
+            expected = f"{CLOUD_TYPES[0]}, Livox's CustomMsg, {velodyne.SCAN_TYPES[0]} or Ouster's PacketMsg"
             problem = f"has no point clouds (expected a topic of {expected}); its topics are"
             raise file_error(self.name, f"{problem} {shorten(topics, 1000) or 'none'}")
         names = ", ".join(f"{key} ({count})" for key, count in clouds.items())
@@ -186,11 +182,11 @@ class BagRecording:
         """The content of a message, or None if it is damaged."""
         topic = self.topics[message.topic]
         data = unpacked_message(message.data)
-        names = (_CLOUD, velodyne.SCAN_TYPES, _TRANSFORMS)
+        names = (CLOUD_TYPES, velodyne.SCAN_TYPES, TRANSFORM_TYPES)
         try:
             if topic.type in livox.TYPES:
                 return livox.decode_cloud(data, topic.encoding)
-            return _decoders()[topic.encoding](data, next(types[0] for types in names if topic.type in types))
+            return decoders()[topic.encoding](data, next(types[0] for types in names if topic.type in types))
         except Exception:
             return None
 
@@ -251,59 +247,6 @@ class _Cloud:
             points, ring = decode_cloud(self.content)
         origin = None if self.frame_id in _NO_SENSORS else np.zeros(3)
         return Sweep(points=points, T_world_sensor=T_world_sensor, origin=origin, ring=ring)
-
-
-@cache
-def _decoders() -> dict[str, Callable[[bytes, str], Any]]:
-    """The function that decodes messages, for each encoding."""
-    with needs_extra("reading a ROS recording"):
-        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-    ros1, ros2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
-    ros1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", _TRANSFORMS[0]))
-    for store, (name, definition) in product((ros1, ros2), velodyne.SCAN_DEFINITIONS.items()):
-        store.register(get_types_from_msg(definition, name))
-    return {"cdr": ros2.deserialize_cdr, "ros1": ros1.deserialize_ros1}
-
-
-def decode_cloud(cloud: Any) -> tuple[np.ndarray, np.ndarray | None]:
-    """The points (n, 3) of a PointCloud2, float64, and the ring (n,) of each if it has one.
-
-    Fields may lie anywhere in a point, in any number type and either byte order; rows may be padded.
-
-    Raises:
-        FormatError: The cloud has no x, y, z, or its layout does not fit its data.
-    """
-    names = {field.name.lower(): field for field in reversed(cloud.fields)}
-    ring = next((name for name in _RING if name in names), None)
-    field_names = ["x", "y", "z", *([ring] if ring else [])]
-    if not {"x", "y", "z"} <= names.keys():
-        actual = shorten(", ".join(names)) or "none"
-        raise FormatError("fields x, y, z in a PointCloud2", actual, "choose another topic")
-    order = ">" if cloud.is_bigendian else "<"
-    for name in field_names:
-        field = names[name]
-        size = np.dtype(_DATATYPES.get(field.datatype, "f8")).itemsize
-        if field.datatype not in _DATATYPES or field.offset + size > cloud.point_step:
-            actual = f"datatype {field.datatype} at byte {field.offset} of {cloud.point_step}"
-            raise FormatError(f"the field {name} within a point", actual, "record it again")
-    formats = [order + _DATATYPES[names[name].datatype] for name in field_names]
-    offsets = [names[name].offset for name in field_names]
-    point = np.dtype({"names": field_names, "formats": formats, "offsets": offsets, "itemsize": cloud.point_step})
-    row_bytes = cloud.width * cloud.point_step
-    row_step = cloud.row_step
-    if row_step < row_bytes or row_step * (cloud.height - 1) + row_bytes > len(cloud.data):
-        # many drivers do not set the row step, or set it to the size of the whole cloud
-        row_step = row_bytes
-    if row_bytes * cloud.height > len(cloud.data):
-        layout = f"{cloud.height} rows of {cloud.width} points of {cloud.point_step} bytes"
-        raise FormatError(layout, f"{len(cloud.data)} bytes", "the cloud is cut off")
-    shape, strides = (cloud.height, cloud.width), (row_step, cloud.point_step)
-    rows = np.ndarray(shape, point, cloud.data, strides=strides) if cloud.width * cloud.height else np.empty(0, point)
-    points = np.stack([rows[name].ravel().astype(np.float64) for name in "xyz"], axis=-1)
-    if ring is None:
-        return points, None
-    with np.errstate(invalid="ignore"):
-        return points, rows[ring].ravel().astype(np.int64)
 
 
 class TransformTree:
