@@ -23,7 +23,7 @@ class Unread(nn.Module):
     def forward(
         self,
         anchors: Tensor,
-        believed: RotaryEmbedding,
+        anchor_places: RotaryEmbedding,
         voxels: Tensor,
         places: RotaryEmbedding,
         log_count: Tensor,

@@ -336,7 +336,7 @@ def test_crowded_crops_keep_center_of_labeled_person():
             pose=replace(sample.pose, visible=np.ones(26, np.float32)),
             joint_labels=np.full(26, SEEN, np.uint8),
         )
-        shown = augmented(stored, Augmentation(refined=0.0), np.random.default_rng(index))
+        shown = augmented(stored, Augmentation(pelvis_centered=0.0), np.random.default_rng(index))
         np.testing.assert_allclose(shown.joints, sample.pose.joints - sample.center, atol=1e-5)
     assert np.median(others) > 40
 

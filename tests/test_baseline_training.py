@@ -344,7 +344,7 @@ def test_prn_pretrain_evaluate_predict_and_finetune(tmp_path, capsys, monkeypatc
 
 def _learned(objective, people, points, steps, rate):
     """Train on a fixed batch, with a rate that falls in the second half; return its error in evaluation mode in mm."""
-    source = SyntheticSource(scene="paper", seed=5, refined=0.0)
+    source = SyntheticSource(scene="paper", seed=5, pelvis_centered=0.0)
     examples = [e for e in map(source.example, range(3 * people)) if len(e.points) >= 30][:people]
     assert len(examples) == people
     rows = [np.random.default_rng(e.seed).permutation(len(e.points))[:points] for e in examples]

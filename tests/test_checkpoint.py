@@ -327,7 +327,7 @@ def test_networks_table_entries_are_complete():
         config, network = entry.part("config"), entry.part("network")
         assert config.kind == kind and issubclass(network, torch.nn.Module)
         assert callable(entry.part("objective")) and callable(entry.part("backend"))
-        assert {"name", "joints", "layers", "to_dict"} <= set(dir(config)) | set(config.__dataclass_fields__)
+        assert {"name", "joints", "min_tensors", "to_dict"} <= set(dir(config)) | set(config.__dataclass_fields__)
 
 
 def test_header_rejects_joints_of_no_known_skeleton():

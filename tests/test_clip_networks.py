@@ -135,15 +135,15 @@ def test_dataset_clips_counts_skipped_frames_by_reason(clips, tmp_path):
 
 def test_clip_example_is_centered_per_frame(clips):
     rng = np.random.default_rng(0)
-    for trans_center, refined in ((False, 0.0), (False, 1.0), (True, 1.0)):
-        example = clip_example(clips[0], rng, trans_center=trans_center, refined=refined)
+    for trans_center, pelvis_centered in ((False, 0.0), (False, 1.0), (True, 1.0)):
+        example = clip_example(clips[0], rng, trans_center=trans_center, pelvis_centered=pelvis_centered)
         for frame, sample, cloud in zip(example.frames, clips[0], example.clouds["background"], strict=True):
             center = sample.pose.joints[0] - frame.joints[0]
             np.testing.assert_allclose(frame.points + center, sample.points, atol=1e-5)
             np.testing.assert_allclose(cloud + center, sample.background, atol=1e-5)
             if trans_center:
                 assert np.abs(frame.joints[0]).max() == 0, "of the package's body the pelvis is trans"
-            elif not refined:
+            elif not pelvis_centered:
                 np.testing.assert_allclose(center, sample.center, atol=1e-5)
             else:
                 assert 0 < np.abs(frame.joints[0]).max() < 0.3
@@ -223,8 +223,8 @@ def test_clip_network_trains_evaluates_and_predicts(name, folder, clips, tmp_pat
 def test_clip_example_turn_rotates_clip_as_a_whole(clips):
     """Points, joints, surroundings and root rotations turn by one angle; other rotations stay the same."""
     clip = clips[0]
-    plain = clip_example(clip, np.random.default_rng(4), refined=0.0)
-    turned = clip_example(clip, np.random.default_rng(4), refined=0.0, turn=True)
+    plain = clip_example(clip, np.random.default_rng(4), pelvis_centered=0.0)
+    turned = clip_example(clip, np.random.default_rng(4), pelvis_centered=0.0, turn=True)
     bones = [np.stack([frame.joints[1] - frame.joints[0] for frame in one.frames]) for one in (plain, turned)]
     angles = [np.arctan2(bone[:, 1], bone[:, 0]) for bone in bones]
     angle = (angles[1] - angles[0])[0]
@@ -239,7 +239,7 @@ def test_clip_example_turn_rotates_clip_as_a_whole(clips):
     roots = [axis_angle_to_matrix(one.rotations[:, 0]) for one in (plain, turned)]
     np.testing.assert_allclose(roots[1], R @ roots[0], atol=1e-5)
     np.testing.assert_array_equal(turned.rotations[:, 1:], plain.rotations[:, 1:])
-    again = clip_example(clip, np.random.default_rng(5), refined=0.0, turn=True)
+    again = clip_example(clip, np.random.default_rng(5), pelvis_centered=0.0, turn=True)
     assert np.abs(again.frames[0].joints - turned.frames[0].joints).max() > 0.01
 
 
@@ -339,7 +339,7 @@ def test_clip_networks_overfit_two_clips(size, monkeypatch):
     monkeypatch.setattr(ne, "drop_path", lambda branch, *_: branch)
     generator = Generator(scene="paper", measure=False)
     made = [[thinned(person.sample) for person in generator.clip(3, k)] for k in (1, 12)]
-    examples = [clip_example(clip, np.random.default_rng(1), trans_center=False, refined=0.0) for clip in made]
+    examples = [clip_example(clip, np.random.default_rng(1), trans_center=False, pelvis_centered=0.0) for clip in made]
     objective = ClipObjective(config=PRETRAINED[size][0])
     rates = recipe(Pretrain, size.removesuffix("-small"), rate=2e-3, schedule="cosine", warmup=0.04)
     torch.manual_seed(0)

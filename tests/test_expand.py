@@ -24,7 +24,7 @@ from lidarpose.train.setup import make_setup
 @pytest.fixture(scope="module")
 def arrays():
     generator, rng = Generator(scene=scene_config("wild"), measure=False), np.random.default_rng(0)
-    people = [example(generator.person(77, k).sample, rng, refined=0.0) for k in range(24)]
+    people = [example(generator.person(77, k).sample, rng, pelvis_centered=0.0) for k in range(24)]
     # with the neighbor tables of convolutions, which other networks ignore
     return PoseNetObjective(config=preset("tiny")).collate(people)
 

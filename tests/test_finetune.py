@@ -252,10 +252,10 @@ def test_augmented_refined_centers_on_noisy_pelvis(labeled):
     def pelvis(person):
         return person.joints[rows].mean(0)
 
-    draw = [pelvis(augmented(person, Augmentation(refined=1.0), np.random.default_rng(k))) for k in range(300)]
+    draw = [pelvis(augmented(person, Augmentation(pelvis_centered=1.0), np.random.default_rng(k))) for k in range(300)]
     np.testing.assert_allclose(np.std(draw, 0), PELVIS_ERROR, rtol=0.2)
     np.testing.assert_allclose(np.mean(draw, 0), 0, atol=0.02)
-    still = [pelvis(augmented(person, Augmentation(refined=0.0), np.random.default_rng(k))) for k in range(3)]
+    still = [pelvis(augmented(person, Augmentation(pelvis_centered=0.0), np.random.default_rng(k))) for k in range(3)]
     np.testing.assert_allclose(still, [pelvis(person) - center_of(person.points)] * 3, atol=1e-5)
 
 
@@ -534,7 +534,7 @@ def test_augmented_hides_sensor_at_rate_or_if_unknown():
 
 def test_augmented_jitters_drops_and_adds_points():
     plain, jittered, clutter, lost = (
-        augmented(someone(count=500), Augmentation(refined=0.0, **more), np.random.default_rng(3))
+        augmented(someone(count=500), Augmentation(pelvis_centered=0.0, **more), np.random.default_rng(3))
         for more in ({}, {"jitter": 0.005}, {"strays": 1.0}, {"drop": 1.0})
     )
     assert (jittered.points - plain.points).std() == pytest.approx(0.005, rel=0.1)

@@ -271,11 +271,11 @@ def test_cross_attention_matches_loop():
     """The loop takes one query, one head and one voxel at a time."""
     torch.manual_seed(0)
     layer = CrossAttention(14, 2, 5)
-    anchors, believed = torch.randn(1, 3, 14), torch.randn(1, 3, 3)
+    anchors, anchor_places = torch.randn(1, 3, 14), torch.randn(1, 3, 3)
     voxels, position, count = torch.randn(1, 4, 5), torch.randn(1, 4, 3), torch.tensor([[1.0, 5.0, 2.0, 9.0]])
     valid = torch.tensor([[True, True, True, False]])
     places, bias = RotaryEmbedding(position), key_bias(valid, torch.float32)
-    read = layer(anchors, RotaryEmbedding(believed), voxels, places, count.log(), bias)
+    read = layer(anchors, RotaryEmbedding(anchor_places), voxels, places, count.log(), bias)
     for j in range(3):
         mixed = []
         for h in range(2):
@@ -285,7 +285,7 @@ def test_cross_attention_matches_loop():
                 key = layer.key(voxels[0, n])[channels]
                 rotated = [
                     RotaryEmbedding(place[None, None]).rotate(x[None, None, None], frequencies)[0, 0, 0]
-                    for place, x in ((believed[0, j], query), (position[0, n], key))
+                    for place, x in ((anchor_places[0, j], query), (position[0, n], key))
                 ]
                 score.append(rotated[0] @ rotated[1] / 7**0.5 + layer.density[h] * count[0, n].log())
             weight = torch.stack(score).softmax(0)

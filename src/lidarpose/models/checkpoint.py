@@ -196,8 +196,8 @@ class SafetensorsFile:
         import torch
 
         shapes = self.shapes
-        if config.layers > len(shapes):
-            problem = f"has {len(shapes)} tensors, too few for the {config.layers} layers of {source}: {remedy}"
+        if config.min_tensors > len(shapes):
+            problem = f"has {len(shapes)} tensors, too few for the {config.min_tensors} or more of {source}: {remedy}"
             raise file_error(self.path, problem)
         with _float32(), torch.device("meta"):
             expected = build(config).state_dict()

@@ -157,7 +157,7 @@ class NetworkConfig(Config):
         return skeleton(self.skeleton).joints
 
     @property
-    def layers(self) -> int:
+    def min_tensors(self) -> int:
         """Number of blocks at all levels."""
         return sum(self.blocks)
 

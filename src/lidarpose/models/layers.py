@@ -204,14 +204,14 @@ class Exchange(nn.Module):
     def forward(
         self,
         anchors: Tensor,
-        believed: RotaryEmbedding,
+        anchor_places: RotaryEmbedding,
         voxels: Tensor,
         places: RotaryEmbedding,
         log_count: Tensor,
         bias: Tensor,
     ) -> Tensor:
         voxels = self.norm_voxels(voxels)
-        anchors = anchors + self.cross(self.norm_cross(anchors), believed, voxels, places, log_count, bias)
+        anchors = anchors + self.cross(self.norm_cross(anchors), anchor_places, voxels, places, log_count, bias)
         anchors = anchors + self.among(self.norm_self(anchors), None, None)
         return anchors + self.feed(self.norm_feed(anchors))
 

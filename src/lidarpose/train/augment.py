@@ -19,7 +19,7 @@ from lidarpose.synth.noise import half_space_keep, jitter, noise_clusters, rando
 
 # share of samples that are centered on an estimated pelvis, as in a second pass, instead of like a user's cloud; and
 # the standard deviation of that estimate, m
-REFINED, PELVIS_ERROR = 0.5, 0.06
+PELVIS_CENTERED, PELVIS_ERROR = 0.5, 0.06
 # the same standard deviation for a crop without a person, m
 _OBJECT_ERROR = 0.15
 # how often the sensor position is withheld from the network
@@ -101,16 +101,17 @@ class Augmentation:
     """Probabilities and magnitudes of the changes of a sample.
 
     released: crop and center as in the released code, else by a box and by the points; box: probability of a crop by
-    the box with a detector's errors (those of the protocol clean), else there is no crop; refined: probability that the
-    center is an estimated pelvis; cut: probability that part of the cloud is cut off by a plane; turn: probability of a
-    turn about z by up to `angle` rad; scale: sizes range from 1 - scale to 1 + scale; flip: probability of a mirror,
-    independently along x and along y; jitter: standard deviation of each coordinate, m, clipped at four times that;
-    drop: probability that a fifth of the points is dropped; strays: probability of clusters of clutter points.
+    the box with a detector's errors (those of the protocol clean), else there is no crop; pelvis_centered: probability
+    that the center is an estimated pelvis; cut: probability that part of the cloud is cut off by a plane; turn:
+    probability of a turn about z by up to `angle` rad; scale: sizes range from 1 - scale to 1 + scale; flip:
+    probability of a mirror, independently along x and along y; jitter: standard deviation of each coordinate, m,
+    clipped at four times that; drop: probability that a fifth of the points is dropped; strays: probability of clusters
+    of clutter points.
     """
 
     released: bool = False
     box: float = 0.0
-    refined: float = REFINED
+    pelvis_centered: float = PELVIS_CENTERED
     cut: float = 0.0
     turn: float = 0.0
     angle: float = np.pi
@@ -128,7 +129,7 @@ AUGMENTATIONS = {
     "paper": Augmentation(released=True, turn=0.5, scale=0.1, flip=0.3, jitter=0.005, drop=0.5),
     # LiDAR-HMR's for PRN and LPFormer; its shift is omitted: it moves points and center together, so it has no effect
     # on points about the center
-    "lidarhmr": Augmentation(refined=0.0, turn=1.0, angle=np.pi / 4, scale=0.2),
+    "lidarhmr": Augmentation(pelvis_centered=0.0, turn=1.0, angle=np.pi / 4, scale=0.2),
     "default": Augmentation(box=0.9, cut=0.15, turn=1.0, scale=0.1, flip=0.5, jitter=0.005, drop=0.5, strays=0.15),
 }
 
@@ -139,15 +140,15 @@ def augmentation(name: str) -> Augmentation:
     return AUGMENTATIONS[name]
 
 
-def example(sample: Sample, rng: np.random.Generator, *, refined: float = REFINED) -> Example:
+def example(sample: Sample, rng: np.random.Generator, *, pelvis_centered: float = PELVIS_CENTERED) -> Example:
     """A training example of a synthetic sample with known pose and parts.
 
-    The center is that of the points, or an estimated pelvis with probability `refined`. The sensor, at the origin of
-    the sample's frame, is withheld with probability `BLIND`.
+    The center is that of the points, or an estimated pelvis with probability `pelvis_centered`. The sensor, at the
+    origin of the sample's frame, is withheld with probability `BLIND`.
     """
     assert sample.pose is not None and sample.part is not None
     center = sample.center
-    if rng.random() < refined:
+    if rng.random() < pelvis_centered:
         center = sample.pose.joints[_PELVIS] + rng.normal(0, PELVIS_ERROR, 3)
     origin = None if rng.random() < BLIND else np.zeros(3)
     points, joints = sample.points - center, sample.pose.joints - center
@@ -166,11 +167,11 @@ def second_person_label(others: int, count: int) -> float:
     return float(others > 0) if is_clear else np.nan
 
 
-def object_example(sample: Sample, rng: np.random.Generator, *, refined: float = REFINED) -> Example:
-    """A training example of a crop without a person: about the points' center, or with probability `refined` about a
-    point where a pelvis might have been estimated."""
+def object_example(sample: Sample, rng: np.random.Generator, *, pelvis_centered: float = PELVIS_CENTERED) -> Example:
+    """A training example of a crop without a person: about the points' center, or with probability `pelvis_centered`
+    about a point where a pelvis might have been estimated."""
     center = sample.center
-    if rng.random() < refined:
+    if rng.random() < pelvis_centered:
         center = center + rng.normal(0, _OBJECT_ERROR, 3)
     origin = None if rng.random() < BLIND else np.zeros(3)
     return make_example(
@@ -217,15 +218,15 @@ def clip_example(
     rng: np.random.Generator,
     *,
     trans_center: bool = False,
-    refined: float = REFINED,
+    pelvis_centered: float = PELVIS_CENTERED,
     turn: bool = False,
 ) -> ClipExample:
     """A training example of a clip: frames of one person, with rotations and the joints of body26.
 
-    The centers are those of the points, or with probability `refined` estimated pelvises; trans_center: they are SMPL's
-    trans, if known; turn: all frames are turned about z by one random angle.
+    The centers are those of the points, or with probability `pelvis_centered` estimated pelvises; trans_center: they
+    are SMPL's trans, if known; turn: all frames are turned about z by one random angle.
     """
-    is_about_pelvis = rng.random() < refined
+    is_about_pelvis = rng.random() < pelvis_centered
     R = rotation_about("z", rng.uniform(-np.pi, np.pi)) if turn else np.eye(3)
     frames, clouds = [], []
     for sample in samples:
@@ -318,7 +319,7 @@ def _view(sample: LabeledSample, kind: Augmentation, rng: np.random.Generator) -
     # if the pelvis is not labeled, the midpoint of the hips, which a second pass centers on
     pelvis = sample.joints[_PELVIS]
     root = sample.joints[_HIPS].mean(0) if np.isnan(pelvis).any() else pelvis
-    if not np.isnan(root).any() and rng.random() < kind.refined:
+    if not np.isnan(root).any() and rng.random() < kind.pelvis_centered:
         center = root + rng.normal(0, PELVIS_ERROR, 3)
     return sample, center
 

@@ -35,7 +35,7 @@ from lidarpose.synth.generator import Generator
 from lidarpose.synth.objects import draw_object
 from lidarpose.synth.scene import RandomStream, scene_config
 from lidarpose.train.augment import (
-    REFINED,
+    PELVIS_CENTERED,
     Augmentation,
     ClipExample,
     Example,
@@ -73,8 +73,8 @@ class SyntheticSource:
 
     easy: number of samples in which the maximum difficulty rises from zero to full. All difficulties below the maximum
     are sampled, harder ones more often; the paper's scenes use the maximum itself. motion, subjects, captured, body,
-    strays, noise, objects, set: see `recipes.Pretrain`; refined: see `example`. Raises InputError, when built, for an
-    unknown scene and for clips that cannot be read.
+    strays, noise, objects, set: see `recipes.Pretrain`; pelvis_centered: see `example`. Raises InputError, when built,
+    for an unknown scene and for clips that cannot be read.
     """
 
     scene: str
@@ -88,7 +88,7 @@ class SyntheticSource:
     noise: float = 0.0
     objects: float = 0.0
     set: tuple[str, ...] = ()
-    refined: float = REFINED
+    pelvis_centered: float = PELVIS_CENTERED
 
     def __post_init__(self):
         # errors are raised here, not in a worker, whose errors come wrapped in a traceback
@@ -115,11 +115,13 @@ class SyntheticSource:
             object_sample, _ = draw_object(scene, self.seed, index, hard=difficulty)
             # disturbed as people are: otherwise every blurred crop would show a person
             object_sample = add_disturbances(object_sample, strays=self.strays, noise=self.noise, rng=rng)
-            return object_example(object_sample, rng, refined=self.refined)
+            return object_example(object_sample, rng, pelvis_centered=self.pelvis_centered)
         difficulty = self._difficulty(index, rng)
         sample = self._generator.person(self.seed, index, hard=difficulty).sample
         result = example(
-            add_disturbances(sample, strays=self.strays, noise=self.noise, rng=rng), rng, refined=self.refined
+            add_disturbances(sample, strays=self.strays, noise=self.noise, rng=rng),
+            rng,
+            pelvis_centered=self.pelvis_centered,
         )
         return replace(result, person=people_in(sample)) if self.objects else result
 
@@ -133,7 +135,7 @@ class SyntheticSource:
         """A clip of a person at the scene's difficulty."""
         rng = np.random.default_rng([self.seed, RandomStream.SYNTHETIC_AUGMENTATION, index])
         samples = [person.sample for person in self._generator.clip(self.seed, index)]
-        return clip_example(samples, rng, trans_center=trans_center, refined=self.refined)
+        return clip_example(samples, rng, trans_center=trans_center, pelvis_centered=self.pelvis_centered)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -199,7 +201,7 @@ class ClipSource(DatasetSource):
         rng = np.random.default_rng(self.seed)
         clip_rows = self.clips[evenly_spaced(len(self.clips), count), :CLIP_FRAMES]
         clips = [[self.dataset.sample(row) for row in rows] for rows in clip_rows]
-        return [clip_example(clip, rng, trans_center=self.trans_center, refined=0.0) for clip in clips]
+        return [clip_example(clip, rng, trans_center=self.trans_center, pelvis_centered=0.0) for clip in clips]
 
 
 @lru_cache(maxsize=2)

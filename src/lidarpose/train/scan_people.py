@@ -18,8 +18,8 @@ from lidarpose.sample import Box, Pose, center_of
 from lidarpose.skeleton import BODY26
 from lidarpose.train.augment import (
     BLIND,
+    PELVIS_CENTERED,
     PELVIS_ERROR,
-    REFINED,
     UNKNOWN_PART,
     Example,
     make_example,
@@ -116,7 +116,7 @@ def person_example(scan: ScanPeople, person: int, rng: np.random.Generator) -> E
         if (owner[is_kept] == 1).sum() >= LEAST_POINTS:
             points, owner = points[is_kept], owner[is_kept]
     center = box_center if (owner < 0).any() else center_of(points)
-    if rng.random() < REFINED:
+    if rng.random() < PELVIS_CENTERED:
         center = joints[_PELVIS] + rng.normal(0, PELVIS_ERROR, 3)
     view = view_features(center, None if rng.random() < BLIND else scan.origin)
     points, joints = points - center, joints - center

@@ -209,7 +209,9 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
 
     def validation() -> Sequence[Example | ClipExample]:
         # centered on the points, like a user's cloud
-        held_out_source = SyntheticSource(seed=_VALIDATION_SEED, refined=0.0, **(synthetic_settings | {"objects": 0.0}))
+        held_out_source = SyntheticSource(
+            seed=_VALIDATION_SEED, pelvis_centered=0.0, **(synthetic_settings | {"objects": 0.0})
+        )
         if isinstance(config, LidarcapConfig):
             clips = range(VALIDATION // config.frames)
             return [held_out_source.clip(index, trans_center=config.trans_center) for index in clips]
@@ -301,7 +303,7 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
         if held_out_dataset is None:
             return []
         # cropped by a box with a detector's errors, if there is a box, and centered on the points
-        cropping = Augmentation(released=kind.released, box=kind.box, refined=0.0)
+        cropping = Augmentation(released=kind.released, box=kind.box, pelvis_centered=0.0)
         rows = evenly_spaced(len(held_out_dataset), VALIDATION)
         return [augmented(held_out_dataset.sample(k), cropping, np.random.default_rng([recipe.seed, k])) for k in rows]
 

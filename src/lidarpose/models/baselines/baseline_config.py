@@ -25,14 +25,14 @@ DIVISORS = (1, 2, 4, 8)
 class BaselineConfig(Config):
     """The settings of all baselines.
 
-    frames: of a clip, 1 for networks of single frames; layers: a lower bound of the number of its tensors; joints:
+    frames: of a clip, 1 for networks of single frames; min_tensors: a lower bound of the number of its tensors; joints:
     names, in the order of the outputs; width_divisor: number by which the published channels of hidden layers are
     divided, for CPUs; most_points: of a cloud, larger clouds are subsampled. Each option is False for the corrected
     behavior. Raises InputError for unknown joints, other divisors, and options that are not booleans.
     """
 
     frames: ClassVar[int] = 1
-    layers: ClassVar[int] = 1
+    min_tensors: ClassVar[int] = 1
 
     joints: tuple[str, ...] = HUMAN15.joints
     width_divisor: int = 1
@@ -63,7 +63,7 @@ class PrnConfig(BaselineConfig):
     """
 
     kind: ClassVar[str] = "prn"
-    layers: ClassVar[int] = 100
+    min_tensors: ClassVar[int] = 100
 
     resample_with_replacement: bool = False
     missing_in_softmax: bool = False
@@ -85,7 +85,7 @@ class LpformerConfig(BaselineConfig):
     """
 
     kind: ClassVar[str] = "lpformer"
-    layers: ClassVar[int] = 50
+    min_tensors: ClassVar[int] = 50
 
     grid: int = 64
     resample_with_replacement: bool = False
@@ -159,7 +159,7 @@ class LidarcapConfig(BaselineConfig):
 
     kind: ClassVar[str] = "lidarcap"
     frames: ClassVar[int] = CLIP_FRAMES
-    layers: ClassVar[int] = 50
+    min_tensors: ClassVar[int] = 50
     clouds: ClassVar[tuple[str, ...]] = CLOUDS[:1]
 
     joints: tuple[str, ...] = SMPL24.joints

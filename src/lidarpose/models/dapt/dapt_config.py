@@ -125,7 +125,7 @@ class DaptConfig(Config):
             raise InputError(f"{reason}: leave bins, ranges and parts empty and set coordinates=True")
 
     @property
-    def layers(self) -> int:
+    def min_tensors(self) -> int:
         """Number of blocks at all levels, encoder and decoder."""
         return sum(self.encoder_depths) + sum(self.decoder_depths)
 

@@ -35,7 +35,7 @@ class DetectorConfig(Config):
     hidden: int = 128
 
     @property
-    def layers(self) -> int:
+    def min_tensors(self) -> int:
         """A lower bound of the number of tensors."""
         return 2
 
