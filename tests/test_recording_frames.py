@@ -11,7 +11,7 @@ from walking_people import FRAMES, boxes_of, moving_source, places_in_world, wal
 import lidarpose
 from lidarpose.body.rig import mean_adult_joints
 from lidarpose.cli import main
-from lidarpose.geometry import UP_AXES
+from lidarpose.geometry import UP_AXES, inverse_transform
 from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.predictor import Predictor
 from lidarpose.inference.results import PersonPose, Poses
@@ -90,9 +90,17 @@ def test_world_option_prints_lines_in_world_frame(monkeypatch, tmp_path, capsys)
 def test_fixed_frame_reuses_last_pose_if_missing():
     T = world_pose(3)
     fixed = FixedFrame("z")
-    np.testing.assert_array_equal(fixed.from_sensor(None), np.eye(4))
     np.testing.assert_array_equal(fixed.from_sensor(T.tolist()), T)
     np.testing.assert_array_equal(fixed.from_sensor(None), T)
+    # frames before the first pose: the frame does not jump when it comes
+    late = FixedFrame("z")
+    np.testing.assert_array_equal(late.from_sensor(None), np.eye(4))
+    np.testing.assert_allclose(late.from_sensor(T.tolist()), np.eye(4), atol=1e-9)
+    again = FixedFrame("z")
+    again.restore(json.loads(json.dumps(late.state())))
+    step = inverse_transform(T) @ world_pose(5)
+    for frame in (late, again):
+        np.testing.assert_allclose(frame.from_sensor(world_pose(5)), step, atol=1e-9)
     # without any pose, only the up axis is rotated to z
     y_up = FixedFrame("y").from_sensor(None)
     np.testing.assert_allclose(y_up[:3, :3] @ [0, 1, 0], [0, 0, 1], atol=1e-12)
@@ -186,6 +194,29 @@ def test_wrong_times_only_disable_smoothing_of_their_frames():
     assert steady_rows([*times[:9], times[11], times[9], times[10], *times[12:]]) == rows[:10] + rows[12:]
     # people are not filled in in damaged frames
     assert steady_rows(times, damaged=[9]) == rows[:9] + rows[10:]
+
+
+def test_smoothed_lines_of_flipped_and_unposed_frames_are_consistent():
+    rng, lines, flip = np.random.default_rng(0), [], list(SMPL24.flip)
+    for k, pose in enumerate(walker(np.arange(12) / 10, rng)):
+        is_flipped = k == 5
+        joints = pose.joints[flip] if is_flipped else pose.joints
+        box = {"center": [1.2 * k / 10, 0, 0.9], "size": [0.6, 0.6, 1.8], "yaw": 3.1 if is_flipped else 0.0}
+        person = {"track": 0, "score": 0.9, "box": box, "warnings": [], "out_of_range": ["left_hand"] * is_flipped}
+        person |= {"joints": joints.tolist(), "spread": [0.05] * 24, "visible": [], "confidence": []}
+        if k == 8:
+            person |= {"joints": None, "spread": [], "warnings": ["no pose: under 5 points", "other"]}
+        lines.append({"time": k / 10, "T_world_sensor": None, "error": None, "people": [person]})
+    people = [line["people"][0] for line in smoothed_lines(lambda: iter(lines), "z", SMPL24)]
+    left, right = (
+        np.array([p["joints"] for p in people])[:, SMPL24.index(f"{side}_hip"), 1] for side in ("left", "right")
+    )
+    assert (left > right).all()
+    assert people[5]["out_of_range"] == ["right_hand"] and abs(people[5]["box"]["yaw"]) < 0.1
+    assert (
+        people[8]["filled"] and people[8]["warnings"] == ["other"] and people[8]["box"] == lines[8]["people"][0]["box"]
+    )
+    assert lines[5]["people"][0]["box"]["yaw"] == 3.1
 
 
 def test_late_frame_does_not_reset_live_filter():

@@ -467,6 +467,22 @@ def test_frame_boxes_match_frames_by_name_or_number(form, tmp_path):
     boxes.check_used("c")
 
 
+def test_frame_boxes_do_not_confuse_numbers_and_names(tmp_path):
+    """Files 1.pcd to 3.pcd have the numbers 0 to 2."""
+    entries = [{"frame": k, "people": [{"center": [k, 0, 0], "size": [1, 1, 2]}]} for k in range(3)]
+    entries[1]["people"].append({"box": None, "filled": True, "joints": []})
+    (tmp_path / "o.jsonl").write_text("\n".join(map(json.dumps, entries)))
+    by_number = {k: [entry["people"][0]] for k, entry in enumerate(entries)}
+    for given in (tmp_path / "o.jsonl", by_number):
+        boxes = FrameBoxes(given)
+        for k in range(3):
+            (box,) = boxes.of(Frame(points=np.zeros((0, 3)), index=k, id=str(k + 1)))
+            assert box.center[0] == k
+    (tmp_path / "w.jsonl").write_text(json.dumps(entries[0] | {"coordinates": "world"}))
+    with pytest.raises(InputError, match="write the result without --world"):
+        FrameBoxes(tmp_path / "w.jsonl")
+
+
 @pytest.mark.parametrize(
     "content, problem",
     [
@@ -734,6 +750,16 @@ def test_scan_is_copied_from_reused_buffer(model, monkeypatch):
     results = list(lidarpose.predict_recording(fed(clouds, buffer), find=True, model=model))
     for result, cloud in zip(results, clouds, strict=True):
         np.testing.assert_array_equal(result.poses.scan, cloud)
+
+
+def test_frames_copy_sensor_poses_and_make_rotations_exact():
+    T = np.eye(4)
+    T[:3, :3] = 1.004 * rotation_about("z", 0.3)
+    origin = np.zeros(3)
+    frame = Frame(points=np.zeros((0, 3)), index=0, id="a", T_world_sensor=T, origin=origin)
+    T[0, 3] = origin[0] = 7.0
+    np.testing.assert_allclose(frame.T_world_sensor[:3, :3], rotation_about("z", 0.3), atol=1e-12)
+    assert frame.T_world_sensor[0, 3] == frame.origin[0] == 0.0
 
 
 def test_predict_recording_checks_generators_and_their_options(model, tmp_path):

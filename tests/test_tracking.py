@@ -132,6 +132,11 @@ def test_tracker_counts_times_that_jump_back():
     for time in (0.0, 0.1, 0.2, 0.15, 0.3):
         assert tracker.update(time, [person(time)]) == [0]
     assert tracker.jumps_back == 1
+    # late frames do not slow tracks down: of every pair of frames, the second comes first
+    swapped = Tracker()
+    for time in (k ^ 1 for k in range(40)):
+        assert swapped.update(time / 10, [person(0.14 * time)]) == [0]
+    assert swapped.predicted(3.95)[0].center[0] == pytest.approx(5.53, abs=0.15)
     # a second recording starts
     assert tracker.update(-60.0, [person(0.3)]) == [1] and tracker.jumps_back == 2
     assert tracker.update(-59.9, [person(0.3)]) == [1]

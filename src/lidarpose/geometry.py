@@ -94,6 +94,14 @@ def is_rotation(R: np.ndarray) -> bool:
     return bool(np.abs(R).max() < 1.01 and np.abs(R @ R.T - np.eye(3)).max() < 0.01 and np.linalg.det(R) > 0)
 
 
+def nearest_rotation(R: np.ndarray) -> np.ndarray:
+    """The rotation (3, 3) nearest to R (3, 3), which `is_rotation` accepts; R itself if it is one to 1e-9."""
+    if np.abs(R @ R.T - np.eye(3)).max() < 1e-9:
+        return R
+    u, _, vt = np.linalg.svd(R)
+    return u @ vt
+
+
 def quaternion_to_matrix(quaternion: np.ndarray) -> np.ndarray:
     """The rotation matrix (3, 3) of a quaternion (4,) w, x, y, z of any length > 0."""
     w, x, y, z = quaternion / np.linalg.norm(quaternion)

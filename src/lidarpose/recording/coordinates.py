@@ -5,22 +5,46 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.geometry import rigid_transform, rotation_of_boxes, transform_points
+from lidarpose.geometry import inverse_transform, rigid_transform, rotation_of_boxes, transform_points
 
 
 class FixedFrame:
-    """The transform to the fixed frame, updated frame by frame. up: up axis of the points, as in `predict`."""
+    """The transform to the fixed frame, updated frame by frame. If the first frames have no sensor pose, the fixed
+    frame stays that of these frames, as if the sensor had not moved until the first known pose.
+
+    up: up axis of the points, as in `predict`.
+    """
 
     def __init__(self, up: str):
         self.R_upright = rotation_of_boxes(up)
         self.T_world_sensor: np.ndarray | None = None
+        self.T_fixed_world: np.ndarray | None = None
+        self._is_first = True
 
     def from_sensor(self, T_world_sensor: np.ndarray | list | None) -> np.ndarray:
         """T_fixed_sensor (4, 4) of the next frame; if the sensor pose of this frame is missing, that of the last
         frame."""
+        T_upright_sensor = rigid_transform(self.R_upright, np.zeros(3))
         if T_world_sensor is not None:
             self.T_world_sensor = np.asarray(T_world_sensor, float)
-        return rigid_transform(self.R_upright, np.zeros(3)) if self.T_world_sensor is None else self.T_world_sensor
+            if self.T_fixed_world is None:
+                self.T_fixed_world = (
+                    np.eye(4) if self._is_first else T_upright_sensor @ inverse_transform(self.T_world_sensor)
+                )
+        self._is_first = False
+        if self.T_world_sensor is None or self.T_fixed_world is None:
+            return T_upright_sensor
+        return self.T_fixed_world @ self.T_world_sensor
+
+    def state(self) -> list:
+        """The state after the frames so far, as JSON values."""
+        poses = (self.T_world_sensor, self.T_fixed_world)
+        return [self._is_first, *(None if T is None else T.tolist() for T in poses)]
+
+    def restore(self, state: list) -> None:
+        """Resumes from the result of `state()`."""
+        self._is_first = state[0]
+        self.T_world_sensor, self.T_fixed_world = (None if T is None else np.array(T) for T in state[1:])
 
 
 def moved_yaw(yaw: float, T: np.ndarray, R_from: np.ndarray | None = None, R_to: np.ndarray | None = None) -> float:

@@ -4,6 +4,7 @@ import json
 import os
 from collections.abc import Mapping
 from functools import partial
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,8 @@ class FrameBoxes:
     Args:
         given: a folder of files named like the frames (`ID.json`, `ID.npy`, KITTI's `ID.txt`, or `ID.boxes.json`, as
             `lidarpose detect` names them); or a file of JSON lines or a JSON list of `{"frame": 0, "people": [...]}`,
-            where the frame is a number or an id; or a mapping from frame numbers or ids to anything that `read_boxes`
-            takes.
+            where the frame is its number (an integer) or its id (text); or a mapping from frame numbers or ids to
+            anything that `read_boxes` takes.
         calib: KITTI calibration, see `read_boxes`.
 
     Raises:
@@ -34,10 +35,13 @@ class FrameBoxes:
     def __init__(self, given: "str | os.PathLike | Mapping[Any, Any]", *, calib: str | os.PathLike | None = None):
         self._name: object = "boxes" if isinstance(given, Mapping) else given
         self._read = partial(read_boxes, calib=calib)
-        self._by_frame: dict[str, Any] = {}
+        # by number (int) or id (str)
+        self._by_frame: dict[int | str, Any] = {}
         self.was_used = False
         if isinstance(given, Mapping):
-            self._by_frame = {str(frame): boxes for frame, boxes in given.items()}
+            self._by_frame = {
+                int(frame) if isinstance(frame, Integral) else str(frame): boxes for frame, boxes in given.items()
+            }
         elif not isinstance(given, str | os.PathLike):
             kind = type(given).__name__
             raise InputError(f"boxes of a recording: expected a folder, a file or a dict by frame, got {kind}")
@@ -54,8 +58,10 @@ class FrameBoxes:
 
     def of(self, frame: Frame | DamagedFrame) -> Boxes | None:
         """The boxes of a frame, None if none are given. Raises InputError for boxes that cannot be read."""
-        key = frame.id if frame.id in self._by_frame else str(frame.index)
-        if key not in self._by_frame:
+        # files may be named by number instead of id
+        keys: tuple[int | str, ...] = (frame.id, frame.index, str(frame.index))
+        key = next((key for key in keys if key in self._by_frame), None)
+        if key is None:
             return None
         self.was_used = True
         try:
@@ -68,13 +74,13 @@ class FrameBoxes:
         """Raises InputError if none of the frames had boxes, which means that the boxes belong to another recording.
         last: id of the last frame."""
         if not self.was_used:
-            ids = shorten(", ".join(list(self._by_frame)[:3]))
+            ids = shorten(", ".join(map(str, list(self._by_frame)[:3])))
             raise file_error(
                 self._name, f"has boxes of frames {ids}, but this recording has other frames, the last one {last}"
             )
 
 
-def _by_frame(path: str | os.PathLike) -> dict[str, Any]:
+def _by_frame(path: str | os.PathLike) -> dict[int | str, Any]:
     """The entries of a file by frame number or id."""
     data = read_bytes(path, expected="a folder or a file of boxes")
     try:
@@ -86,7 +92,7 @@ def _by_frame(path: str | os.PathLike) -> dict[str, Any]:
     except (UnicodeDecodeError, ValueError, RecursionError) as error:
         raise file_error(path, f"expected JSON or JSON lines, {_FORM} each, got something else ({error})") from None
     entries = content.get("frames", [content]) if isinstance(content, dict) else content
-    by_frame: dict[str, Any] = {}
+    by_frame: dict[int | str, Any] = {}
     for i, entry in enumerate(entries if isinstance(entries, list) else [entries]):
         frame = entry.get("frame") if isinstance(entry, dict) else None
         # documents of one scan state their coordinate frame under this key
@@ -96,7 +102,14 @@ def _by_frame(path: str | os.PathLike) -> dict[str, Any]:
             raise file_error(
                 path, f"expected one entry per frame, {_FORM}, got {excerpt} as entry {i}: one box file is one scan"
             )
-        if str(frame) in by_frame:
+        if frame in by_frame:
             raise file_error(path, f"expected each frame once, got {frame!r} twice: put its people into one entry")
-        by_frame[str(frame)] = entry
+        if entry.get("coordinates") == "world":
+            problem = f"boxes in the sensor frame, got coordinates 'world' in entry {i}"
+            raise file_error(path, f"expected {problem}: write the result without --world")
+        if isinstance(entry["people"], list):
+            # results with tracks contain people who were not seen
+            is_unseen = [isinstance(p, dict) and bool(p.get("filled")) and not p.get("box") for p in entry["people"]]
+            entry = entry | {"people": [p for p, unseen in zip(entry["people"], is_unseen, strict=True) if not unseen]}
+        by_frame[frame] = entry
     return by_frame

@@ -12,8 +12,7 @@ from lidarpose.inference.scan import Scan
 from lidarpose.recording.coordinates import FixedFrame, moved_yaw
 from lidarpose.sample import Box, Pose
 from lidarpose.tracking.live import LiveFilter
-from lidarpose.tracking.smoothing import MAX_LATE
-from lidarpose.tracking.tracker import Tracker, TrackState
+from lidarpose.tracking.tracker import MAX_LATE, Tracker, TrackState
 
 # time, s, after which known people and rejected positions are verified again: spread over this interval, so that not
 # all are due in the same frame
@@ -72,7 +71,9 @@ class KnownPeople:
                 )
                 pelvises.append(transform_points(T_sensor_fixed, state.center + verification.offset))
         elapsed = time - self._rejected[:, 3]
-        self._rejected = self._rejected[(elapsed >= 0) & (elapsed < _trusted(np.arange(len(self._rejected))))]
+        # by their place, so that positions that were rejected together are not all due in the same frame
+        trusted = _trusted(np.floor(100 * self._rejected[:, 0]))
+        self._rejected = self._rejected[(elapsed >= 0) & (elapsed < trusted)]
         return KnownPlaces(
             boxes=boxes,
             pelvises=np.reshape(pelvises, (-1, 3)),
@@ -156,10 +157,9 @@ class KnownPeople:
 
     def state(self) -> dict[str, Any]:
         """The state after the frames so far, as JSON values."""
-        T_world_sensor = self.fixed.T_world_sensor
         return {
             "tracker": self._tracker.state(),
-            "T_world_sensor": None if T_world_sensor is None else T_world_sensor.tolist(),
+            "fixed": self.fixed.state(),
             "verified": self._verified,
             "rejected": self._rejected.tolist(),
             "filters": {id: [time, live_filter.state()] for id, (time, live_filter) in self._filters.items()},
@@ -168,7 +168,7 @@ class KnownPeople:
     def restore(self, state: dict[str, Any]) -> None:
         """Resumes from the result of `state()`."""
         self._tracker = Tracker.from_state(state["tracker"])
-        self.fixed.from_sensor(state["T_world_sensor"])
+        self.fixed.restore(state["fixed"])
         self._verified = {int(id): _Verified(*values) for id, values in state["verified"].items()}
         self._rejected = np.array(state["rejected"], float).reshape(-1, 4)
         self._filters = {
@@ -178,7 +178,8 @@ class KnownPeople:
 
 
 def _trusted(number: Any) -> Any:
-    """Time, s, for which a verification remains valid. number: id of the track or index of the rejected position."""
+    """Time, s, for which a verification remains valid. number: id of the track, or x of the rejected position in
+    cm."""
     shortest, longest = _TRUSTED
     return shortest + (longest - shortest) * (number % 5) / 4
 

@@ -26,7 +26,8 @@ def in_fixed_frame(line: dict[str, Any], fixed: FixedFrame) -> tuple[np.ndarray,
     T_fixed_sensor = fixed.from_sensor(line["T_world_sensor"])
     # people may already be in the world frame
     is_moved = line.get("coordinates") == "world"
-    T, R_upright = (np.eye(4), None) if is_moved else (T_fixed_sensor, fixed.R_upright)
+    T_fixed_world = np.eye(4) if fixed.T_fixed_world is None else fixed.T_fixed_world
+    T, R_upright = (T_fixed_world, None) if is_moved else (T_fixed_sensor, fixed.R_upright)
     people = []
     for person in line["people"]:
         joints, box = person["joints"], person["box"]

@@ -10,7 +10,8 @@ from lidarpose.recording.coordinates import FixedFrame, rounded_points
 from lidarpose.sample import Pose, known_values
 from lidarpose.skeleton import Skeleton
 from lidarpose.tracking.clip import TrackPoses
-from lidarpose.tracking.smoothing import MAX_LATE, smooth
+from lidarpose.tracking.smoothing import smooth
+from lidarpose.tracking.tracker import MAX_LATE
 
 # values smoothed besides the joints, and their decimals
 _SMOOTHED = {"spread": 4, "visible": 3, "confidence": 3}
@@ -43,20 +44,35 @@ def smoothed_lines(
                 }
                 pose = Pose(joints=joints, skeleton=skeleton, **values)
                 tracks.setdefault(person["track"], {})[row] = pose
-    steady_poses: list[dict[int, tuple[Pose, bool]]] = [{} for _ in times]
+    steady_poses: list[dict[int, tuple[Pose, bool, bool]]] = [{} for _ in times]
     for id in list(tracks):
-        for row, pose, is_filled in _steady(tracks.pop(id), np.array(times)):
-            steady_poses[row][id] = pose, is_filled
+        for row, pose, is_filled, is_swapped in _steady(tracks.pop(id), np.array(times)):
+            steady_poses[row][id] = pose, is_filled, is_swapped
     for line, people, T_fixed_sensor in zip(lines(), steady_poses, to_fixed, strict=True):
         T_sensor_fixed = inverse_transform(T_fixed_sensor)
-        entries = {id: _entry(pose, T_sensor_fixed) | {"filled": is_filled} for id, (pose, is_filled) in people.items()}
+        entries = {
+            id: _entry(pose, T_sensor_fixed) | {"filled": is_filled} for id, (pose, is_filled, _) in people.items()
+        }
+        swapped = {id for id, (_, _, is_swapped) in people.items() if is_swapped}
         people.clear()
-        yield line | {"people": list(_with_steady(line["people"], entries))}
+        line_people = [_unswapped(p, skeleton) if p["track"] in swapped else p for p in line["people"]]
+        yield line | {"people": list(_with_steady(line_people, entries))}
 
 
-def _steady(poses: dict[int, Pose], times: np.ndarray) -> Iterator[tuple[int, Pose, bool]]:
-    """Yields the smoothed poses of a track in temporal order: row, pose, and whether it was filled in. times: s, of all
-    rows."""
+def _unswapped(person: dict[str, Any], skeleton: Skeleton) -> dict[str, Any]:
+    """A person whose left and right were exchanged: with the other side's joints out of range, and the detected box,
+    which was fitted to the pose, turned by half a turn."""
+    joints, box = skeleton.joints, person["box"]
+    others = {name: joints[skeleton.flip[k]] for k, name in enumerate(joints)}
+    if box is not None and person["score"] is not None:
+        yaw = (box["yaw"] + 2 * np.pi) % (2 * np.pi) - np.pi
+        box = box | {"yaw": round(float(yaw), 4)}
+    return person | {"box": box, "out_of_range": [others.get(name, name) for name in person["out_of_range"]]}
+
+
+def _steady(poses: dict[int, Pose], times: np.ndarray) -> Iterator[tuple[int, Pose, bool, bool]]:
+    """Yields the smoothed poses of a track in temporal order: row, pose, whether it was filled in, and whether left and
+    right were exchanged. times: s, of all rows."""
     rows = np.arange(min(poses), max(poses) + 1)
     rows = rows[np.isfinite(times[rows])]
     skeleton = next(iter(poses.values())).skeleton
@@ -65,9 +81,10 @@ def _steady(poses: dict[int, Pose], times: np.ndarray) -> Iterator[tuple[int, Po
         # frames that come late, or have the same time as another, are not smoothed
         run = run[times[run] > np.maximum.accumulate(np.concatenate([[-np.inf], times[run]]))[:-1]]
         track = smooth(TrackPoses.of_poses(times[run], [poses.get(row) for row in run.tolist()], skeleton))
+        assert track.swapped is not None
         for i, row in enumerate(run.tolist()):
             if (pose := track.pose(i)) is not None:
-                yield row, pose, row not in poses
+                yield row, pose, row not in poses, bool(track.swapped[i])
 
 
 def _entry(pose: Pose, T_sensor_fixed: np.ndarray) -> dict[str, Any]:
@@ -82,7 +99,11 @@ def _entry(pose: Pose, T_sensor_fixed: np.ndarray) -> dict[str, Any]:
 def _with_steady(people: list[dict[str, Any]], entries: dict[int, dict[str, Any]]) -> Iterator[dict[str, Any]]:
     """The people of a line with their smoothed values, then the occluded people that were added."""
     for person in people:
-        yield person | entries.pop(person["track"], {})
+        entry = entries.pop(person["track"], {})
+        if entry.get("filled"):
+            # the pose comes from other frames
+            entry["warnings"] = [text for text in person["warnings"] if not text.startswith("no pose")]
+        yield person | entry
     for id, entry in sorted(entries.items()):
         person_entry: dict[str, Any] = {"id": id, "num_points": 0}
         person_entry |= dict.fromkeys(("box", "score", "mounted", "person", "second_person", "joints"))

@@ -19,7 +19,8 @@ class TrackPoses:
 
     times (T,) s, increasing; joints (T, J, 3) m, NaN where the person was not seen; spread (T, J) m, the expected
     distance between joint and truth, or None; visible, confidence (T, J) in [0, 1] or None; filled (T,) bool: frames
-    whose joints were filled in from the frames before and after, none by default.
+    whose joints were filled in from the frames before and after, none by default; swapped (T,) bool: frames in which
+    left and right were exchanged, none by default.
     """
 
     times: np.ndarray
@@ -29,6 +30,7 @@ class TrackPoses:
     visible: np.ndarray | None = None
     confidence: np.ndarray | None = None
     filled: np.ndarray | None = None
+    swapped: np.ndarray | None = None
 
     def __post_init__(self):
         shape = (len(self.times), len(self.skeleton))
@@ -39,8 +41,9 @@ class TrackPoses:
                 raise InputError(f"TrackPoses.{name} must be {shape}, one per joint, got {value.shape}")
         if not (np.isfinite(self.times).all() and (np.diff(self.times) > 0).all()):
             raise InputError("TrackPoses.times must be finite seconds, each later than the one before")
-        if self.filled is None:
-            object.__setattr__(self, "filled", np.zeros(len(self.times), bool))
+        for name in ("filled", "swapped"):
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, np.zeros(len(self.times), bool))
 
     def __len__(self) -> int:
         return len(self.times)

@@ -27,8 +27,6 @@ _PATH, _COMMON = 2.5, 0.8
 LEAST_FRAMES = 3
 # gaps up to MAX_GAP are filled in; in longer ones, and before and after a track, only frames this near to a seen one, s
 MAX_GAP, _MAX_BEYOND = 2.0, 0.5
-# a frame up to this much earlier than the one before, s, is late; a larger difference means that the clock was set back
-MAX_LATE = 0.3
 # after this time, s, nothing is known of the earlier motion; variances of longer steps exceed the precision of floats
 _LONGEST_STEP = 60.0
 
@@ -97,7 +95,7 @@ def with_facing_corrected(track: TrackPoses) -> TrackPoses:
     for name, value in values.items():
         values[name] = value.copy()
         values[name][flipped_rows] = value[flipped_rows][:, flip]
-    return replace(track, **values)
+    return replace(track, **values, swapped=np.isin(np.arange(len(track)), flipped_rows))
 
 
 def frame_weights(offset: np.ndarray, precision: np.ndarray, freedom: float = _FREEDOM) -> np.ndarray:

@@ -17,6 +17,8 @@ from lidarpose.errors import InputError, check_finite
 from lidarpose.sample import Box
 from lidarpose.tracking.assignment import assign
 
+# a frame up to this much earlier than the one before, s, is late; a larger difference means that the clock was set back
+MAX_LATE = 0.3
 # standard deviation of the center of a box of score 1, m, along x, y and z; its square is divided by the score, but not
 # by less than _LEAST_SCORE: measured on detected boxes
 POSITION_SD, _LEAST_SCORE = np.array([0.12, 0.12, 0.2]), 0.05
@@ -204,9 +206,11 @@ class Tracker:
         """The tracks predicted for `time`, without those that were unseen for too long."""
         check_finite("time", time)
         seconds = 0.0 if self._time is None else float(time) - self._time
-        self._time = float(time)
         if seconds < 0:
             self.jumps_back += 1
+        # a frame that comes late does not set the clock back
+        if self._time is None or not -MAX_LATE <= seconds < 0:
+            self._time = float(time)
         # a large jump back means another recording
         if abs(seconds) > self.max_gap:
             return _of_boxes([])

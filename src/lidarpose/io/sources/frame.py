@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from lidarpose.errors import InputError, LidarPoseError, MissingExtra, check_finite, check_int
-from lidarpose.geometry import is_rotation
+from lidarpose.geometry import is_rotation, nearest_rotation
 from lidarpose.io.files import FormatError, file_error, one_line, shorten
 
 # frames per second if a source has no times
@@ -49,6 +49,8 @@ class Frame(Sweep):
         id: its name in the source, e.g. the stem of its file.
         time: s; computed from `index` and the rate if the source has no times.
 
+    `T_world_sensor` and `origin` are copied, and a rotation that is off by up to 1 % is made exact.
+
     Raises:
         InputError: `T_world_sensor` is not a rigid transform (4, 4).
     """
@@ -58,10 +60,12 @@ class Frame(Sweep):
     time: float | None = None
 
     def __post_init__(self):
+        if self.origin is not None:
+            object.__setattr__(self, "origin", np.array(self.origin, float))
         if self.T_world_sensor is None:
             return
         try:
-            T = np.asarray(self.T_world_sensor, float)
+            T = np.array(self.T_world_sensor, float)
         except (TypeError, ValueError):
             T = np.zeros(0)
         is_finite = T.shape == (4, 4) and np.isfinite(T).all()
@@ -71,6 +75,7 @@ class Frame(Sweep):
                 "Frame.T_world_sensor: expected (4, 4), a rotation and a position in meters over 0 0 0 1, got "
                 f"{actual}: give None if the sensor's pose is not known"
             )
+        T[:3, :3] = nearest_rotation(T[:3, :3])
         object.__setattr__(self, "T_world_sensor", T)
 
 
