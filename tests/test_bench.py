@@ -106,6 +106,21 @@ class Knowing:
 
 
 @pytest.mark.long
+def test_objects_are_posed_about_their_boxes_as_people_are():
+    class Boxed(Knowing):
+        def predict_in(self, clouds, origin, skeleton, *, box_centers, check_upside_down):
+            asked.append((len(clouds), box_centers))
+            return self.predict(clouds)
+
+    asked = []
+    evaluation.evaluate(Boxed(lambda cloud: 0.5), "bench-2", limit=40)
+    objects = bench("bench-2").columns["box"][bench("bench-2").objects]
+    count, centers = asked[-1]
+    assert count == len(objects) and all(centers is not None for _, centers in asked)
+    np.testing.assert_array_equal(centers, objects[:, :3])
+
+
+@pytest.mark.long
 def test_evaluate_bench_2_scores_slices():
     model = Knowing()
     result = evaluation.evaluate(model, "bench-2", limit=600)

@@ -288,6 +288,27 @@ def test_evaluate_accepts_minimal_user_model(sets):
         evaluation.evaluate(Own(answers), sets / "humanm3", protocol="dapt")
 
 
+@pytest.mark.parametrize(
+    "pose, words",
+    [
+        (
+            Pose(joints=np.zeros((15, 3)), skeleton=HUMAN15),
+            "expected a lidarpose.Pose with the 24 joints of smpl24, got 15",
+        ),
+        (np.zeros((24, 3)), "got ndarray: return poses of the model's skeleton"),
+        (
+            Pose(joints=np.zeros((24, 3)), skeleton=SMPL24, confidence=np.full(24, 95.0)),
+            "expected confidence from 0 to 1, got 95.0 to 95.0",
+        ),
+        (Pose(joints=np.zeros((24, 3)), skeleton=SMPL24, person=-0.5), "expected person from 0 to 1"),
+    ],
+)
+def test_evaluate_rejects_unsuitable_poses_of_user_models(pose, words):
+    model = Own(lambda clouds: [SimpleNamespace(pose=pose)] * len(clouds))
+    with pytest.raises(InputError, match=f"^Own.predict: .*{words}"):
+        evaluation.evaluate(model, "bench", limit=3)
+
+
 def test_open_eval_dataset_default_splits(sets, tmp_path):
     assert [open_eval_dataset(sets / name).split for name in ("waymo", "humanm3")] == ["val", "test"]
     everybody = open_eval_dataset(sets / "humanm3", split="all")
@@ -563,7 +584,10 @@ def test_scores_round_trip(written):
     assert len(content["weights"]["digest"]) == 64 and content["weights"]["file"] == "tiny.safetensors"
     for result in content["results"]:
         for row in result["lines"]:
-            assert (row["protocol"], row["centring"]) == ("clean", "points alone")
+            assert (row["protocol"], row["centring"]) == (
+                "clean",
+                "points, and where uncertain the center of the displaced box",
+            )
             assert row["split"] == result["setting"]["split"]
     assert {path.name for path in paths} == {path.name for path in folder.iterdir()}
     assert [path.read_bytes()[:4] for path in paths if path.suffix == ".png"] == [b"\x89PNG"] * 9
@@ -616,6 +640,16 @@ def test_read_scores_rejects_other_files(written, tmp_path):
         (good | {"weights": good["weights"] | {"digest": float("nan")}}, "not a scores.json .*digest"),
         (nameless, "not a scores.json .*dataset is not text"),
     ]
+    for change, words in [
+        (lambda result: result["lines"][0].update(value="x"), "value is not a number"),
+        (lambda result: result["lines"][0].update(method=["a"]), "method is not text"),
+        (lambda result: result["setting"].update(limit="5"), "limit is not a whole number"),
+        (lambda result: result["skipped"].update({"people of": {"count": "3"}}), "count of people of is not a whole"),
+        (lambda result: result["skipped"].update({"people of": 3}), "not a scores.json"),
+    ]:
+        changed = json.loads(json.dumps(good))
+        change(changed["results"][0])
+        cases.append((changed, f"not a scores.json .*{words}" if words != "not a scores.json" else words))
     for content, words in [*((json.dumps(content), words) for content, words in cases), ("a", "not a scores.json")]:
         (tmp_path / "scores.json").write_text(content)
         for read in (evaluation.read_scores, evaluation.table):

@@ -325,5 +325,7 @@ def test_sensor_curve_casts_same_people_at_same_places(synthetic, monkeypatch):
         for person, first in zip(people, asked[0], strict=True):
             assert person.sample.distance == pytest.approx(first.sample.distance, abs=1.0)
             np.testing.assert_allclose(person.sample.joints[:, :2], first.sample.joints[:, :2], atol=1e-3)
+    # the protocol clean passes the boxes' centers
+    assert all(person.crop_box is person.sample.box is not None for people in asked for person in people)
     assert min(len(person.points) for person in asked[1]) < LEAST_POINTS
     assert [point.people for point in curve.points] == [12, 12, 12]

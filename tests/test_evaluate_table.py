@@ -118,8 +118,8 @@ def test_cli_evaluate_then_table(tmp_path, monkeypatch, capsys):
     }  # fmt: skip
     # the headline first, then the setting, printed once
     headline, setting, *rows = shown.out.splitlines()
-    assert "clean · points alone · no split · 12 of 2,000 people" in setting
-    assert not any("points alone · no split" in row for row in rows) and sum("MPJPE" in row for row in rows) > 10
+    assert "clean · points, and where uncertain the center of the displaced box · no split · 12 of 2,000" in setting
+    assert not any("displaced box · no split" in row for row in rows) and sum("MPJPE" in row for row in rows) > 10
     made = evaluation.read_scores(tmp_path / "evaluation/tiny")
     assert made.command == "lidarpose evaluate tiny bench --limit 12 --seed 3" and made.seed == 3
     assert headline.startswith(f"lidarpose-bench-1: MPJPE {made.results[0].line('mpjpe').value:.1f} mm [")

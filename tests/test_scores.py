@@ -135,6 +135,14 @@ def test_report_edges_cover_all_people(edges, values, people):
     assert all(np.isnan(part.score) == (part.score.people == 0) for part in slices.values())
 
 
+def test_by_span_keeps_spans_of_large_numbers_apart():
+    values, edges = np.arange(1_000_000, 1_000_004), [1_000_000, 1_000_001, 1_000_002, 1_000_004]
+    slices = metrics.by_span(np.array([10.0, 20, 30, 40]), values, edges)
+    assert {name: span.score for name, span in slices.items()} == {
+        "1000000 to 1000001": 10, "1000001 to 1000002": 20, "1000002 to 1000004": 35
+    }  # fmt: skip
+
+
 def test_by_span_computes_interval_of_each_slice():
     table, distance, sequence = drawn(1), np.repeat([5.0, 15.0], 15), np.arange(30) // 5
     slices = metrics.by_span(table, distance, (0, 10, 20), rng=np.random.default_rng(0), clusters=sequence)

@@ -19,7 +19,7 @@ from lidarpose.eval.predictions import Predictions, stack
 from lidarpose.eval.scores import Setting
 from lidarpose.inference.inputs import Clips
 from lidarpose.io.files import shorten
-from lidarpose.sample import PER_PERSON, UNLABELED, Box, LabeledSample, clip_windows, known_values
+from lidarpose.sample import PER_PERSON, UNLABELED, Box, LabeledSample, Pose, clip_windows, known_values
 from lidarpose.skeleton import Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
 
@@ -225,7 +225,31 @@ class EvalSetup:
                 f"{name} or None, got {shorten(repr(people), 60)}: return the same as lidarpose.Predictor"
             )
         for person in people:
+            self._check_pose(person.pose)
             yield {} if person.pose is None else self._prediction_columns(person.pose, ())
+
+    def _check_pose(self, pose: Any) -> None:
+        """Raises InputError unless a model's answer is None or a pose of its skeleton with shares from 0 to 1."""
+        model, skeleton = self.model.model["name"], self.model.skeleton
+        if pose is None:
+            return
+        if (
+            not isinstance(pose, Pose)
+            or pose.skeleton.joints != skeleton.joints
+            or pose.joints.shape != (len(skeleton), 3)
+        ):
+            actual = type(pose).__name__
+            if isinstance(pose, Pose):
+                actual = f"{len(pose.skeleton)} joints of {pose.skeleton.name}"
+            raise InputError(
+                f"{model}.predict: expected a lidarpose.Pose with the {len(skeleton)} joints of {skeleton.name}, got "
+                f"{actual}: return poses of the model's skeleton"
+            )
+        for name, value in known_values(pose, "confidence", "visible", *PER_PERSON).items():
+            if not np.all((value >= 0) & (value <= 1)):
+                raise InputError(
+                    f"{model}.predict: expected {name} from 0 to 1, got {np.min(value)} to {np.max(value)}"
+                )
 
     def _predict_dapt(self, samples: list[EvalSample], origin: np.ndarray | None) -> Iterator[dict]:
         """Predicts in one pass, centered as in the released code."""
@@ -359,11 +383,19 @@ def eval_setup(
         not_judged="; ".join(f"{reason} {', '.join(names)}" for reason, names in reasons.items() if names),
         sensor="unknown" if sensor_unknown else "known",
         seed=seed,
-        centring=DAPT[dataset.kind].centring if protocol == "dapt" else "points alone",
+        centring=DAPT[dataset.kind].centring if protocol == "dapt" else _centering(model, dataset.kind),
         crop=DAPT[dataset.kind].crop if protocol == "dapt" else _CLEAN_CROPS.get(dataset.kind, _UNBOXED),
         **{name: getattr(dataset, name) for name in fields},
     )
     return EvalSetup(model=model, dataset=dataset, setting=setting, joints=_subset(target_skeleton, scored_joints))
+
+
+def _centering(model: Model, kind: str) -> str:
+    """How people are centered in the protocol clean."""
+    if kind not in _CLEAN_CROPS or not hasattr(model, "predict_in"):
+        return "points alone"
+    boxed = "where uncertain the center of the displaced box"
+    return f"points; top view: and {boxed}" if kind == "itop" else f"points, and {boxed}"
 
 
 def _subset(skeleton: Skeleton, joints: Sequence[str]) -> Skeleton:

@@ -243,6 +243,7 @@ def people_to_perturb(setup: EvalSetup) -> list[CroppedPerson]:
 def study(
     setup: EvalSetup,
     predictions: Predictions,
+    setting: Setting | None = None,
     *,
     people: list[CroppedPerson] | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -251,13 +252,17 @@ def study(
 
     Args:
         predictions: of the unperturbed dataset.
+        setting: of the result of `evaluate_dataset`, which knows of which people the sensor position is known; None
+            for that of `setup`.
         people: people to perturb, by default `people_to_perturb`.
         progress: progress(done, 0) is called as people are predicted.
     """
     people = people_to_perturb(setup) if people is None else people
+    setting = setting or setup.setting
     if setup.dataset.count > PEOPLE:
         # a draw from the dataset, as with a limit
         setup = replace(setup, dataset=replace(setup.dataset, limit=PEOPLE))
+        setting = replace(setting, limit=PEOPLE)
     num_predicted = 0
 
     def advance(count: int) -> None:
@@ -286,7 +291,7 @@ def study(
     else:
         notes.append("other sensors: people in new ray casts have no released center")
     who, ends = f"{len(people):,} {_people_text(setup)}", end_errors(predictions)
-    return Stability(setting=setup.setting, who=who, curves=tuple(curves), ends=ends, notes=tuple(notes))
+    return Stability(setting=setting, who=who, curves=tuple(curves), ends=ends, notes=tuple(notes))
 
 
 def end_errors(predictions: Predictions) -> tuple[End, ...]:
@@ -333,6 +338,9 @@ def _perturbed(setup: EvalSetup, person: CroppedPerson, name: str, amount: float
         box = box and replace(box, center=apply(box.center))
     elif name == "crop" and box is not None:
         box = moved_box(points, box, amount, np.random.default_rng(seed))
+        # the released code's center of Waymo and HumanM3
+        box_centers = dict.fromkeys({"box", "joints_box"} & set(sample.centers), box.center)
+        sample = replace(sample, centers=sample.centers | box_centers)
     return replace(eval_sample, points=apply(points), sample=sample, crop_box=box)
 
 
@@ -401,4 +409,4 @@ def _simulated(sample, setup: EvalSetup, shard: int, row: int) -> EvalSample:
         joint_labels=np.full(len(skeleton), SEEN, np.uint8),
         sequence=str(row),
     )
-    return EvalSample(sample=labeled_sample, points=sample.points, shard=shard, row=row)
+    return EvalSample(sample=labeled_sample, points=sample.points, shard=shard, row=row, crop_box=sample.box)

@@ -131,9 +131,15 @@ def _person_rows(setup: EvalSetup, bench: Bench, predictions: Predictions, setti
     people = predictions.select(~predictions.moving)
     if not len(bench.objects) or np.isnan(people.person).all():
         return ()
-    model, origin = setup.model, np.zeros(3) if setting.sensor == "known" else None
+    model: Any = setup.model
+    origin, name = np.zeros(3) if setting.sensor == "known" else None, model.skeleton.name
     clouds = [bench.points[row] for row in bench.objects]
-    answers = model.predict(clouds, sensor_origin=origin, skeleton=model.skeleton.name)
+    if hasattr(model, "predict_in"):
+        # with the centers of their boxes, as people are predicted
+        centers = bench.columns["box"][bench.objects, :3].astype(float)
+        answers = model.predict_in(clouds, origin, name, box_centers=centers, check_upside_down=False)
+    else:
+        answers = model.predict(clouds, sensor_origin=origin, skeleton=name)
     # an object without a pose counts as a prediction of no person
     probabilities = [None if answer.pose is None else answer.pose.person for answer in answers]
     objects = np.array([0.0 if probability is None else float(probability) for probability in probabilities])
@@ -261,7 +267,15 @@ def run(
         evaluations.append(evaluate_dataset(setup, dapt_compat=dapt_compat or legacy, progress=partial(progress, name)))
         if people is not None:
             study_progress = partial(progress, f"{name}, perturbed")
-            studies.append(study(setup, evaluations[-1].predictions, people=people, progress=study_progress))
+            studies.append(
+                study(
+                    setup,
+                    evaluations[-1].predictions,
+                    evaluations[-1].result.setting,
+                    people=people,
+                    progress=study_progress,
+                )
+            )
     results = tuple(evaluation.result for evaluation in evaluations)
     scores = Scores(weights=weights, command=command, seed=setups[0].setting.seed, results=results)
     return Run(scores=scores, evaluations=tuple(evaluations), studies=tuple(studies))

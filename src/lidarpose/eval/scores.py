@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, fields
 from importlib import resources
 from os import PathLike
 from pathlib import Path
+from types import NoneType
 from typing import Any
 
 from lidarpose._version import __version__
@@ -169,17 +170,31 @@ def _result(content: dict[str, Any]) -> Result:
     for field in fields(Setting):
         if field.type is str and not isinstance(setting[field.name], str):
             raise TypeError(f"{field.name} is not text")
-    counts = dict(content["counts"])
-    for name in ("people", "without a pose"):
-        if type(counts[name]) is not int:
+    counts, skipped = dict(content["counts"]), dict(content["skipped"])
+    numbers = {name: counts[name] for name in ("people", "without a pose")} | {"total": setting["total"]}
+    numbers |= {"limit": 0 if setting["limit"] is None else setting["limit"]}
+    numbers |= {f"count of {reason}": entry["count"] for reason, entry in skipped.items()}
+    for name, value in numbers.items():
+        if type(value) is not int:
             raise TypeError(f"{name} is not a whole number")
     return Result(
         setting=Setting(**setting),
         counts=counts,
-        skipped=dict(content["skipped"]),
+        skipped=skipped,
         notes=tuple(content["notes"]),
-        lines=tuple(MetricRow(**row) for row in content["lines"]),
+        lines=tuple(map(_row, content["lines"])),
     )
+
+
+def _row(content: dict[str, Any]) -> MetricRow:
+    row = MetricRow(**content)
+    for field in fields(MetricRow):
+        value = getattr(row, field.name)
+        if field.type is str and not isinstance(value, str):
+            raise TypeError(f"{field.name} is not text")
+        if field.name in ("value", "low", "high") and type(value) not in (int, float, NoneType):
+            raise TypeError(f"{field.name} is not a number")
+    return row
 
 
 def number(value: float) -> float | None:

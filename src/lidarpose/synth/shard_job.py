@@ -105,7 +105,8 @@ class SynthesisJob:
 
         scene = scene_config(self.scene).eased(self.hard).changed(self.set)
         if self.sensors is not None:
-            scene = replace(scene, sensors=self.sensors)
+            # `sparse` would replace the chosen sensors by others
+            scene = replace(scene, sensors=self.sensors, sparse=0.0)
         bank = PoseBank.from_clips(self.motion, self.subjects) if self.motion is not None else None
         if self.what == "clips" and self.share and bank is not None and not len(bank.clips.windows(CLIP_FRAMES + 1)):
             raise file_error(

@@ -283,9 +283,11 @@ class Slice:
 
 def span_rows(values: np.ndarray, edges: Sequence[float] | np.ndarray) -> dict[str, np.ndarray]:
     """Span -> (n,) bool: values (n,) in it. A span includes its lower edge; the last one also its upper edge."""
-    rows = {}
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
-        name = f"{low:g} and more" if np.isinf(high) else f"{low:g} to {high:g}"
+    rows, texts = {}, [f"{edge:g}" for edge in edges]
+    if len(set(texts)) < len(texts):
+        texts = [f"{edge:.17g}" for edge in edges]
+    for low, high, low_text, high_text in zip(edges[:-1], edges[1:], texts[:-1], texts[1:], strict=True):
+        name = f"{low_text} and more" if np.isinf(high) else f"{low_text} to {high_text}"
         rows[name] = (values >= low) & ((values < high) | ((values == high) & (high == edges[-1])))
     return rows
 
