@@ -1,12 +1,14 @@
 """Writes the tables of the README, docs/results.md, evaluate.md, method.md and the model cards, from docs/scores.
 
     python benchmarks/results.py --collect runs/ablations     # runs' scores.json into docs/scores/ablations.json
+    python benchmarks/results.py --curve RUN               # a run of paper-small into docs/scores
     python benchmarks/results.py                              # docs/scores -> the tables of the pages
     python benchmarks/results.py --check                      # exit code 1 if they differ
 
 docs/scores/paper is the output of `lidarpose paper`, NAME.json that of `lidarpose evaluate NAME bench`, NAME-2.json the
 same for bench-2, NAME-unknown.json with `--sensor-unknown`, and stability/NAME.json the additional output with
-`--stability`. The other files are the output of the benchmarks with the same names.
+`--stability`; NAME-own.json are scores on 1,000 people of the paper's scene. The other files are the output of the
+benchmarks with the same names.
 
 A table stands between `<!-- table NAME -->` and `<!-- end -->`; the text around it is not changed.
 """
@@ -28,10 +30,11 @@ from ablations import VARIANTS
 from against_paper import WAYS
 
 from lidarpose.eval.scores import BASELINE, MetricRow, Scores, published, read_scores
-from lidarpose.io.files import content_digest, write_atomic
+from lidarpose.io.files import content_digest, lined_json, write_atomic
 from lidarpose.models import BUNDLED, DEFAULT, VERIFIER, bundled_path, weights_file
-from lidarpose.models.checkpoint import read_header, runs_of
+from lidarpose.models.checkpoint import load_checkpoint, parameter_count, read_header, runs_of
 from lidarpose.paper import report
+from lidarpose.train.run_dir import read_log
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -269,6 +272,40 @@ def progress(model: str) -> str:
     return table(("", "people in total", "hours", "validation mm", "`heldout.py` mm", "`heldout.py` plain mm"), rows)
 
 
+def paper_small(what: str) -> str:
+    """The long training of the paper's network at the small width: its "figures" beside those of the bundled networks,
+    or its "curve"."""
+    run = _read("paper-small-run")
+    if what == "curve":
+        rows = []
+        for line in run["log"]:
+            hours, error = line["seconds"] / 3600, 1e3 * line["mpjpe"]
+            cells = f"{line['people']:,}", f"{hours:.2f}", f"{error:.0f}", f"{line['heatmap']:.1f}"
+            rows.append((*cells, f"{line['validation_mm']:.0f}"))
+        return table(("people", "hours", "training error, mm", "training loss", "validation, mm"), rows)
+    cards = {name: runs_of(read_header(bundled_path(name)).card) for name in BUNDLED}
+    people = {"paper-small": run["log"][-1]["people"]}
+    people |= {name: sum(part["people_seen"] for part in runs) for name, runs in cards.items()}
+    parameters = {"paper-small": run["parameters"]}
+    parameters |= {name: parameter_count(bundled_path(name)) for name in BUNDLED}
+    columns = {
+        "bench: MPJPE, mm": ("", "all", "mpjpe"),
+        "PA-MPJPE, mm": ("", "all", "pa_mpjpe"),
+        "plain, mm": ("", "plain", "mpjpe"),
+        "facing > 90 deg off, %": ("", "100 and more", "turned_round"),
+        "the paper's scene: MPJPE, mm": ("-own", "all", "mpjpe"),
+        "its facing > 90 deg off, %": ("-own", "100 and more", "turned_round"),
+    }
+    rows = []
+    for name in people:
+        cells = [f"`{name}`", f"{people[name]:,}", f"{parameters[name]:,}"]
+        for suffix, of, figure in columns.values():
+            lines = (x for x in own_lines(_scored(f"{name}{suffix}").results[0]) if x.figure == figure)
+            cells.append(_cell(next(x for x in lines if of in (x.group, x.of))))
+        rows.append(tuple(cells))
+    return table(("", "people in training", "parameters", *columns), rows)
+
+
 def _in_all(runs: list[dict], name: str, form: str) -> str:
     """A number of the last run, and its sum over all runs."""
     last_value = f"{runs[0][name]:{form}}"
@@ -495,6 +532,7 @@ def tables() -> dict[str, Callable[[], str]]:
         f"bench-2 by {group}": partial(second_bench, group) for group in ("condition", "poses", "family", "sensor")
     }
     makers["bench-2 persons"] = persons
+    makers |= {f"paper-small {what}": partial(paper_small, what) for what in ("figures", "curve")}
     makers["stability"] = lambda: table(("", "undisturbed", *5 * ("",)), disturbed.curves(DEFAULT))
     makers["stability sensors"] = lambda: table(("sensor", "points", "MPJPE mm"), disturbed.sensors(DEFAULT))
     makers["stability ends"] = lambda: table(("", "mean, mm", "deviation"), disturbed.ends(DEFAULT))
@@ -522,12 +560,20 @@ def written(page: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--collect", type=Path, metavar="DIR", help="folder of runs whose scores are added")
+    parser.add_argument("--curve", type=Path, metavar="RUN", help="folder of a run of paper-small to store")
     parser.add_argument("--check", action="store_true", help="write nothing, say whether the page is up to date")
     options = parser.parse_args()
     if options.collect:
         runs, path = changed.collect(options.collect, _read(RUNS)), SCORES / f"{RUNS}.json"
         write_atomic(path, "[\n" + ",\n".join(json.dumps(run) for run in runs) + "\n]\n")
         print(f"{len(runs)} runs -> {path}")
+        return
+    if options.curve:
+        network, header = load_checkpoint(options.curve / "model.safetensors")
+        count = sum(value.numel() for value in network.parameters())
+        log = [line for line in read_log(options.curve) if "validation_mm" in line]
+        content = {"command": header.card["command"], "parameters": count, "log": log}
+        write_atomic(SCORES / "paper-small-run.json", lined_json(content, "log") + "\n")
         return
     for path in PAGES:
         page = path.read_text()
