@@ -87,10 +87,11 @@ def test_picture_of_scan_has_view_from_above(monkeypatch, tmp_path):
         np.testing.assert_allclose(panel.poses.joints, joints[None])
         np.testing.assert_allclose(panel.sensor, origin[:2])
         assert np.abs(panel.boxes[0].center - center).max() < (1e-9 if up in UP_AXES else 0.3)
-    few = replace(person, pose=None, points=np.zeros((0, 3)), id="0123456789abcdef")
+    named = replace(person, box=replace(person.box, id=7))
+    few = replace(person, pose=None, points=np.zeros((0, 3)), box=replace(person.box, id="0123456789abcdef"))
     written, annotate = [], Axes.annotate
     monkeypatch.setattr(Axes, "annotate", lambda ax, text, *a, **b: written.append(text) or annotate(ax, text, *a, **b))
-    replace(poses, people=(person, few), up="z").picture()
+    replace(poses, people=(named, few), up="z").picture()
     assert panels.pop().label == "2 people, 1 with a pose"
     assert "7" in written and max(map(len, written)) == bird_eye.LONGEST_NAME
     # without a known sensor position no distance is shown
