@@ -262,7 +262,8 @@ def study(
     if setup.dataset.count > PEOPLE:
         # a draw from the dataset, as with a limit
         setup = replace(setup, dataset=replace(setup.dataset, limit=PEOPLE))
-        setting = replace(setting, limit=PEOPLE)
+        if setting.kind != BENCH:
+            setting = replace(setting, limit=PEOPLE)
     num_predicted = 0
 
     def advance(count: int) -> None:
