@@ -118,6 +118,12 @@ def _cell(line: MetricRow) -> str:
     return f"{line.value:.1f} {_interval(line)}".rstrip()
 
 
+def _figure(file: str, of: str, figure: str) -> str:
+    """A figure of all people or of a group in the scores of a file, with its interval if it has one."""
+    lines = (x for x in own_lines(_scored(file).results[0]) if x.figure == figure)
+    return _cell(next(x for x in lines if of in (x.group, x.of)))
+
+
 def headline(bench: str, **files: str) -> str:
     """The main figures of several networks on a bench. files: column title -> name of the scores."""
     figure_by_title = {
@@ -133,12 +139,7 @@ def headline(bench: str, **files: str) -> str:
     }
     rows = []
     for name, (of, figure) in figure_by_title.items():
-        cells = []
-        for file in files.values():
-            lines = (x for x in own_lines(_scored(file).results[0]) if x.figure == figure)
-            line = next(x for x in lines if of in (x.group, x.of))
-            cells.append(_cell(line))
-        rows.append((name, *cells))
+        rows.append((name, *(_figure(file, of, figure) for file in files.values())))
     return table((bench, *files), rows)
 
 
@@ -300,8 +301,7 @@ def paper_small(what: str) -> str:
     for name in people:
         cells = [f"`{name}`", f"{people[name]:,}", f"{parameters[name]:,}"]
         for suffix, of, figure in columns.values():
-            lines = (x for x in own_lines(_scored(f"{name}{suffix}").results[0]) if x.figure == figure)
-            cells.append(_cell(next(x for x in lines if of in (x.group, x.of))))
+            cells.append(_figure(f"{name}{suffix}", of, figure))
         rows.append(tuple(cells))
     return table(("", "people in training", "parameters", *columns), rows)
 

@@ -366,11 +366,11 @@ def test_read_bin_infers_columns_from_values(folder, cloud, n):
             same(found, rows5, ("x", "y", "z", "intensity", "ring"))
             assert len(found.warnings) == 1 and "columns 4" in found.warnings[0]
     for count in range(n - 3, n + 1) if n >= 40 else ():
-        found = read(folder, "a.bin", xyz[:count].astype(np.float32).tobytes())
-        same(found, xyz[:count].astype(np.float32), ("x", "y", "z"))
+        triples = read(folder, "a.bin", xyz[:count].astype(np.float32).tobytes())
+        same(triples, xyz[:count].astype(np.float32), ("x", "y", "z"))
         mixed = [f"rows of {columns} would mix" for columns in (4, 5) if count % columns == 0]
         reason = mixed[0] if mixed else "the size is a multiple of 3 values and not of 4"
-        assert f"rows of 3 float32, since {reason}" in found.warnings[0]
+        assert f"rows of 3 float32, since {reason}" in triples.warnings[0]
     # rows that are cut off are not taken for rows of 3
     cut_off = np.column_stack([xyz, rng.uniform(0, 1, n)]).astype(np.float32).ravel()
     cut_off = cut_off[: next(size for size in range(4 * n - 1, 0, -1) if size % 3 == 0 and size % 4 and size % 5)]

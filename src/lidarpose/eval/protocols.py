@@ -210,11 +210,7 @@ class EvalSetup:
         name, clips = model.skeleton.name, self._clips(samples)
         # in a call either all people have a box or none; these are the boxes that cropped, not boxes made from labels
         centers = [person.crop_box.center for person in samples if person.crop_box is not None]
-        if hasattr(model, "predict_in") and not clips:
-            box_centers = np.stack(centers) if centers else None
-            people = model.predict_in(clouds, origin, name, box_centers=box_centers, check_upside_down=False)
-        else:
-            people = model.predict(clouds, sensor_origin=origin, skeleton=name, **clips)
+        people = self.answers(clouds, origin, np.stack(centers) if centers else None, clips)
         if (
             not isinstance(people, Sequence)
             or len(people) != len(clouds)
@@ -227,6 +223,21 @@ class EvalSetup:
         for person in people:
             self._check_pose(person.pose)
             yield {} if person.pose is None else self._prediction_columns(person.pose, ())
+
+    def answers(
+        self,
+        clouds: list[np.ndarray],
+        origin: np.ndarray | None,
+        box_centers: np.ndarray | None,
+        clips: dict[str, Clips] | None = None,
+    ) -> Any:
+        """The model's answers for clouds (n, 3) m under the protocol clean. box_centers (N, 3) m, None without boxes:
+        for models that take them, but not for clips."""
+        model: Any = self.model
+        name = model.skeleton.name
+        if hasattr(model, "predict_in") and not clips:
+            return model.predict_in(clouds, origin, name, box_centers=box_centers, check_upside_down=False)
+        return model.predict(clouds, sensor_origin=origin, skeleton=name, **(clips or {}))
 
     def _check_pose(self, pose: Any) -> None:
         """Raises InputError unless a model's answer is None or a pose of its skeleton with shares from 0 to 1."""

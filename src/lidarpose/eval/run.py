@@ -131,15 +131,9 @@ def _person_rows(setup: EvalSetup, bench: Bench, predictions: Predictions, setti
     people = predictions.select(~predictions.moving)
     if not len(bench.objects) or np.isnan(people.person).all():
         return ()
-    model: Any = setup.model
-    origin, name = np.zeros(3) if setting.sensor == "known" else None, model.skeleton.name
+    origin = np.zeros(3) if setting.sensor == "known" else None
     clouds = [bench.points[row] for row in bench.objects]
-    if hasattr(model, "predict_in"):
-        # with the centers of their boxes, as people are predicted
-        centers = bench.columns["box"][bench.objects, :3].astype(float)
-        answers = model.predict_in(clouds, origin, name, box_centers=centers, check_upside_down=False)
-    else:
-        answers = model.predict(clouds, sensor_origin=origin, skeleton=name)
+    answers = setup.answers(clouds, origin, bench.columns["box"][bench.objects, :3].astype(float))
     # an object without a pose counts as a prediction of no person
     probabilities = [None if answer.pose is None else answer.pose.person for answer in answers]
     objects = np.array([0.0 if probability is None else float(probability) for probability in probabilities])

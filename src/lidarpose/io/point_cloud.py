@@ -218,19 +218,13 @@ def _guess_columns(data: bytes) -> tuple[int, tuple[str, ...]]:
             guess, candidates, reason = five, [five], "every fifth value is a beam number"
     if candidates and guess not in candidates:
         # neither 4 nor 5 divides the size; the columns of cut off rows of 4 or 5 would be narrower than those of 3 or 6
-        widths = {columns: _width(_whole_rows(values, columns)) for columns in (*candidates, four, five)}
-        if _SIX in widths:
-            # rows of 3 read as rows of 6 have columns of the same spread, so 6 needs a clear advantage over 3
-            widths[_SIX] += _NARROWER
+        widths = {columns: _width(values, columns) for columns in (*candidates, four, five)}
         narrowest = min(widths, key=widths.__getitem__)
         if narrowest in candidates and widths[narrowest] < min(widths[four], widths[five]) - _NARROWER:
             guess, alternative = narrowest, _SIX if narrowest == 3 else 3
             reason = f"the size is a multiple of {guess} values and not of 4"
     elif len(candidates) > 1:
-        widths = {columns: _width(values.reshape(-1, columns)) for columns in candidates}
-        if _SIX in widths:
-            # rows of 3 read as rows of 6 have columns of the same spread, so 6 needs a clear advantage over 3
-            widths[_SIX] += _NARROWER
+        widths = {columns: _width(values, columns) for columns in candidates}
         narrowest = min(candidates, key=widths.__getitem__)
         if widths[narrowest] < widths[guess] - _NARROWER:
             guess, reason = narrowest, f"rows of {guess} would mix up its columns"
@@ -243,16 +237,15 @@ def _guess_columns(data: bytes) -> tuple[int, tuple[str, ...]]:
     return guess, (f"read as rows of {guess} float32{names.get(guess, '')}, since {reason}; {remedy}",)
 
 
-def _whole_rows(values: np.ndarray, columns: int) -> np.ndarray:
-    """Values (n,) as rows of `columns`, without those of an incomplete last row."""
-    return values[: len(values) // columns * columns].reshape(-1, columns)
-
-
-def _width(rows: np.ndarray) -> float:
-    """Mean logarithm of the columns' standard deviations. It is smallest for the right number of columns, since any
-    other number mixes x, y, z and the rest in all columns. Infinite if no value is a number."""
+def _width(values: np.ndarray, columns: int) -> float:
+    """Mean logarithm of the standard deviations of the columns of values (n,) in rows of `columns`, without an
+    incomplete last row. It is smallest for the right number of columns, since any other number mixes x, y, z and the
+    rest in all columns. Infinite if no value is a number."""
+    rows = values[: len(values) // columns * columns].reshape(-1, columns)
     spread = np.nanstd(np.clip(rows, -_FAR, _FAR), axis=0, dtype=np.float64)
-    return float(np.nan_to_num(np.log(spread + _NARROWEST).mean(), nan=np.inf))
+    width = float(np.nan_to_num(np.log(spread + _NARROWEST).mean(), nan=np.inf))
+    # rows of 3 read as rows of 6 have columns of the same spread, so 6 needs a clear advantage over 3
+    return width + _NARROWER if columns == _SIX else width
 
 
 # ---- NumPy

@@ -9,7 +9,7 @@ import sqlite3
 import struct
 import sys
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from importlib import import_module
@@ -17,7 +17,8 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
-from lidarpose.io.files import FormatError, check_unpacked, shorten
+from lidarpose.errors import InputError
+from lidarpose.io.files import FormatError, check_unpacked, file_error, shorten, unreadable
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _CUT_OFF = "is cut off: the part before the cut is read, if there is any"
@@ -329,3 +330,18 @@ class SqliteFile:
                     yield Message(str(name), time if isinstance(time, int) else 0, data)
         except sqlite3.Error as error:
             raise FormatError(f"is damaged ({shorten(str(error))}): the part before the damage is read") from None
+
+
+def all_messages(files: Iterable[RecordFile | SqliteFile], topics: set[str]) -> Iterator[Message]:
+    """The messages of all files, in order. After a damaged position, reading continues with the next file; the last
+    damage is raised at the end, as InputError."""
+    damage: InputError | None = None
+    for file in files:
+        try:
+            yield from file.messages(topics)
+        except FormatError as problem:
+            damage = file_error(file.path, problem)
+        except OSError as error:
+            damage = unreadable(file.path, error)
+    if damage is not None:
+        raise damage

@@ -5,9 +5,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from lidarpose.errors import InputError
-from lidarpose.io.files import FormatError, file_error, unreadable
+from lidarpose.io.files import file_error
 from lidarpose.io.sources import ouster
-from lidarpose.io.sources.containers import RecordFile, SqliteFile, unpacked_message
+from lidarpose.io.sources.containers import RecordFile, SqliteFile, all_messages, unpacked_message
 from lidarpose.io.sources.frame import ReadingOptions, Recording
 from lidarpose.io.sources.pcap import Datagram
 from lidarpose.io.sources.ros_messages import FRAME_TYPES, TEXT_TYPES, decoders
@@ -28,9 +28,10 @@ def open_packets(name: str, files: list[RecordFile | SqliteFile], options: Readi
         return ouster.OusterRecording(Path(name), options.meta, datagrams=datagrams)
     text_topics = {key for key, entry in topics.items() if entry.type in TEXT_TYPES and key.endswith("metadata")}
     texts = []
-    for file in files:
-        with suppress(FormatError, OSError):
-            for message in file.messages(text_topics):
+    with suppress(InputError):
+        for message in all_messages(files, text_topics):
+            # a damaged text is no metadata
+            with suppress(Exception):
                 decode = decoders()[topics[message.topic].encoding]
                 texts.append(decode(unpacked_message(message.data), TEXT_TYPES[0]).data)
     if not texts:
@@ -47,20 +48,11 @@ class MessageDatagrams:
 
     def __iter__(self) -> Iterator[Datagram]:
         self.num_cut = 0
-        damage: InputError | None = None
-        for file in self.files:
+        for message in all_messages(self.files, set(self.encodings)):
             try:
-                for message in file.messages(set(self.encodings)):
-                    try:
-                        decode = decoders()[self.encodings[message.topic]]
-                        payload = bytes(decode(unpacked_message(message.data), ouster.PACKET_TYPES[0]).buf)
-                    except Exception:
-                        self.num_cut += 1
-                        continue
-                    yield Datagram(message.time / 1e9, (message.topic.encode(), 0), payload)
-            except FormatError as problem:
-                damage = file_error(file.path, problem)
-            except OSError as error:
-                damage = unreadable(file.path, error)
-        if damage is not None:
-            raise damage
+                decode = decoders()[self.encodings[message.topic]]
+                payload = bytes(decode(unpacked_message(message.data), ouster.PACKET_TYPES[0]).buf)
+            except Exception:
+                self.num_cut += 1
+                continue
+            yield Datagram(message.time / 1e9, (message.topic.encode(), 0), payload)

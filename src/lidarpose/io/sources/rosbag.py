@@ -26,6 +26,7 @@ from lidarpose.io.sources.containers import (
     Ros1File,
     SqliteFile,
     Topic,
+    all_messages,
     unpacked_message,
 )
 from lidarpose.io.sources.folders import natural_key
@@ -193,13 +194,10 @@ class BagRecording:
     def _messages(self) -> Iterator[Message]:
         """Clouds and transforms of all files. After a damaged position, reading continues with the next file."""
         self._damage = None
-        for file in self.files:
-            try:
-                yield from file.messages({self.topic, *self._transforms})
-            except FormatError as problem:
-                self._damage = file_error(file.path, problem)
-            except OSError as error:
-                self._damage = unreadable(file.path, error)
+        try:
+            yield from all_messages(self.files, {self.topic, *self._transforms})
+        except InputError as damage:
+            self._damage = damage
 
     def _pose(self, transforms: "TransformTree", cloud: "_Cloud", is_last: bool) -> np.ndarray | None:
         """T_world_sensor at a cloud's time. The world is chosen once: the first of `_WORLDS`, or the next available one
