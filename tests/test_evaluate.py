@@ -565,7 +565,7 @@ def test_run_accepts_numpy_numbers_and_options_of_load(tmp_path):
 def test_metrics_can_be_computed_from_poses_parquet(written):
     _, folder, _ = written
     scores, people = evaluation.read_scores(folder), evaluation.read_poses(folder / "poses.parquet")
-    assert list(people) == ["waymo", "humanm3", "lidarpose-bench-1"]
+    assert list(people) == ["waymo", "humanm3", "lidarpose-bench-1.1"]
     # also from the table alone, without this package
     table = pd.read_parquet(folder / "poses.parquet")
     for result in scores.results:

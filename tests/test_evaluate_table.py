@@ -73,7 +73,7 @@ def test_table_separates_protocols(tmp_path):
     words = "protocol clean", "center: somewhere", "crop: so", "split: val (a list)", "9 people", "2 joints", "abababab"
     assert all(word in note for word in (*words, "2 without a pose")) and "which leaks: much" in text
     # datasets that are not in the paper have their own block
-    text = evaluation.table([scores(tmp_path / "c", kind="bench", dataset="lidarpose-bench-1", limit=9)])
+    text = evaluation.table([scores(tmp_path / "c", kind="bench", dataset="lidarpose-bench-1.1", limit=9)])
     assert "9 people, evenly picked from 200" in text
     assert "**Evaluated here on sets that the paper does not have.**" in text and "| baseline: nobody | 300.00" in text
 
@@ -113,8 +113,8 @@ def test_cli_evaluate_then_table(tmp_path, monkeypatch, capsys):
     assert run("evaluate", "tiny", "bench", "--limit", "12", "--seed", "3") == 0
     shown = capsys.readouterr()
     assert {path.name for path in (tmp_path / "evaluation/tiny").iterdir()} == {
-        "scores.json", "poses.parquet", "lidarpose-bench-1-errors.png", "lidarpose-bench-1-reliability.png",
-        "lidarpose-bench-1-worst.png",
+        "scores.json", "poses.parquet", "lidarpose-bench-1.1-errors.png", "lidarpose-bench-1-reliability.png",
+        "lidarpose-bench-1.1-worst.png",
     }  # fmt: skip
     # the headline first, then the setting, printed once
     headline, setting, *rows = shown.out.splitlines()
@@ -122,7 +122,7 @@ def test_cli_evaluate_then_table(tmp_path, monkeypatch, capsys):
     assert not any("displaced box · no split" in row for row in rows) and sum("MPJPE" in row for row in rows) > 10
     made = evaluation.read_scores(tmp_path / "evaluation/tiny")
     assert made.command == "lidarpose evaluate tiny bench --limit 12 --seed 3" and made.seed == 3
-    assert headline.startswith(f"lidarpose-bench-1: MPJPE {made.results[0].line('mpjpe').value:.1f} mm [")
+    assert headline.startswith(f"lidarpose-bench-1.1: MPJPE {made.results[0].line('mpjpe').value:.1f} mm [")
     assert ", 12 of 12 people · tiny" in headline
 
     assert run("table", "evaluation/tiny") == 0

@@ -5,9 +5,9 @@ scans, including false positives. The rest of the network is not changed.
     python tools/fit_person.py fit CROPS.npz RUN/model.safetensors OUT.safetensors
 
 `crops` creates the training data: crops of the detections in synthesized scans (family "train"), prepared as in
-`lidarpose.detect`, and equal numbers of people and objects of the scene "wide", undisturbed. `fit` trains the head
-further on the network's features of these crops. Later weights of a network are fitted to the same crops. Needs
-lidarpose[train].
+`lidarpose.detect`, and equal numbers of people and objects of the scene "wide", disturbed as in training. `fit`
+trains the head further on the network's features of these crops. Later weights of a network are fitted to the same
+crops. Needs lidarpose[train].
 """
 
 import argparse
@@ -31,6 +31,8 @@ from lidarpose.train.detector.crop_source import scan_crops
 
 SEED = 9101
 MOST_POINTS = 1024
+# how often people and objects are disturbed, as in pre-training: else the head rejects people in blurred clouds
+STRAYS, NOISE = 0.2, 0.15
 EPOCHS, BATCH, RATE, HELD_OUT = 40, 512, 2e-3, 0.1
 
 Crop = tuple[np.ndarray, np.ndarray, np.ndarray, int]
@@ -54,7 +56,9 @@ def sample_crops(index: int, *, source: SyntheticSource) -> list[Crop]:
 
 def make_crops(out: Path, scenes: int, samples: int, motion: str | None, workers: int) -> None:
     captured = 0.6 if motion else 0.0
-    source = SyntheticSource(scene="wide", seed=SEED, motion=motion, captured=captured, objects=0.5)
+    source = SyntheticSource(
+        scene="wide", seed=SEED, motion=motion, captured=captured, strays=STRAYS, noise=NOISE, objects=0.5
+    )
     rng = np.random.default_rng(SEED)
     crops: list[Crop] = []
     with multiprocessing.get_context("forkserver").Pool(workers) as pool:

@@ -49,8 +49,8 @@ class BenchFile(NamedTuple):
 # keys are the names that users give; the first one is also the `kind` of both sets
 BENCH = "bench"
 BENCHES = {
-    BENCH: BenchFile("lidarpose-bench-1", "8abcafc6628c7580b8bdf91f9c05992c7c6e4098d6922973c7cfc39d8fe0e0d2"),
-    "bench-2": BenchFile("lidarpose-bench-2", "872355263c4fc6de96e158c177ebb8694753ab5de5110013eb029a6152caf69d"),
+    BENCH: BenchFile("lidarpose-bench-1.1", "d4b999797b03f13c14cefabe594660033d7562fa4f644887fdf3a84dcc581bcc"),
+    "bench-2": BenchFile("lidarpose-bench-2.1", "19ceed16dec362c56115ae589f7d8c66c4bb5131c57edb50dff0031fe51eb8ec"),
 }
 # the split name that selects all people
 EVERYBODY = "all"

@@ -25,8 +25,9 @@ MAX_POINTS = 50_000
 # scan's coordinates is estimated
 _COARSE, _LOOKED_AT = 0.1, 100_000
 
-# a crop wider than this, m, may contain more than one person, so candidates are searched in it
-_TIGHT = 2.0
+# a crop wider than this, m, may contain more than one person, so candidates are searched in it; if its pose is unsure,
+# in a crop wider than the second value
+WIDE, WIDE_IF_UNSURE = 2.0, 1.3
 # maximum distance of candidates from the middle of the crop, and size of the grid cells, m
 _SEARCH, _CELL = 10.0, 0.1
 # height range from above the ground to a raised hand, m
@@ -248,14 +249,14 @@ def is_few(points: np.ndarray) -> bool:
     return False
 
 
-def candidates(points: np.ndarray) -> list[np.ndarray]:
+def candidates(points: np.ndarray, width: float = WIDE) -> list[np.ndarray]:
     """points (n, 3) m, z up, n >= 1 -> candidate clouds (k, 3) for the person, the first of which contains all points.
 
-    A crop as narrow as a person has only this candidate. In a wider crop with ground and clutter, upright columns that
-    are filled at many heights and have free space around them are candidates too. The network's confidence then decides
-    between the candidates.
+    A crop narrower than `width` m has only this candidate. In a wider crop with ground and clutter, upright columns
+    that are filled at many heights and have free space around them are candidates too. The network's confidence then
+    decides between the candidates.
     """
-    if (np.ptp(points[:, :2], axis=0) < _TIGHT).all():
+    if (np.ptp(points[:, :2], axis=0) < width).all():
         return [points]
     near_points = points[(np.abs(points - np.median(points, axis=0))[:, :2] < _SEARCH).all(1)]
     if len(near_points) < MIN_POINTS:

@@ -21,6 +21,7 @@ from lidarpose.inference.checks import (
 )
 from lidarpose.inference.estimator import PoseEstimator
 from lidarpose.inference.inputs import (
+    WIDE_IF_UNSURE,
     Clips,
     as_origin,
     as_points,
@@ -56,6 +57,8 @@ TTA = 1
 # minimum confidence of a candidate pose, as a fraction of the highest confidence; poses nearer than this, m, are of the
 # same person
 _SURE, _SAME = 0.6, 0.3
+# mean confidence below which the pose of a crop is unsure
+_UNSURE = 0.65
 
 
 def load(
@@ -422,6 +425,16 @@ class Predictor(PoseEstimator):
                 new_poses = self.poses([parts[k][1] for k in part_rows], origin, progress=progress, **places)
                 for k, pose in zip(part_rows, new_poses, strict=True):
                     poses[k] = pose
+            if box_centers is None:
+                # a box tells which points are the person's; without one, ground and clutter may explain an unsure pose
+                more_parts = [
+                    (i, part)
+                    for (i, cloud), pose in zip(parts, poses, strict=True)
+                    if not is_placed[i] and pose is not None and 0 < _confidence(pose) < _UNSURE
+                    for part in (candidates(cloud, WIDE_IF_UNSURE)[1:] if len(candidates(cloud)) == 1 else ())
+                ]
+                parts += more_parts
+                poses += self.poses([part for _, part in more_parts], origin, progress=progress)
         poses_by_person: dict[int, list[tuple[Pose, np.ndarray]]] = {}
         for (i, part), pose in zip(parts, poses, strict=True):
             if pose is not None:
@@ -432,6 +445,10 @@ class Predictor(PoseEstimator):
         }
 
 
+def _confidence(pose: Pose) -> float:
+    return 0.0 if pose.confidence is None else float(pose.confidence.mean())
+
+
 def _select_pose(answers: list[tuple[Pose, np.ndarray]], box_center: np.ndarray | None) -> tuple[Pose, np.ndarray]:
     """Selects the pose of the intended person among the poses of a crop's candidates, the first of which is the whole
     cloud.
@@ -440,7 +457,7 @@ def _select_pose(answers: list[tuple[Pose, np.ndarray]], box_center: np.ndarray 
     people among the candidates raise `second_person` of the selected pose. Without confidence, the first pose is
     selected.
     """
-    confidences = [0.0 if pose.confidence is None else float(pose.confidence.mean()) for pose, _ in answers]
+    confidences = [_confidence(pose) for pose, _ in answers]
     if len(answers) == 1 or not any(confidences):
         return answers[0]
     middles = np.stack([pose.joints[list(pose.skeleton.middle)].mean(0)[:2] for pose, _ in answers])

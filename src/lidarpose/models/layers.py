@@ -40,8 +40,8 @@ class RotaryEmbedding:
     """Sines and cosines of the positions (B, N, 3) m of rows, shared by position features and rotary attention."""
 
     def __init__(self, position: Tensor):
-        scale = position.new_tensor([2 * torch.pi / w for w in WAVELENGTHS])
-        phase = position[..., None] * scale
+        # by scalars: a tensor made from them would be copied to a GPU, which a CUDA graph cannot record
+        phase = torch.stack([position * (2 * torch.pi / w) for w in WAVELENGTHS], -1)
         self.position = position
         self.sin, self.cos = phase.sin(), phase.cos()
         self._shared: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}

@@ -46,9 +46,8 @@ from lidarpose.train.validation import validate
 # number of validation samples; synthetic ones use a seed that no run trains on
 VALIDATION = 256
 _VALIDATION_SEED = 2**31 - 7
-_NO_VALIDATION = (
-    "no validation people: there is no split val, and no sequence is held out (--hold-out 0, or too few sequences)"
-)
+_NO_VALIDATION = "no validation people: there is no split val, and there are too few sequences to hold one out"
+_NOT_VALIDATED = "no validation people: --hold-out is 0"
 # no sequence is held out from fewer sequences than this
 _LEAST_SEQUENCES = 3
 # chunks between two uses of a scan: divisible by the usual numbers of workers
@@ -307,6 +306,7 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
         rows = evenly_spaced(len(held_out_dataset), VALIDATION)
         return [augmented(held_out_dataset.sample(k), cropping, np.random.default_rng([recipe.seed, k])) for k in rows]
 
+    no_validation = _NO_VALIDATION if recipe.hold_out else _NOT_VALIDATED
     setup = TrainSetup(
         objective=objective_of(config, recipe, layout),
         source=source,
@@ -317,7 +317,7 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
         validation=validation,
         joints=joints,
         card=card | {"damaged": list(dataset.damaged)},
-        warnings=_damage(dataset) + ((_NO_VALIDATION,) if held_out_dataset is None else ()),
+        warnings=_damage(dataset) + ((no_validation,) if held_out_dataset is None else ()),
     )
     if not isinstance(config, LidarcapConfig):
         if recipe.shift_windows:

@@ -21,8 +21,8 @@ from lidarpose.models.detector.render import render
 from lidarpose.models.onnx import check_names, map_in_threads, open_network, thread_count
 
 # default detection range, m; points farther than this beyond the range are ignored, m: a candidate at the end of the
-# range still has its surroundings
-MAX_RANGE, BEYOND = 40.0, 6.0
+# range still has its surroundings, and the ground below them is estimated as if there were no end
+MAX_RANGE, BEYOND = 40.0, 14.0
 # if the sensor is unknown, there is no range: points farther than this, m, from nearly all others, percentiles, are
 # stray points, which would enlarge the cells of `SceneIndex`
 _STRAY, _NEARLY_ALL = 100.0, (0.1, 99.9)
