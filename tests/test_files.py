@@ -236,7 +236,7 @@ def test_file_error_message_is_one_printable_line():
 
 
 def test_locked_allows_one_writer_and_removes_leftovers(tmp_path):
-    folder, left = tmp_path / "out", ".0123456789abcdef-a.json"
+    folder, left = tmp_path / "new" / "out", ".0123456789abcdef-a.json"
     with locked(folder, r"a\.json", busy="somebody writes"):
         assert is_unused(folder, r"a\.json")
         with (
@@ -244,8 +244,8 @@ def test_locked_allows_one_writer_and_removes_leftovers(tmp_path):
             locked(folder, r"a\.json", busy="somebody writes"),
         ):
             pass
-    # a folder that was created and not used is removed
-    assert not folder.exists()
+    # folders that were created and not used are removed
+    assert not folder.parent.exists()
     (folder / "deep").mkdir(parents=True)
     for name in (left, f"deep/{left}", ".0123456789abcdef-b.json", LOCK):
         (folder / name).touch()

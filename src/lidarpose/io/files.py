@@ -305,7 +305,7 @@ def is_unused(folder: Path, names: str) -> bool:
 def locked(folder: Path, names: str, *, busy: str, wait: float = 0.0) -> Iterator[None]:
     """Locks a folder against writing by other processes, and removes temporary files that killed processes left.
 
-    The folder is created if it is missing; such a folder is removed at the end if it is still empty. The lock of a
+    Missing folders are created, and removed at the end if they are still empty. The lock of a
     killed process does not block others. On file systems without locks nothing is locked.
 
     Args:
@@ -317,7 +317,7 @@ def locked(folder: Path, names: str, *, busy: str, wait: float = 0.0) -> Iterato
         MissingExtra: filelock is not installed.
     """
     lock = _file_lock(folder / LOCK)
-    is_new = not folder.exists()
+    new_folders = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     if not _acquired(lock, wait):
         raise file_error(folder, busy)
@@ -330,9 +330,9 @@ def locked(folder: Path, names: str, *, busy: str, wait: float = 0.0) -> Iterato
         with suppress(OSError):
             (folder / LOCK).unlink()
         lock.release()
-        if is_new:
+        for path in new_folders:
             with suppress(OSError):
-                folder.rmdir()
+                path.rmdir()
 
 
 @contextmanager
