@@ -790,12 +790,18 @@ def test_close_does_not_wait_for_next_frame(model):
         yield from fed([cloud])
         is_over.wait(60)
 
+    others = threading.enumerate()
     frames = lidarpose.predict_recording(endless(), crop=True, model=model)
     next(frames)
     start = time.perf_counter()
     frames.close()
     assert time.perf_counter() - start < 20
+    # nor does the interpreter wait at its end, and no thread is left when the frame comes
+    (thread,) = (thread for thread in threading.enumerate() if thread not in others)
+    assert thread.daemon
     is_over.set()
+    thread.join(20)
+    assert not thread.is_alive()
 
 
 def test_boxes_of_unknown_frames_raise_at_the_end(model):
