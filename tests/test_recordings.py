@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pandas
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from walking_people import FRAMES, PLACES, STEPS, moving_source, walking_clouds
 
 import lidarpose
@@ -447,16 +449,17 @@ def test_hidden_people_are_filled_in(clouds, folder, model, monkeypatch):
 # ---- boxes of many frames
 
 
+@pytest.mark.parametrize("names", [("a", "b"), (0, 1)])
 @pytest.mark.parametrize("form", ["folder", "list", "lines"])
-def test_frame_boxes_match_frames_by_name_or_number(form, tmp_path):
+def test_frame_boxes_match_frames_by_name_or_number(form, names, tmp_path):
     people = [{"center": [1, 2, 3], "size": [1, 1, 2]}]
-    entries = [{"frame": 0, "people": []}, {"frame": "b", "people": people}]
+    entries = [{"frame": names[0], "people": []}, {"frame": names[1], "people": people}]
     path = tmp_path / "boxes.json"
     if form == "folder":
         path = tmp_path / "boxes"
         path.mkdir()
-        (path / "0.json").write_text(json.dumps({"people": []}))
-        (path / "b.boxes.json").write_text(json.dumps({"people": people}))
+        (path / f"{names[0]}.json").write_text(json.dumps({"people": []}))
+        (path / f"{names[1]}.boxes.json").write_text(json.dumps({"people": people}))
     else:
         path.write_text("\n".join(map(json.dumps, entries)) if form == "lines" else json.dumps(entries))
     boxes = FrameBoxes(path)
@@ -473,14 +476,38 @@ def test_frame_boxes_do_not_confuse_numbers_and_names(tmp_path):
     entries[1]["people"].append({"box": None, "filled": True, "joints": []})
     (tmp_path / "o.jsonl").write_text("\n".join(map(json.dumps, entries)))
     by_number = {k: [entry["people"][0]] for k, entry in enumerate(entries)}
-    for given in (tmp_path / "o.jsonl", by_number):
-        boxes = FrameBoxes(given)
+    for boxes in map(FrameBoxes, (tmp_path / "o.jsonl", by_number)):
         for k in range(3):
             (box,) = boxes.of(Frame(points=np.zeros((0, 3)), index=k, id=str(k + 1)))
             assert box.center[0] == k
     (tmp_path / "w.jsonl").write_text(json.dumps(entries[0] | {"coordinates": "world"}))
     with pytest.raises(InputError, match="write the result without --world"):
         FrameBoxes(tmp_path / "w.jsonl")
+
+
+def numbered(ids):
+    """An empty frame of each id, and boxes at x = n by name, for names n."""
+    frames = [Frame(points=np.zeros((0, 3)), index=k, id=id) for k, id in enumerate(ids)]
+    return frames, lambda names: FrameBoxes({name: [[int(name), 0, 0, 1, 1, 2, 0]] for name in names})
+
+
+@given(first=st.integers(0, 30), count=st.integers(1, 30), zeros=st.tuples(st.integers(0, 6), st.integers(0, 6)))
+def test_frame_boxes_compare_ids_as_integers(first, count, zeros):
+    values = range(first, first + count)
+    frames, boxes_by = numbered([f"{n:0{zeros[0]}d}" for n in values])
+    boxes = boxes_by(f"{n:0{zeros[1]}d}" for n in values)
+    assert [boxes.of(frame)[0].center[0] for frame in frames] == list(values)
+
+
+def test_frame_boxes_refuse_ids_after_numbers():
+    frames, boxes_by = numbered(["07", "08", "09"])
+    boxes = boxes_by(["0", "2", "9"])
+    assert boxes.of(frames[0])[0].center[0] == 0 and boxes.of(frames[1]) is None
+    with pytest.raises(InputError, match="boxes: has boxes for the id of frame 09, but .* found by number: name all"):
+        boxes.of(frames[2])
+    # the other way around, a frame without boxes does not get those of another one
+    boxes = boxes_by(["7", "1"])
+    assert boxes.of(frames[0])[0].center[0] == 7 and boxes.of(frames[1]) is None
 
 
 @pytest.mark.parametrize(

@@ -334,14 +334,14 @@ class FramePredictor:
     def state(self) -> dict[str, Any]:
         """The state after the frames so far, as JSON values."""
         people = None if self.people is None else self.people.state()
-        boxes_used = self.boxes is not None and self.boxes.was_used
+        boxes_by = None if self.boxes is None else self.boxes.found_by
         search_state = {"is_crop": self._is_crop, "was_searched": self._was_searched}
-        return search_state | {"boxes_used": boxes_used, "people": people}
+        return search_state | {"boxes_by": boxes_by, "people": people}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Resumes from the result of `state()`."""
         self._is_crop, self._was_searched = state["is_crop"], state["was_searched"]
         if self.boxes is not None:
-            self.boxes.was_used = state["boxes_used"]
+            self.boxes.found_by = state["boxes_by"]
         if self.people is not None:
             self.people.restore(state["people"])
