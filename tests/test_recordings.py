@@ -6,7 +6,8 @@ import os
 import threading
 import time
 from dataclasses import replace
-from itertools import islice
+from functools import partial
+from itertools import islice, product
 from pathlib import Path
 
 import numpy as np
@@ -20,11 +21,12 @@ import lidarpose
 from lidarpose import Box, Boxes, InputError
 from lidarpose.cli import main
 from lidarpose.geometry import UP_AXES, rigid_transform, rotation_about
-from lidarpose.io.sources.frame import Frame, FrameSource, IndexedRecording, Sweep
+from lidarpose.io.sources.frame import Frame, FrameSource, IndexedRecording, LazyFrame, Sweep
 from lidarpose.recording import output, page, picture, result_files
 from lidarpose.recording.coordinates import in_world
 from lidarpose.recording.frame_boxes import FrameBoxes
 from lidarpose.recording.predict_recording import FramePredictor
+from lidarpose.skeleton import SMPL24
 from lidarpose.viz.bird_eye import draw_scan_and_people
 
 DAMAGED = 4
@@ -612,6 +614,41 @@ def test_picture_of_single_frame_shows_people(drive, tmp_path, monkeypatch):
         assert panel.label == f"{person['id']} · score {person['score']:.2f}"
         np.testing.assert_allclose(panel.pose.joints, person["joints"], atol=1e-9)
         assert abs(len(panel.points) - person["num_points"]) <= 2 and panel.box.contains(panel.points).all()
+
+
+class CountingRecording:
+    """A recording of 40 frames that can only be read from its beginning; counts the frames that are passed and
+    decoded."""
+
+    name, count, warnings = "counting", None, ()
+
+    def __init__(self):
+        self.passed = self.decoded = 0
+
+    def lazy_frames(self, first=0):
+        for k in range(40):
+            self.passed += 1
+            if k >= first:
+                yield LazyFrame(str(k), k / 10, partial(self.decode, k))
+
+    def decode(self, k):
+        self.decoded += 1
+        return Sweep(points=np.full((5, 3), k + 1.0), T_world_sensor=np.eye(4))
+
+
+def test_picture_and_page_read_their_frames_in_one_pass(monkeypatch):
+    monkeypatch.setattr(page, "_MOST_FRAMES", 4)
+    views = picture.TrajectoryPicture("z"), page.RecordingPage("z")
+    for k, view in product(range(36), views):
+        pose = {"T_world_sensor": np.eye(4).tolist(), "time": k / 10}
+        view.add(pose | {"error": None, "frame": k, "people": []})
+    for read, shown in ((views[0]._points, 8), (partial(views[1].render, skeleton=SMPL24, title=""), 3)):
+        recording = CountingRecording()
+        source = FrameSource(recording)
+        recording.passed = 0
+        result = read(source)
+        assert recording.decoded == shown and recording.passed <= 37
+        assert shown != 8 or result[::5, 0].tolist() == [1, 6, 11, 16, 21, 26, 31, 36]
 
 
 def page_data(path):
