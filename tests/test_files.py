@@ -25,6 +25,7 @@ from lidarpose.io.files import (
     is_unused,
     locked,
     read_bytes,
+    read_json,
     write_all_atomic,
     write_atomic,
 )
@@ -34,6 +35,12 @@ from lidarpose.io.point_cloud import read_points
 
 def tree(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_read_json_detects_unicode_encoding(tmp_path, encoding):
+    (tmp_path / "a.json").write_bytes('{"name": "Zoë"}'.encode(encoding))
+    assert read_json(tmp_path / "a.json", expected="a name") == {"name": "Zoë"}
 
 
 @settings(max_examples=30, deadline=None)

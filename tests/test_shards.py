@@ -115,7 +115,7 @@ def test_damaged_or_missing_shard_error_names_file(folder):
     ("change", "message"),
     [
         (None, "dataset.json is missing"),
-        ("{", "not a dataset's card"),
+        ("{", "dataset.json: is not JSON"),
         ("[]", "not a dataset's card"),
         ({"schema": 2}, "has schema 2, this lidarpose reads 1: install lidarpose [0-9]"),
         ({"count": 0}, "are invalid"),

@@ -145,7 +145,8 @@ def read_json(path: str | os.PathLike, *, expected: str) -> Any:
     """The content of a JSON file. expected and errors: as in `read_bytes`; invalid JSON is an InputError, too."""
     data = read_bytes(path, expected=expected)
     try:
-        return json.loads(data.decode("utf-8-sig"))
+        # as bytes: json then detects the Unicode encoding
+        return json.loads(data)
     except (ValueError, RecursionError) as error:
         raise file_error(path, f"is not JSON ({error}); was it copied completely?") from None
 
