@@ -193,6 +193,12 @@ def test_read_boxes_converts_kitti_labels_to_lidar_frame(tmp_path, tracking):
     assert read_boxes(label, calib=tmp_path / "none.txt") == []
 
 
+def test_kitti_label_in_root_folder_has_no_calibration(monkeypatch):
+    monkeypatch.setattr("lidarpose.io.boxes.read_bytes", lambda *_, **__: KITTI)
+    with pytest.raises(InputError, match="expected its calibration at /calib/label.txt"):
+        read_boxes("/label.txt")
+
+
 def changed(**changes):
     """Two people, the second with changes; a value of ... removes the key."""
     person = {key: value for key, value in {**PERSON, **changes}.items() if value is not ...}

@@ -1,5 +1,7 @@
 """Data of clip networks: rotations, clouds around a person, and windows of consecutive frames."""
 
+from collections import Counter
+
 import dataset_files as files
 import numpy as np
 import pyarrow.parquet as pq
@@ -10,6 +12,7 @@ from lidarpose.body.rig import forward_kinematics
 from lidarpose.body.smpl import load_body
 from lidarpose.data.clips import MARGIN, MOST, consecutive, static_points, window_points, without_person
 from lidarpose.data.prepare import reader
+from lidarpose.data.readers import base
 from lidarpose.data.rows import person_row, sample_of
 from lidarpose.data.shards import read_rows
 from lidarpose.errors import InputError
@@ -126,7 +129,7 @@ def test_readers_give_rotations_in_sensor_frame(name, tmp_path, smpl):
         assert items[0].background is None and items[0].neighbors is None
 
 
-def test_lidarhuman26m_scans_give_background_and_neighbors(tmp_path, smpl):
+def test_lidarhuman26m_scans_give_background_and_neighbors(tmp_path, smpl, monkeypatch):
     files.write_lidarhuman26m(tmp_path, smpl, sequences=("7",), frames=6)
     rng = np.random.default_rng(0)
     source = reader("lidarhuman26m", smpl)
@@ -137,7 +140,11 @@ def test_lidarhuman26m_scans_give_background_and_neighbors(tmp_path, smpl):
         passer = person[:50] * 0.8 + [0.0, 0.2 * f - 0.4, 0.0]
         files.write_pcd(tmp_path / f"pointclouds/7/{f + 1:06d}.pcd", np.concatenate([person, wall, passer]))
     (tmp_path / "pointclouds/7/000006.pcd").write_bytes(b"cut off")
+    read, read_points = Counter(), base.read_points
+    monkeypatch.setattr(base, "read_points", lambda path: read.update([path.suffix]) or read_points(path))
     items = list(source.read(tmp_path, "7"))
+    # each file once for its frame, and once for the map of static points, if its scan is not damaged
+    assert read == {".ply": 11, ".pcd": 12}
     assert [item.background is None for item in items] == [False] * 5 + [True]
     for item in items[:5]:
         assert len(item.background) > 50 and np.abs(item.background[:, 0] - 25).max() < 1e-3

@@ -25,6 +25,7 @@ from lidarpose.io.files import (
     is_unused,
     locked,
     read_bytes,
+    read_json,
     write_all_atomic,
     write_atomic,
 )
@@ -34,6 +35,12 @@ from lidarpose.io.point_cloud import read_points
 
 def tree(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_read_json_detects_unicode_encoding(tmp_path, encoding):
+    (tmp_path / "a.json").write_bytes('{"name": "Zoë"}'.encode(encoding))
+    assert read_json(tmp_path / "a.json", expected="a name") == {"name": "Zoë"}
 
 
 @settings(max_examples=30, deadline=None)
@@ -236,7 +243,7 @@ def test_file_error_message_is_one_printable_line():
 
 
 def test_locked_allows_one_writer_and_removes_leftovers(tmp_path):
-    folder, left = tmp_path / "out", ".0123456789abcdef-a.json"
+    folder, left = tmp_path / "new" / "out", ".0123456789abcdef-a.json"
     with locked(folder, r"a\.json", busy="somebody writes"):
         assert is_unused(folder, r"a\.json")
         with (
@@ -244,8 +251,8 @@ def test_locked_allows_one_writer_and_removes_leftovers(tmp_path):
             locked(folder, r"a\.json", busy="somebody writes"),
         ):
             pass
-    # a folder that was created and not used is removed
-    assert not folder.exists()
+    # folders that were created and not used are removed
+    assert not folder.parent.exists()
     (folder / "deep").mkdir(parents=True)
     for name in (left, f"deep/{left}", ".0123456789abcdef-b.json", LOCK):
         (folder / name).touch()

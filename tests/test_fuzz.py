@@ -96,10 +96,13 @@ JSON = st.recursive(
 @given(content=JSON)
 def test_read_boxes_accepts_or_rejects_any_json(content):
     if isinstance(content, list | dict):
+        boxes = []
         try:
-            read_boxes(content)
+            boxes = read_boxes(content)
         except InputError as error:
             assert str(error).isprintable()
+        for box in boxes:
+            assert np.isfinite([*box.center, *box.size, box.yaw]).all() and (box.size > 0).all()
 
 
 @fuzz

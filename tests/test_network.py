@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from itertools import product
 
 import numpy as np
 import pytest
@@ -421,11 +422,14 @@ def test_visible_joints_have_points_within_radius():
     points = np.array([[0.1, 0.1, 0.0], [1.0, 0.17, 0.0], [0.0, 0.0, 1.8]])
     np.testing.assert_array_equal(visible_joints(joints, points), [True, True, False])
     assert not visible_joints(joints, points[:0]).any()
-    for known in people():
+    for known, distance in product(people(), (0, 100, 300)):
         sample = known.sample
-        body = sample.points[sample.part > 0]
-        nearest = np.linalg.norm(sample.pose.joints[:, None] - body[None], axis=-1).min(1, initial=np.inf)
-        np.testing.assert_array_equal(visible_joints(sample.pose.joints, body.astype(float)), nearest < VISIBLE_RADIUS)
+        joints, body = (
+            (values + [distance, 0, 0]).astype(np.float32)
+            for values in (sample.pose.joints, sample.points[sample.part > 0])
+        )
+        nearest = np.linalg.norm(joints[:, None].astype(float) - body, axis=-1).min(1, initial=np.inf)
+        np.testing.assert_array_equal(visible_joints(joints, body), nearest < VISIBLE_RADIUS)
 
 
 def test_collate_keeps_targets_and_takes_majority_of_parts():

@@ -1,6 +1,7 @@
 """`lidarpose paper`: tables and their cells, steps that run once and can be resumed, pages, figures."""
 
 import json
+import re
 import shutil
 import sys
 import threading
@@ -483,6 +484,23 @@ def test_run_steps_raises_if_step_is_stopped_or_fails(tmp_path):
     for _ in range(2):
         run_steps(step, tmp_path, lambda words: asked.append(words) or 0, print)
     assert asked == [["synth", "-n", "3", "--out", str(step.folder(tmp_path))]]
+
+
+def test_damaged_files_of_steps_are_named(tmp_path):
+    cell = cells(TABLES["table1"], Options(people=64), ["dapt"])[0]
+    state, results = tmp_path / "runs" / f"{cell.evaluation.name}.json", report._path(cell.evaluation, tmp_path)
+    curves = cell.evaluation.product(tmp_path) / "stability.json"
+    for path in (state, results, curves, tmp_path / run_dir.CONFIG):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text('{"done": tr')
+    for path, read in (
+        (state, lambda: steps.is_done(cell.evaluation, tmp_path)),
+        (results, lambda: report._entry(cell, tmp_path, "")),
+        (curves, lambda: figures._picture("fig7", {"ours": cell}, tmp_path)),
+        (tmp_path / run_dir.CONFIG, lambda: steps._people(tmp_path)),
+    ):
+        with pytest.raises(InputError, match=f"^{re.escape(str(path))}: is not JSON"):
+            read()
 
 
 def test_run_steps_waits_for_step_of_another_process(tmp_path):

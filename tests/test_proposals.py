@@ -1,11 +1,14 @@
 """Detection of people: the ground under a scan, proposals, and the network's inputs at candidates."""
 
 import pickle
+import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from lidarpose.geometry import rotation_about
 from lidarpose.models.detector import proposals
@@ -498,6 +501,26 @@ def test_suppress_near_removes_weaker_of_close_places():
     row = np.array([[0.0, 0], [0.2, 0], [0.4, 0]])
     assert suppress_near(row, np.array([3.0, 2, 1]), 0.25).tolist() == [0, 2]
     assert len(suppress_near(np.zeros((0, 3)), np.zeros(0), 0.25)) == 0
+
+
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(0, 60), step=st.sampled_from([0.0, 0.0625, 0.25]))
+def test_suppress_near_matches_reference(seed, count, step):
+    """On a grid, pairs are exactly at the radius."""
+    rng = np.random.default_rng(seed)
+    centers, strength = rng.uniform(-2, 2, (count, 3)), rng.integers(0, 20, count)
+    if step:
+        centers = np.round(centers / step) * step
+    assert suppress_near(centers, strength, 0.25).tolist() == suppress_near_reference(centers, strength, 0.25)
+
+
+def test_suppress_near_memory_grows_with_pairs():
+    rng = np.random.default_rng(0)
+    centers, strength = rng.uniform(0, 300, (3000, 2)), rng.normal(size=3000)
+    tracemalloc.start()
+    suppress_near(centers, strength, 0.15)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2e6
 
 
 @pytest.mark.parametrize("shift", [(-3000.0, -3000.0), (3000.0, 0.0), (-20_000.0, 5000.0)])

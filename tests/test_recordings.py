@@ -6,23 +6,27 @@ import os
 import threading
 import time
 from dataclasses import replace
-from itertools import islice
+from functools import partial
+from itertools import islice, product
 from pathlib import Path
 
 import numpy as np
 import pandas
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from walking_people import FRAMES, PLACES, STEPS, moving_source, walking_clouds
 
 import lidarpose
 from lidarpose import Box, Boxes, InputError
 from lidarpose.cli import main
 from lidarpose.geometry import UP_AXES, rigid_transform, rotation_about
-from lidarpose.io.sources.frame import Frame, FrameSource, IndexedRecording, Sweep
+from lidarpose.io.sources.frame import Frame, FrameSource, IndexedRecording, LazyFrame, Sweep
 from lidarpose.recording import output, page, picture, result_files
 from lidarpose.recording.coordinates import in_world
 from lidarpose.recording.frame_boxes import FrameBoxes
 from lidarpose.recording.predict_recording import FramePredictor
+from lidarpose.skeleton import SMPL24
 from lidarpose.viz.bird_eye import draw_scan_and_people
 
 DAMAGED = 4
@@ -447,16 +451,17 @@ def test_hidden_people_are_filled_in(clouds, folder, model, monkeypatch):
 # ---- boxes of many frames
 
 
+@pytest.mark.parametrize("names", [("a", "b"), (0, 1)])
 @pytest.mark.parametrize("form", ["folder", "list", "lines"])
-def test_frame_boxes_match_frames_by_name_or_number(form, tmp_path):
+def test_frame_boxes_match_frames_by_name_or_number(form, names, tmp_path):
     people = [{"center": [1, 2, 3], "size": [1, 1, 2]}]
-    entries = [{"frame": 0, "people": []}, {"frame": "b", "people": people}]
+    entries = [{"frame": names[0], "people": []}, {"frame": names[1], "people": people}]
     path = tmp_path / "boxes.json"
     if form == "folder":
         path = tmp_path / "boxes"
         path.mkdir()
-        (path / "0.json").write_text(json.dumps({"people": []}))
-        (path / "b.boxes.json").write_text(json.dumps({"people": people}))
+        (path / f"{names[0]}.json").write_text(json.dumps({"people": []}))
+        (path / f"{names[1]}.boxes.json").write_text(json.dumps({"people": people}))
     else:
         path.write_text("\n".join(map(json.dumps, entries)) if form == "lines" else json.dumps(entries))
     boxes = FrameBoxes(path)
@@ -473,14 +478,38 @@ def test_frame_boxes_do_not_confuse_numbers_and_names(tmp_path):
     entries[1]["people"].append({"box": None, "filled": True, "joints": []})
     (tmp_path / "o.jsonl").write_text("\n".join(map(json.dumps, entries)))
     by_number = {k: [entry["people"][0]] for k, entry in enumerate(entries)}
-    for given in (tmp_path / "o.jsonl", by_number):
-        boxes = FrameBoxes(given)
+    for boxes in map(FrameBoxes, (tmp_path / "o.jsonl", by_number)):
         for k in range(3):
             (box,) = boxes.of(Frame(points=np.zeros((0, 3)), index=k, id=str(k + 1)))
             assert box.center[0] == k
     (tmp_path / "w.jsonl").write_text(json.dumps(entries[0] | {"coordinates": "world"}))
     with pytest.raises(InputError, match="write the result without --world"):
         FrameBoxes(tmp_path / "w.jsonl")
+
+
+def numbered(ids):
+    """An empty frame of each id, and boxes at x = n by name, for names n."""
+    frames = [Frame(points=np.zeros((0, 3)), index=k, id=id) for k, id in enumerate(ids)]
+    return frames, lambda names: FrameBoxes({name: [[int(name), 0, 0, 1, 1, 2, 0]] for name in names})
+
+
+@given(first=st.integers(0, 30), count=st.integers(1, 30), zeros=st.tuples(st.integers(0, 6), st.integers(0, 6)))
+def test_frame_boxes_compare_ids_as_integers(first, count, zeros):
+    values = range(first, first + count)
+    frames, boxes_by = numbered([f"{n:0{zeros[0]}d}" for n in values])
+    boxes = boxes_by(f"{n:0{zeros[1]}d}" for n in values)
+    assert [boxes.of(frame)[0].center[0] for frame in frames] == list(values)
+
+
+def test_frame_boxes_refuse_ids_after_numbers():
+    frames, boxes_by = numbered(["07", "08", "09"])
+    boxes = boxes_by(["0", "2", "9"])
+    assert boxes.of(frames[0])[0].center[0] == 0 and boxes.of(frames[1]) is None
+    with pytest.raises(InputError, match="boxes: has boxes for the id of frame 09, but .* found by number: name all"):
+        boxes.of(frames[2])
+    # the other way around, a frame without boxes does not get those of another one
+    boxes = boxes_by(["7", "1"])
+    assert boxes.of(frames[0])[0].center[0] == 7 and boxes.of(frames[1]) is None
 
 
 @pytest.mark.parametrize(
@@ -585,6 +614,41 @@ def test_picture_of_single_frame_shows_people(drive, tmp_path, monkeypatch):
         assert panel.label == f"{person['id']} · score {person['score']:.2f}"
         np.testing.assert_allclose(panel.pose.joints, person["joints"], atol=1e-9)
         assert abs(len(panel.points) - person["num_points"]) <= 2 and panel.box.contains(panel.points).all()
+
+
+class CountingRecording:
+    """A recording of 40 frames that can only be read from its beginning; counts the frames that are passed and
+    decoded."""
+
+    name, count, warnings = "counting", None, ()
+
+    def __init__(self):
+        self.passed = self.decoded = 0
+
+    def lazy_frames(self, first=0):
+        for k in range(40):
+            self.passed += 1
+            if k >= first:
+                yield LazyFrame(str(k), k / 10, partial(self.decode, k))
+
+    def decode(self, k):
+        self.decoded += 1
+        return Sweep(points=np.full((5, 3), k + 1.0), T_world_sensor=np.eye(4))
+
+
+def test_picture_and_page_read_their_frames_in_one_pass(monkeypatch):
+    monkeypatch.setattr(page, "_MOST_FRAMES", 4)
+    views = picture.TrajectoryPicture("z"), page.RecordingPage("z")
+    for k, view in product(range(36), views):
+        pose = {"T_world_sensor": np.eye(4).tolist(), "time": k / 10}
+        view.add(pose | {"error": None, "frame": k, "people": []})
+    for read, shown in ((views[0]._points, 8), (partial(views[1].render, skeleton=SMPL24, title=""), 3)):
+        recording = CountingRecording()
+        source = FrameSource(recording)
+        recording.passed = 0
+        result = read(source)
+        assert recording.decoded == shown and recording.passed <= 37
+        assert shown != 8 or result[::5, 0].tolist() == [1, 6, 11, 16, 21, 26, 31, 36]
 
 
 def page_data(path):
@@ -790,12 +854,18 @@ def test_close_does_not_wait_for_next_frame(model):
         yield from fed([cloud])
         is_over.wait(60)
 
+    others = threading.enumerate()
     frames = lidarpose.predict_recording(endless(), crop=True, model=model)
     next(frames)
     start = time.perf_counter()
     frames.close()
     assert time.perf_counter() - start < 20
+    # nor does the interpreter wait at its end, and no thread is left when the frame comes
+    (thread,) = (thread for thread in threading.enumerate() if thread not in others)
+    assert thread.daemon
     is_over.set()
+    thread.join(20)
+    assert not thread.is_alive()
 
 
 def test_boxes_of_unknown_frames_raise_at_the_end(model):

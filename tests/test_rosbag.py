@@ -1,6 +1,7 @@
 """Point clouds of ROS recordings written with rosbags: containers, field layouts, transforms and damaged files."""
 
 import json
+import re
 import struct
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -558,6 +559,8 @@ def test_damaged_message_gets_time_of_sensor_clock(tmp_path):
     source = open_source(path, end=0.5)
     frames = list(source)
     assert [isinstance(frame, DamagedFrame) for frame in frames] == [k == 3 for k in range(6)]
+    # the type of the error tells a bug from a damaged message
+    assert re.fullmatch(r"cannot be decoded .*: the message is damaged \(\w+Error: .+\)", frames[3].error)
     np.testing.assert_allclose([frame.time for frame in frames], 5 + np.arange(6) / 10)
     assert not source.warnings
 

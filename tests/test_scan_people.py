@@ -110,6 +110,9 @@ def test_scan_without_people_is_skipped(monkeypatch, scan):
     monkeypatch.setattr(scan_people, "scan_people", people)
     assert populated_scan(SEED, 5) is scan
     assert len(set(asked)) == 3 and asked[0] == 5
+    monkeypatch.setattr(scan_people, "scan_people", lambda *_: empty)
+    with pytest.raises(InputError, match=f"^16 scenes of seed {SEED}, from number 5 on, have no people"):
+        populated_scan(SEED, 5)
 
 
 def test_whole_scans_are_a_share_of_pretraining(monkeypatch):

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from contextlib import contextmanager
 from dataclasses import fields, replace
 
 import numpy as np
@@ -12,11 +13,11 @@ from pyarrow import parquet
 from shard_files import sample, write_shard
 
 from lidarpose.cli import main
-from lidarpose.data import shards
+from lidarpose.data import shards, writer
 from lidarpose.data.dataset_card import DatasetCard, read_card, write_card
 from lidarpose.data.rows import TABLES, person_row
 from lidarpose.data.shards import open_dataset, read_rows
-from lidarpose.data.writer import check_settings
+from lidarpose.data.writer import check_settings, open_folder
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.sample import PersonInfo
 from lidarpose.skeleton import BODY26
@@ -114,7 +115,7 @@ def test_damaged_or_missing_shard_error_names_file(folder):
     ("change", "message"),
     [
         (None, "dataset.json is missing"),
-        ("{", "not a dataset's card"),
+        ("{", "dataset.json: is not JSON"),
         ("[]", "not a dataset's card"),
         ({"schema": 2}, "has schema 2, this lidarpose reads 1: install lidarpose [0-9]"),
         ({"count": 0}, "are invalid"),
@@ -129,6 +130,21 @@ def test_open_dataset_rejects_invalid_card(folder, change, message):
     content = json.dumps(json.loads(path.read_text()) | change) if isinstance(change, dict) else change
     path.unlink() if content is None else path.write_text(content)
     refused(lambda: open_dataset(folder), message)
+
+
+def test_open_folder_looks_again_when_it_is_locked(folder, tmp_path, monkeypatch):
+    out, card = tmp_path / "out", read_card(folder)
+
+    @contextmanager
+    def locked_after_another_job(path, *_, **__):
+        path.mkdir()
+        write_card(path, card)
+        yield
+
+    monkeypatch.setattr(writer, "locked", locked_after_another_job)
+    with pytest.raises(InputError, match="has a dataset with other settings: count"):
+        with open_folder(out, replace(card, count=card.count + 1)):
+            pass
 
 
 def test_check_settings_names_differences(folder):

@@ -14,7 +14,7 @@ import lidarpose
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.inference.background import learn_background, read_background
-from lidarpose.io.sources import DamagedFrame, FrameSource, is_single_scan, open_source
+from lidarpose.io.sources import DamagedFrame, FrameSource, is_single_scan, kitti, open_source
 from lidarpose.io.sources.folders import in_order
 from lidarpose.io.sources.frame import ChainedRecording, IndexedRecording, Sweep
 
@@ -473,6 +473,11 @@ def write_sequence(folder, T_world_velo, *, semantic=False):
     table = sequence / "poses.txt" if semantic else folder / "poses" / "07.txt"
     table.write_text("".join(text(row) + "\n" for row in rows))
     return sequence
+
+
+def test_kitti_sequence_may_be_directly_below_root(monkeypatch):
+    monkeypatch.setattr(kitti, "scan_files", lambda folder: ([folder / "000000.bin"], []))
+    assert "poses are not known" in kitti._open_sequence(Path("/data")).warnings[-1]
 
 
 @pytest.mark.parametrize("semantic", [False, True])

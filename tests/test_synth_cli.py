@@ -215,6 +215,20 @@ def test_synth_rejects_unusable_folders(tmp_path, capsys):
     assert [path.name for path in tmp_path.iterdir()] == ["file"] and file.read_text() == "mine"
 
 
+def test_synth_locks_folder_before_it_prepares(tmp_path, monkeypatch):
+    job, out = SynthesisJob(what="people", count=1), tmp_path / "new" / "people"
+
+    def generator(self):
+        with pytest.raises(InputError, match="another process writes this dataset"):
+            write_dataset(replace(job, seed=2), out)
+        raise InputError("no clip")
+
+    monkeypatch.setattr(SynthesisJob, "generator", generator)
+    with pytest.raises(InputError, match="no clip"):
+        write_dataset(job, out)
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.long
 def test_full_disk_error_leaves_no_partial_shard(tmp_path):
     resource = pytest.importorskip("resource")

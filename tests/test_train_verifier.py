@@ -161,6 +161,16 @@ def test_collate_groups_crops_by_size():
     assert objective.scores(network, an_example(0, 0)).shape == (0, 2)
 
 
+def test_batch_without_detections_has_gradients_of_zero():
+    objective = VerifierObjective(config=CONFIG)
+    network = objective.network()
+    terms = objective.terms(network, objective.collate([an_example(0, 0), an_example(1, 0)]))
+    assert {name: term.item() for name, term in terms.items()} == {"person": 0, "mounted": 0, "ap": 0}
+    (terms["person"] + terms["mounted"]).backward()
+    gradients = [p.grad for p in network.person.parameters()]
+    assert gradients and not any(gradient.any() for gradient in gradients)
+
+
 @pytest.mark.long
 def test_verifier_training_updates_whole_network(quick_crops):
     torch.manual_seed(0)

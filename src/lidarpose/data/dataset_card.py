@@ -9,7 +9,7 @@ from typing import Any
 from lidarpose._version import __version__
 from lidarpose.data.rows import TABLES
 from lidarpose.errors import InputError, counted
-from lidarpose.io.files import file_error, read_bytes, write_atomic
+from lidarpose.io.files import file_error, read_json, write_atomic
 from lidarpose.skeleton import BODY26, skeleton
 
 SCHEMA = 1
@@ -85,7 +85,7 @@ def read_card(folder: str | Path) -> DatasetCard:
     if not path.is_file():
         raise file_error(folder, f"is not a dataset: {CARD} is missing; write one with lidarpose synth or prepare")
     try:
-        content = json.loads(read_bytes(path, expected="a dataset's card"))
+        content = read_json(path, expected="a dataset's card")
         if content["schema"] != SCHEMA:
             version = content.get("version", "of the version that wrote it")
             problem = f"has schema {content['schema']!r}, this lidarpose reads {SCHEMA}: install lidarpose {version}"
@@ -94,7 +94,7 @@ def read_card(folder: str | Path) -> DatasetCard:
         card = DatasetCard(**{name: _CARD_TYPES[name](content[name]) for name in names})
     except InputError:
         raise
-    except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, OverflowError) as error:
         problem = f"{error} is missing" if isinstance(error, KeyError) else str(error)
         raise file_error(path, f"is not a dataset's card ({problem})") from None
     if card.count < 1 or card.per_shard < 1 or not set(card.tables) <= set(TABLES):

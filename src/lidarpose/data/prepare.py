@@ -20,7 +20,7 @@ from lidarpose.data.readers.base import BAD_REST, Reader, Skipped
 from lidarpose.data.rows import labeled_row
 from lidarpose.data.shards import DatasetReader, open_dataset, read_rows, shard_path, shard_writer
 from lidarpose.data.splits import SplitRule, split_rule
-from lidarpose.data.writer import Counts, lock_dataset, make_shards, open_folder
+from lidarpose.data.writer import Counts, make_shards, open_folder
 from lidarpose.errors import InputError, check_int, check_name, first_names
 from lidarpose.io.files import file_error, one_line
 from lidarpose.progress import Progress
@@ -108,10 +108,9 @@ def prepare(
     for part in parts:
         source.check(root, part)
     card = _card(source, parts, rule, split)
-    missing_shards = open_folder(out, card)
     make = PartWriter(reader=source, root=root, out=out, parts=tuple(parts), rule=rule, only=split)
-    num_finished = len(parts) - len(missing_shards)
-    with lock_dataset(out):
+    with open_folder(out, card) as missing_shards:
+        num_finished = len(parts) - len(missing_shards)
         # without the summary of an earlier run, which would be wrong until this run is finished
         if missing_shards or not (out / CARD).is_file():
             write_card(out, card)

@@ -14,8 +14,7 @@ import threading
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing
-from functools import partial
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 from lidarpose.data.dataset_card import CARD, DatasetCard, read_card
@@ -33,25 +32,32 @@ Make = Callable[[int], Counts]
 _TICK = 0.5
 # pattern of the file names in a dataset's folder
 _NAMES = rf"(?:(?:{'|'.join(TABLES)})-\d{{5}}\.parquet|{re.escape(CARD)})"
-# keeps other processes from writing into a dataset's folder
-lock_dataset = partial(
-    locked, names=_NAMES, busy="another process writes this dataset: wait for its end, or give another folder"
-)
+_BUSY = "another process writes this dataset: wait for its end, or give another folder"
 
 
-def open_folder(folder: Path, card: DatasetCard, rows: Mapping[str, int] | None = None) -> list[int]:
-    """The numbers of the shards that are missing, damaged or, according to `rows`, incomplete.
+@contextmanager
+def open_folder(folder: Path, card: DatasetCard, rows: Mapping[str, int] | None = None) -> Iterator[list[int]]:
+    """Locks a dataset's folder, see `files.locked`, and yields the numbers of the shards that are missing, damaged or,
+    according to `rows`, incomplete.
 
     rows: by table, the number of rows of each of the `card.count` items, if known. Raises InputError unless the folder
-    is missing, empty or of this dataset.
+    is missing, empty or of this dataset, and if another process writes there.
     """
+    # before locking, which removes the file .lock at the end: it may belong to another program
+    _check_folder(folder, card)
+    with locked(folder, _NAMES, busy=_BUSY):
+        # again: meanwhile another process may have written a dataset
+        _check_folder(folder, card)
+        yield [shard for shard in range(card.shards) if not _is_whole(folder, card, shard, rows or {})]
+
+
+def _check_folder(folder: Path, card: DatasetCard) -> None:
     if folder.exists() and not folder.is_dir():
         raise file_error(folder, "is a file; give a folder for the dataset")
     if (folder / CARD).is_file():
         check_settings(folder, read_card(folder), card)
     elif not is_unused(folder, _NAMES):
         raise file_error(folder, f"holds other files and no {CARD}; give a new or empty folder for the dataset")
-    return [shard for shard in range(card.shards) if not _is_whole(folder, card, shard, rows or {})]
 
 
 def check_settings(folder: str | Path, present: DatasetCard, wanted: DatasetCard) -> None:

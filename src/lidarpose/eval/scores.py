@@ -14,7 +14,7 @@ from typing import Any
 
 from lidarpose._version import __version__
 from lidarpose.errors import InputError
-from lidarpose.io.files import file_error, lined_json, listed, read_bytes
+from lidarpose.io.files import file_error, lined_json, listed, read_json
 
 SCHEMA = "lidarpose.scores/1"
 # top-level keys of scores.json besides its results, and their types
@@ -149,15 +149,14 @@ def scores_path(path: str | PathLike) -> Path:
 def read_scores(path: str | PathLike) -> Scores:
     """Reads scores.json, given the file or its folder. Raises InputError for any other file."""
     path = scores_path(path)
-    data = read_bytes(path, expected=f"{FILE} of lidarpose evaluate")
+    content = read_json(path, expected=f"{FILE} of lidarpose evaluate")
     try:
-        content = json.loads(data)
         if (schema := content["schema"]) == SCHEMA:
             head = {name: kind(content[name]) for name, kind in _HEAD.items()}
             if not isinstance(head["weights"].get("digest") or "", str):
                 raise TypeError("the digest of the weights is not text")
             return Scores(**head, results=tuple(map(_result, content["results"])))
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
         problem = f"{error} is missing" if isinstance(error, KeyError) else error
         raise file_error(path, f"is not a {FILE} of lidarpose evaluate ({problem})") from None
     remedy = "evaluate again, or use the lidarpose version that wrote it"

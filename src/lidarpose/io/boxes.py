@@ -236,7 +236,7 @@ def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | N
     if not people:
         return []
     if calib is None:
-        calib = Path(os.path.abspath(os.fsdecode(path))).parents[1] / "calib" / Path(os.fsdecode(path)).name
+        calib = Path(os.path.abspath(os.fsdecode(path))).parent.parent / "calib" / Path(os.fsdecode(path)).name
         if not calib.is_file():
             raise FormatError(
                 f"is a KITTI label: expected its calibration at {calib}, got none: "

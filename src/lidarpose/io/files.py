@@ -145,7 +145,8 @@ def read_json(path: str | os.PathLike, *, expected: str) -> Any:
     """The content of a JSON file. expected and errors: as in `read_bytes`; invalid JSON is an InputError, too."""
     data = read_bytes(path, expected=expected)
     try:
-        return json.loads(data.decode("utf-8-sig"))
+        # as bytes: json then detects the Unicode encoding
+        return json.loads(data)
     except (ValueError, RecursionError) as error:
         raise file_error(path, f"is not JSON ({error}); was it copied completely?") from None
 
@@ -305,7 +306,7 @@ def is_unused(folder: Path, names: str) -> bool:
 def locked(folder: Path, names: str, *, busy: str, wait: float = 0.0) -> Iterator[None]:
     """Locks a folder against writing by other processes, and removes temporary files that killed processes left.
 
-    The folder is created if it is missing; such a folder is removed at the end if it is still empty. The lock of a
+    Missing folders are created, and removed at the end if they are still empty. The lock of a
     killed process does not block others. On file systems without locks nothing is locked.
 
     Args:
@@ -317,7 +318,7 @@ def locked(folder: Path, names: str, *, busy: str, wait: float = 0.0) -> Iterato
         MissingExtra: filelock is not installed.
     """
     lock = _file_lock(folder / LOCK)
-    is_new = not folder.exists()
+    new_folders = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     if not _acquired(lock, wait):
         raise file_error(folder, busy)
@@ -330,9 +331,9 @@ def locked(folder: Path, names: str, *, busy: str, wait: float = 0.0) -> Iterato
         with suppress(OSError):
             (folder / LOCK).unlink()
         lock.release()
-        if is_new:
+        for path in new_folders:
             with suppress(OSError):
-                folder.rmdir()
+                path.rmdir()
 
 
 @contextmanager

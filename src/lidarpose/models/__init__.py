@@ -18,8 +18,8 @@ class NetworkKind:
     """Where the parts of a kind of network are defined, as "module:name"; they are imported on first use.
 
     config: a `models.config.Config` with `kind` (its key in `NETWORKS`), `name` (for messages), `joints` (names, in the
-    order of the outputs) and `layers` (a lower bound of the number of its tensors), which raises InputError for invalid
-    settings; network: a module built from the config alone, which it stores as `config`; objective: a
+    order of the outputs) and `min_tensors` (a lower bound of the number of its tensors), which raises InputError for
+    invalid settings; network: a module built from the config alone, which it stores as `config`; objective: a
     `train.objectives.objective.Objective`; backend: called with (network, header, device=, compile=), returns an
     `inference.backend.Backend`.
     """

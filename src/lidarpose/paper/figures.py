@@ -1,6 +1,5 @@
 """The paper's figures 5 to 8, drawn from the results of their tables' cells."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 from lidarpose.eval.charts import compare_ends, compare_stability
 from lidarpose.eval.dataset import open_eval_dataset
 from lidarpose.eval.predictions import read_poses
-from lidarpose.io.files import write_atomic
+from lidarpose.io.files import read_json, write_atomic
 from lidarpose.paper.steps import POSES, Step, is_done
 from lidarpose.paper.tables import Cell
 from lidarpose.sample import Pose, facing
@@ -49,7 +48,10 @@ def _picture(name: str, cells: dict[str, Cell], out: Path) -> bytes:
     paths = {row: cell.evaluation.product(out) / "stability.json" for row, cell in cells.items() if cell.evaluation}
     target = next(iter(cells.values())).target
     title = "the stand-in" if isinstance(target.test, Step) else target.title
-    studies = {row: _titled(json.loads(path.read_text())["studies"][0], title) for row, path in paths.items()}
+    studies = {
+        row: _titled(read_json(path, expected="a study of stability")["studies"][0], title)
+        for row, path in paths.items()
+    }
     return (compare_stability if name == "fig7" else compare_ends)(studies)
 
 

@@ -15,7 +15,7 @@ from lidarpose.eval.metrics import aggregate
 from lidarpose.eval.predictions import read_poses
 from lidarpose.eval.protocols import DAPT, check_protocol
 from lidarpose.eval.scores import COLUMNS, FILE, Result, read_scores
-from lidarpose.io.files import content_digest, write_atomic
+from lidarpose.io.files import content_digest, read_json, write_atomic
 from lidarpose.models.checkpoint import load_checkpoint, runs_of
 from lidarpose.paper.steps import (
     CELLS,
@@ -123,7 +123,7 @@ def _entry(cell: Cell, out: Path, failure: str) -> dict[str, Any]:
         return entry | {"state": "failed", "reason": failure}
     path = _path(cell.evaluation, out)
     if path.is_file():
-        return entry | json.loads(path.read_text())
+        return entry | read_json(path, expected="a cell's results")
     if not is_done(cell.evaluation, out):
         return entry | {"state": "not run", "reason": "its command was not run, or did not finish"}
     try:
@@ -230,7 +230,7 @@ def mean_pose_error(target: Target, result: Result, out: Path) -> float:
         errors = 1e3 * np.linalg.norm(np.array(test_offsets) - mean, axis=-1)
         error = aggregate.mean(errors)
         write_atomic(path, json.dumps({"mpjpe": round(error, 1), "people": len(test_offsets)}) + "\n")
-    return json.loads(path.read_text())["mpjpe"]
+    return read_json(path, expected="the error of the mean pose")["mpjpe"]
 
 
 def _offset(person: EvalSample, result: Result) -> np.ndarray:

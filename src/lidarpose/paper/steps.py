@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarpose.errors import InputError, LidarPoseError
-from lidarpose.io.files import exclusive_lock, write_atomic
+from lidarpose.io.files import exclusive_lock, read_json, write_atomic
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.run_dir import CONFIG, LENGTHS, MODEL, read_config, read_log
 
@@ -136,7 +136,7 @@ def run_steps(step: Step, out: Path, execute: Execute, tell: Callable[[str], Non
 
 def _state(step: Step, out: Path) -> dict[str, Any]:
     path = out / RUNS / f"{step.name}.json"
-    return json.loads(path.read_text()) if path.is_file() else {}
+    return read_json(path, expected="the state of a step") if path.is_file() else {}
 
 
 def _note(step: Step, out: Path, **entries: Any) -> None:
@@ -242,7 +242,7 @@ def _people(folder: Path) -> int:
     """The number of samples that the whole run sees."""
     from lidarpose.train.setup import make_setup
 
-    kind = KINDS[json.loads((folder / CONFIG).read_text())["kind"]]
+    kind = KINDS[read_json(folder / CONFIG, expected="the configuration of a run")["kind"]]
     return make_setup(read_config(folder, kind)[0]).people
 
 

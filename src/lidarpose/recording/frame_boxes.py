@@ -10,7 +10,7 @@ from typing import Any
 
 from lidarpose.errors import InputError
 from lidarpose.io.boxes import Boxes, read_boxes
-from lidarpose.io.files import file_error, read_bytes, shorten
+from lidarpose.io.files import FRAME_NUMBER, file_error, read_bytes, shorten
 from lidarpose.io.sources import DamagedFrame, Frame
 from lidarpose.io.sources.folders import list_folder
 
@@ -23,9 +23,9 @@ class FrameBoxes:
 
     Args:
         given: a folder of files named like the frames (`ID.json`, `ID.npy`, KITTI's `ID.txt`, or `ID.boxes.json`, as
-            `lidarpose detect` names them); or a file of JSON lines or a JSON list of `{"frame": 0, "people": [...]}`,
-            where the frame is its number (an integer) or its id (text); or a mapping from frame numbers or ids to
-            anything that `read_boxes` takes.
+            `lidarpose detect` names them), or all by the frames' numbers; or a file of JSON lines or a JSON list of
+            `{"frame": 0, "people": [...]}`, where the frame is its number (an integer) or its id (text); or a mapping
+            from frame numbers or ids to anything that `read_boxes` takes. Ids that are integers are compared by value.
         calib: KITTI calibration, see `read_boxes`.
 
     Raises:
@@ -37,7 +37,8 @@ class FrameBoxes:
         self._read = partial(read_boxes, calib=calib)
         # by number (int) or id (str)
         self._by_frame: dict[int | str, Any] = {}
-        self.was_used = False
+        # whether the boxes of frames are found by "id" or by "number"; None before the first frame with boxes
+        self.found_by: str | None = None
         if isinstance(given, Mapping):
             self._by_frame = {
                 int(frame) if isinstance(frame, Integral) else str(frame): boxes for frame, boxes in given.items()
@@ -55,15 +56,25 @@ class FrameBoxes:
             raise file_error(
                 self._name, f"expected boxes for each frame, files named like the frames or {_FORM}, got none"
             )
+        # by the value of ids that are integers
+        self._by_value = {_value(key): key for key in self._by_frame if isinstance(key, str)}
+        self._by_value.pop(None, None)
 
     def of(self, frame: Frame | DamagedFrame) -> Boxes | None:
         """The boxes of a frame, None if none are given. Raises InputError for boxes that cannot be read."""
-        # files may be named by number instead of id
-        keys: tuple[int | str, ...] = (frame.id, frame.index, str(frame.index))
-        key = next((key for key in keys if key in self._by_frame), None)
+        id, number = str(frame.id), frame.index
+        keys: dict[str, int | str | None] = {
+            "id": id if id in self._by_frame else self._by_value.get(_value(id)),
+            "number": number if number in self._by_frame else self._by_value.get(number),
+        }
+        # decided once: the number of one frame may be the id of another
+        self.found_by = self.found_by or next((way for way, key in keys.items() if key is not None), None)
+        if self.found_by == "number" and keys["id"] not in (None, keys["number"]):
+            problem = f"has boxes for the id of frame {id}, but those of earlier frames were found by number"
+            raise file_error(self._name, f"{problem}: name all frames by their ids, or all by their numbers")
+        key = None if self.found_by is None else keys[self.found_by]
         if key is None:
             return None
-        self.was_used = True
         try:
             return self._read(self._by_frame[key])
         except InputError as error:
@@ -73,11 +84,16 @@ class FrameBoxes:
     def check_used(self, last: str) -> None:
         """Raises InputError if none of the frames had boxes, which means that the boxes belong to another recording.
         last: id of the last frame."""
-        if not self.was_used:
+        if self.found_by is None:
             ids = shorten(", ".join(map(str, list(self._by_frame)[:3])))
             raise file_error(
                 self._name, f"has boxes of frames {ids}, but this recording has other frames, the last one {last}"
             )
+
+
+def _value(id: str) -> int | None:
+    """The value of an id that is an integer."""
+    return int(id) if FRAME_NUMBER.fullmatch(id) else None
 
 
 def _by_frame(path: str | os.PathLike) -> dict[int | str, Any]:

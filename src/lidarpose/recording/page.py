@@ -71,10 +71,8 @@ class RecordingPage:
         is_surroundings = set(evenly_spaced(len(shown), _SURROUNDINGS).tolist())
         panels: dict[int, ScanPanel] = {}
         surroundings: list[np.ndarray] = []
-        for frame in source.frames(min(shown, default=0)):
-            if len(panels) == len(shown):
-                break
-            if not isinstance(frame, Frame) or frame.index not in shown:
+        for frame in source.frames(min(shown, default=0), only=shown):
+            if not isinstance(frame, Frame):
                 continue
             k = shown[frame.index]
             about, T_fixed_sensor, people = self._lines[k]

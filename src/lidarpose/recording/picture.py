@@ -115,9 +115,8 @@ class TrajectoryPicture:
         if not self._frames:
             return np.zeros((0, 3))
         is_static, count = self._fixed.T_world_sensor is None, len(self._frames)
-        clouds = []
-        for row in [count - 1] if is_static else evenly_spaced(count, _FRAMES).tolist():
-            frame = next(source.frames(self._frames[row]), None)
-            if isinstance(frame, Frame):
-                clouds.append(transform_points(self._to_fixed[row], frame.points))
+        rows = [count - 1] if is_static else evenly_spaced(count, _FRAMES).tolist()
+        T_fixed_sensor = {self._frames[row]: self._to_fixed[row] for row in rows}
+        frames = source.frames(min(T_fixed_sensor), only=T_fixed_sensor)
+        clouds = [transform_points(T_fixed_sensor[f.index], f.points) for f in frames if isinstance(f, Frame)]
         return np.concatenate(clouds) if clouds else np.zeros((0, 3))

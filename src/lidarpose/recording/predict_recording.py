@@ -1,12 +1,13 @@
 """`predict_recording`: poses of the people in each frame of a folder or recording, optionally tracked over time."""
 
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
-from typing import Any, TypedDict, Unpack
+from queue import SimpleQueue
+from typing import Any, TypedDict, TypeVar, Unpack
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from lidarpose.recording.known_people import KnownPeople
 from lidarpose.skeleton import Skeleton
 
 SCHEMA = "lidarpose.recording/1"
+_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -160,6 +162,34 @@ def _frames_among(source: Any) -> tuple[Any, Iterator[Frame | DamagedFrame] | No
     return [first, *items] if first else [], None
 
 
+def _one_ahead(items: Iterator[_Item]) -> Iterator[_Item]:
+    """The items, each made in another thread while the one before it is used."""
+    requests: SimpleQueue[bool] = SimpleQueue()
+    made: SimpleQueue[tuple[_Item | None, BaseException | None]] = SimpleQueue()
+
+    def work() -> None:
+        while requests.get():
+            try:
+                made.put((next(items, None), None))
+            except BaseException as error:
+                made.put((None, error))
+
+    # a daemon, which nobody waits for at the end: the next frame of a running sensor may never come
+    threading.Thread(target=work, daemon=True).start()
+    requests.put(True)
+    try:
+        while True:
+            item, error = made.get()
+            if error is not None:
+                raise error
+            if item is None:
+                return
+            requests.put(True)
+            yield item
+    finally:
+        requests.put(False)
+
+
 class FramePredictor:
     """Poses the frames of a recording in order, with the state carried from earlier frames.
 
@@ -233,22 +263,10 @@ class FramePredictor:
 
     def predict_all(self, frames: Iterator[Frame | DamagedFrame]) -> Iterator[FramePoses]:
         """Poses the next frames. While one frame is posed, the following one is read and searched."""
-
-        def prepare() -> tuple[Frame | DamagedFrame, Scan | DetectedScan | InputError] | None:
-            frame = next(frames, None)
-            return None if frame is None else (frame, self._prepared(frame))
-
         last = None
-        pool = ThreadPoolExecutor(1)
-        try:
-            future = pool.submit(prepare)
-            while (prepared_frame := future.result()) is not None:
-                future = pool.submit(prepare)
-                last = prepared_frame[0].index, prepared_frame[0].id
-                yield self._predicted(*prepared_frame)
-        finally:
-            # do not wait: the next frame of a running sensor may never come
-            pool.shutdown(wait=False, cancel_futures=True)
+        for frame, scan in _one_ahead((frame, self._prepared(frame)) for frame in frames):
+            last = frame.index, frame.id
+            yield self._predicted(frame, scan)
         self.check_boxes(last)
 
     def predict(self, frame: Frame | DamagedFrame) -> FramePoses:
@@ -316,14 +334,14 @@ class FramePredictor:
     def state(self) -> dict[str, Any]:
         """The state after the frames so far, as JSON values."""
         people = None if self.people is None else self.people.state()
-        boxes_used = self.boxes is not None and self.boxes.was_used
+        boxes_by = None if self.boxes is None else self.boxes.found_by
         search_state = {"is_crop": self._is_crop, "was_searched": self._was_searched}
-        return search_state | {"boxes_used": boxes_used, "people": people}
+        return search_state | {"boxes_by": boxes_by, "people": people}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Resumes from the result of `state()`."""
         self._is_crop, self._was_searched = state["is_crop"], state["was_searched"]
         if self.boxes is not None:
-            self.boxes.was_used = state["boxes_used"]
+            self.boxes.found_by = state["boxes_by"]
         if self.people is not None:
             self.people.restore(state["people"])

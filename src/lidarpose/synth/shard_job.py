@@ -12,7 +12,7 @@ from lidarpose.body.mocap import digest as motion_digest
 from lidarpose.data.dataset_card import CARD, DatasetCard, write_card
 from lidarpose.data.rows import person_row
 from lidarpose.data.shards import shard_path, shard_writer
-from lidarpose.data.writer import Counts, lock_dataset, make_shards, open_folder
+from lidarpose.data.writer import Counts, make_shards, open_folder
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.io.files import content_digest, file_error
 from lidarpose.lidar.presets import SENSORS, sensor
@@ -150,12 +150,11 @@ def write_dataset(
     """
     check_int("--workers", workers, least=1)
     folder, card = Path(folder), job.card()
-    missing_shards = open_folder(folder, card, _ROWS.get(job.what))
-    remaining = sum(card.size(shard) for shard in missing_shards)
-    done_count = card.count - remaining
-    # before anything is written, so that an unreadable motion file leaves no folder behind
-    maker = Maker(job=job, card=card, folder=folder, generator=job.generator()) if missing_shards else None
-    with lock_dataset(folder):
+    with open_folder(folder, card, _ROWS.get(job.what)) as missing_shards:
+        remaining = sum(card.size(shard) for shard in missing_shards)
+        done_count = card.count - remaining
+        # before anything is written, so that an unreadable motion file leaves no folder behind
+        maker = Maker(job=job, card=card, folder=folder, generator=job.generator()) if missing_shards else None
         has_card = (folder / CARD).is_file()
         if not has_card:
             write_card(folder, card)

@@ -300,6 +300,8 @@ def visible_joints(joints: np.ndarray, points: np.ndarray) -> np.ndarray:
     """joints (J, 3) m, points (n, 3) m on the body -> (J,) bool: a point is within `VISIBLE_RADIUS` of the joint."""
     if not len(points):
         return np.zeros(len(joints), bool)
+    # about a point of the body: far from the sensor, the squares below would differ by less than float32 resolves
+    joints, points = joints - points[0], points - points[0]
     square_distance = (joints**2).sum(1)[:, None] + (points**2).sum(1) - 2 * joints @ points.T
     return square_distance.min(1) < VISIBLE_RADIUS**2
 

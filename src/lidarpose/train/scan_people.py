@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lidarpose.errors import InputError
 from lidarpose.eval.protocols import jittered
 from lidarpose.geometry import rows_near
 from lidarpose.inference.verification import AROUND, box_about, inside_column
@@ -64,12 +65,12 @@ class ScanPeople:
 
 
 def populated_scan(seed: int, number: int) -> ScanPeople:
-    """The people of a scene, or of another scene if it has none."""
+    """The people of a scene, or of another scene if it has none. Raises InputError if `_TRIES` scenes have none."""
     for attempt in range(_TRIES):
         people = scan_people(seed, number + attempt * _STRIDE)
         if people.boxes:
-            break
-    return people
+            return people
+    raise InputError(f"{_TRIES} scenes of seed {seed}, from number {number} on, have no people: change the seed")
 
 
 def draw_person(scan: ScanPeople, rng: np.random.Generator) -> Example:

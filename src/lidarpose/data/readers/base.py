@@ -263,10 +263,10 @@ class SceneClouds:
     def __init__(self, paths: dict[int, Path], people: Callable[[int], np.ndarray]):
         self._paths, self._people = paths, people
 
-    def _others(self, frame: int) -> np.ndarray | None:
-        """The scan without the person; None if it cannot be read."""
+    def _others(self, frame: int, person: np.ndarray | None = None) -> np.ndarray | None:
+        """The scan without the person; None if it cannot be read. person: its points, None to obtain them."""
         try:
-            return without_person(read_cloud(self._paths[frame]), self._people(frame))
+            return without_person(read_cloud(self._paths[frame]), self._people(frame) if person is None else person)
         except (KeyError, InputError):
             return None
 
@@ -276,14 +276,16 @@ class SceneClouds:
         indices = np.unique(np.linspace(0, len(frames) - 1, SCANS).astype(int)).tolist()
         return static_points(scan for k in indices if (scan := self._others(frames[k])) is not None)
 
-    def around(self, frame: int, R_sensor_scan: np.ndarray, origin: np.ndarray | None = None) -> dict[str, Any]:
-        """The fields background and neighbors of a frame's sample, turned by R_sensor_scan (3, 3) about the sensor at
-        origin (3,) m, by default 0; empty if there is no scan."""
-        scan = self._others(frame)
+    def around(
+        self, frame: int, person: np.ndarray, R_sensor_scan: np.ndarray, origin: np.ndarray | None = None
+    ) -> dict[str, Any]:
+        """The fields background and neighbors of the sample of a frame's person, points (n, 3) m, turned by
+        R_sensor_scan (3, 3) about the sensor at origin (3,) m, by default 0; empty if there is no scan."""
+        scan = self._others(frame, person)
         if scan is None:
             return {}
         origin = np.zeros(3) if origin is None else origin
-        person, scan, static_map = ((x - origin) @ R_sensor_scan.T for x in (self._people(frame), scan, self._static))
+        person, scan, static_map = ((x - origin) @ R_sensor_scan.T for x in (person, scan, self._static))
         return {"background": window_points(static_map, person), "neighbors": window_points(scan, person)}
 
 

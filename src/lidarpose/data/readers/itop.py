@@ -16,11 +16,11 @@ Sources: iballester/spike const/skeleton_joints.py and utils/preprocess_itop.py.
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
 from lidarpose.data.readers import base
 from lidarpose.data.readers.base import Reader, Skipped
@@ -243,18 +243,7 @@ def _floor(heights: np.ndarray) -> float:
 
 def _clusters(points: np.ndarray) -> np.ndarray:
     """points (n, 3) m, n >= 1 -> (n,) int, equal for points whose cells are connected, including by a corner."""
-    cells = np.floor((points - points.min(0)) / _CELL).astype(int) + 1
-    shape = tuple(cells.max(0) + 2)
-    code, cell = np.unique(np.ravel_multi_index(tuple(cells.T), shape), return_inverse=True)
-    grid = np.full(np.prod(shape), -1)
-    grid[code] = np.arange(len(code))
-    steps = np.array(list(product((-1, 0, 1), repeat=3))) @ [shape[1] * shape[2], shape[2], 1]
-    neighbors = grid[code + steps[:, None]]
-    number = np.arange(len(code))
-    while True:
-        # label propagation: the minimum label of all neighbors, then one step of pointer jumping
-        least_number = np.where(neighbors >= 0, number[neighbors], len(code)).min(0)
-        least_number = least_number[least_number]
-        if (least_number == number).all():
-            return number[cell]
-        number = least_number
+    cell = tuple(np.floor((points - points.min(0)) / _CELL).astype(int).T)
+    is_filled = np.zeros([index.max() + 1 for index in cell], bool)
+    is_filled[cell] = True
+    return ndimage.label(is_filled, np.ones((3, 3, 3)))[0][cell]

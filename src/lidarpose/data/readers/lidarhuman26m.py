@@ -96,9 +96,9 @@ class LidarHuman26M(Reader):
             else:
                 time = (frame - min(poses)) / LIDARHUMAN26M_FPS
                 R = np.eye(3) if turn is None else turn
-                clip = {"rotations": base.turned_pose(labels[frame][1], R)} | clouds.around(frame, R)
+                rotations = base.turned_pose(labels[frame][1], R)
                 frame_fields = {"sequence": part, "frame": frame, "frame_id": f"{part}/{cloud.stem}", "time": time}
-                yield _sample(cloud, joints[frame], labels[frame][2], turn, **frame_fields, **clip)
+                yield _sample(cloud, clouds, joints[frame], labels[frame][2], turn, **frame_fields, rotations=rotations)
 
 
 def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -113,16 +113,22 @@ def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _sample(
-    path: Path, joints: np.ndarray, trans: np.ndarray, turn: np.ndarray | None, **fields: Any
+    path: Path,
+    clouds: base.SceneClouds,
+    joints: np.ndarray,
+    trans: np.ndarray,
+    turn: np.ndarray | None,
+    **fields: Any,
 ) -> LabeledSample | Skipped:
-    """The sample of a frame. turn: R_level_sensor, None to keep the sensor's frame; fields: others of the sample,
-    already turned."""
+    """The sample of a frame. clouds: the whole scans; turn: R_level_sensor, None to keep the sensor's frame; fields:
+    others of the sample, already turned."""
     try:
         points = base.read_cloud(path)
     except InputError as error:
         return Skipped("cloud cannot be read", str(error))
     if not len(points):
         return Skipped("empty cloud", fields["frame_id"])
+    fields |= clouds.around(fields["frame"], points, np.eye(3) if turn is None else turn)
     source = "lidarhuman26m"
     if turn is not None:
         points, joints, trans = (x @ turn.T for x in (points, joints, trans))

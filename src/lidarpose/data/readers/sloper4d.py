@@ -116,7 +116,7 @@ class Sloper4D(Reader):
                     centers={"trans": center},
                     rotations=turned_pose(pose[index], R_sensor_world),
                     translation=center,
-                    **scans.around(frame, R_sensor_world, position[index]),
+                    **scans.around(frame, cloud, R_sensor_world, position[index]),
                 )
         yield from (
             Skipped("cloud of a frame without labels", f"{part}/{frame}")

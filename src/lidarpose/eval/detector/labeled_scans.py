@@ -17,7 +17,7 @@ from lidarpose.eval.dataset import evenly_drawn
 from lidarpose.inference.checks import rows_inside
 from lidarpose.inference.inputs import as_origin, only_returns
 from lidarpose.io.boxes import read_boxes
-from lidarpose.io.files import file_error, read_bytes
+from lidarpose.io.files import file_error, read_json
 from lidarpose.io.point_cloud import SUFFIXES, read_points
 from lidarpose.sample import Box
 
@@ -137,7 +137,7 @@ def labeled_scans(folder: str | os.PathLike, limit: int | None = None) -> ScanSe
 
 def _read_scan(labels: Path, cloud: Path) -> LabeledScan:
     labeled_boxes = read_boxes(labels)
-    content = json.loads(read_bytes(labels, expected="labels of people"))
+    content = read_json(labels, expected="labels of people")
     document: dict[str, Any] = content if isinstance(content, dict) else {"people": content}
     boxes, people, kinds = [], [], []
     for box, entry in zip(labeled_boxes, document["people"], strict=True):

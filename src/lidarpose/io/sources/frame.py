@@ -1,7 +1,7 @@
 """Frames and frame sources, the common interface of all kinds of recordings."""
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -286,13 +286,16 @@ class FrameSource:
             return 1
         return -1 if self.start is not None and elapsed < self.start - _ROUNDING else 0
 
-    def frames(self, first: int = 0) -> Iterator[Frame | DamagedFrame]:
-        """The frames from index `first` on, without decoding those before."""
+    def frames(self, first: int = 0, *, only: Collection[int] | None = None) -> Iterator[Frame | DamagedFrame]:
+        """The frames from index `first` on, or of the indices `only`, without decoding others."""
+        last = None if only is None else max(only, default=-1)
         self._num_back = 0
         last_time = -np.inf
         index = first - 1
         try:
             for index, lazy_frame in enumerate(self.recording.lazy_frames(first), first):
+                if last is not None and index > last:
+                    return
                 time = index / self.rate if self._first_time is None else lazy_frame.time
                 if time is not None:
                     self._num_back += time < last_time
@@ -301,7 +304,7 @@ class FrameSource:
                         return
                     if place < 0:
                         continue
-                if index % self.every == 0:
+                if index % self.every == 0 and (only is None or index in only):
                     yield _read(lazy_frame, index, time)
         except LidarPoseError as error:
             if index < 0 or isinstance(error, MissingExtra):

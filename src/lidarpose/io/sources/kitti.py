@@ -61,7 +61,7 @@ def _open_sequence(sequence: Path) -> IndexedRecording:
     rows = _numbers(files)
     stamps = _table(sequence / "times.txt", 1)
     times = _frame_times(None if stamps is None else stamps[:, 0], rows, "times.txt", notes)
-    tables = (sequence / "poses.txt", sequence.parents[1] / "poses" / f"{sequence.name}.txt")
+    tables = (sequence / "poses.txt", sequence.parent.parent / "poses" / f"{sequence.name}.txt")
     poses = _table(next((path for path in tables if path.is_file()), tables[0]), 12)
     row = _calibration(sequence / "calib.txt").get("Tr", np.zeros(0))
     if poses is None or len(row) != 12:

@@ -4,7 +4,6 @@ Source: Caesar et al., nuScenes: A Multimodal Dataset for Autonomous Driving, CV
 development kit.
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from lidarpose.errors import InputError, check_name
 from lidarpose.geometry import quaternion_to_matrix, rigid_transform
-from lidarpose.io.files import file_error, read_bytes, shorten
+from lidarpose.io.files import file_error, read_bytes, read_json, shorten
 from lidarpose.io.point_cloud import NUSCENES_FIELDS
 from lidarpose.io.sources.frame import IndexedRecording, ReadingOptions, Sweep
 
@@ -39,7 +38,7 @@ def open_nuscenes(folder: Path, options: ReadingOptions) -> IndexedRecording | N
         sweeps = _sweeps(versions[0], options.topic)
     except InputError:
         raise
-    except (LookupError, TypeError, ValueError, ArithmeticError, RecursionError) as error:
+    except (LookupError, TypeError, ValueError, ArithmeticError) as error:
         raise file_error(versions[0], f"not nuScenes tables ({shorten(str(error))}): download them again") from None
     file_names = {f"{part}/{_CHANNEL}": _names(root / part / _CHANNEL) for part in ("samples", "sweeps")}
     present_sweeps = [
@@ -65,7 +64,7 @@ def open_nuscenes(folder: Path, options: ReadingOptions) -> IndexedRecording | N
 
 def _sweeps(version: Path, scene: str | None) -> list[dict[str, Any]]:
     """The id, file, time in s and pose (None if damaged) of each sweep, in order."""
-    tables = {name: json.loads(read_bytes(version / f"{name}.json", expected="a nuScenes table")) for name in _TABLES}
+    tables = {name: read_json(version / f"{name}.json", expected="a nuScenes table") for name in _TABLES}
     sample_data = tables.pop("sample_data")
     by_token = {name: {row["token"]: row for row in rows} for name, rows in tables.items()}
     if scene is not None:

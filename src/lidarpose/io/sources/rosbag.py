@@ -180,7 +180,7 @@ class BagRecording:
             raise self._damage
 
     def _decode(self, message: Message) -> Any:
-        """The content of a message, or None if it is damaged."""
+        """The content of a message, or the error of decoding it, of any type if it is damaged."""
         topic = self.topics[message.topic]
         data = unpacked_message(message.data)
         names = (CLOUD_TYPES, velodyne.SCAN_TYPES, TRANSFORM_TYPES)
@@ -188,8 +188,8 @@ class BagRecording:
             if topic.type in livox.TYPES:
                 return livox.decode_cloud(data, topic.encoding)
             return decoders()[topic.encoding](data, next(types[0] for types in names if topic.type in types))
-        except Exception:
-            return None
+        except Exception as error:
+            return error
 
     def _messages(self) -> Iterator[Message]:
         """Clouds and transforms of all files. After a damaged position, reading continues with the next file."""
@@ -234,8 +234,9 @@ class _Cloud:
         self.stamp = stamp if stamp > 0 else message.time - (0 if header else delay)
 
     def decode(self, T_world_sensor: np.ndarray | None) -> Sweep:
-        if self.content is None:
-            raise FormatError("cannot be decoded as a point cloud: the message is damaged")
+        if isinstance(self.content, Exception):
+            reason = shorten(f"{type(self.content).__name__}: {self.content}")
+            raise FormatError(f"cannot be decoded as a point cloud: the message is damaged ({reason})")
         ring: np.ndarray | None
         if isinstance(self.content, livox.LivoxCloud):
             points, ring = self.content.points, self.content.ring

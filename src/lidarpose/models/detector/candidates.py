@@ -258,15 +258,16 @@ def suppress_near(centers: np.ndarray, strength: np.ndarray, radius: float) -> n
     """
     order = np.argsort(-np.asarray(strength), kind="stable")
     x, y = np.asarray(centers, float)[order, :2].T
-    is_near = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 < radius**2
-    return order[_that_stay(len(order), np.argwhere(np.triu(is_near, 1)))]
-
-
-def _that_stay(count: int, pairs: np.ndarray) -> np.ndarray:
-    """(count,) bool, by decreasing strength: False if in a pair (P, 2), ascending, with a stronger one that remains."""
-    is_kept = np.ones(count, bool)
-    # pairs are sorted by the stronger candidate, so it is known whether that one remains
-    for stronger, weaker in pairs.tolist():
+    # pairs of candidates that are near in x, each with those that follow it
+    by_x, rows = np.argsort(x), np.arange(len(order))
+    counts = np.maximum(np.searchsorted(x[by_x], x[by_x] + 1.001 * radius) - rows - 1, 0)
+    first = np.repeat(rows, counts)
+    second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(counts) - counts, counts)
+    pairs = np.sort([by_x[first], by_x[second]], axis=0)
+    pairs = pairs[:, np.diff(x[pairs], axis=0)[0] ** 2 + np.diff(y[pairs], axis=0)[0] ** 2 < radius**2]
+    is_kept = np.ones(len(order), bool)
+    # sorted by the stronger candidate, so that it is known whether that one remains
+    for stronger, weaker in pairs[:, np.lexsort(pairs[::-1])].T.tolist():
         if is_kept[stronger]:
             is_kept[weaker] = False
-    return is_kept
+    return order[is_kept]

@@ -43,12 +43,15 @@ class VerifierObjective:
         mounted = np.concatenate([example.mounted for example in examples])
         labels = np.stack([person, mounted], 1).astype(np.float32)
         seeds = np.concatenate([example.seed + np.arange(example.size) for example in examples])
+        if not clouds:
+            # a cloud without label, so that a batch without detections has gradients, which are 0
+            clouds, view, seeds = [np.zeros((1, 3), np.float32)], np.zeros((1, 5), np.float32), np.zeros(1, int)
         order = np.argsort([len(cloud) for cloud in clouds], kind="stable")
         groups = []
         for start in range(0, len(order), _GROUP):
             rows = order[start : start + _GROUP]
             pyramid = training_voxels([clouds[row] for row in rows], view[rows], seeds[rows], self.config)
-            groups.append(pyramid.arrays() | {"person": labels[rows]})
+            groups.append(pyramid.arrays() | {"person": labels[rows[: len(labels)]]})
         return groups
 
     def terms(
@@ -73,7 +76,7 @@ class VerifierObjective:
         return np.concatenate([*logits, np.zeros((0, 2))])[np.argsort(order)]
 
     def _logits(self, network: Callable, group: dict, device: torch.device | str) -> Tensor:
-        return network(Batch.from_arrays(group, device)).person.float()
+        return network(Batch.from_arrays(group, device)).person.float()[: len(group["person"])]
 
 
 def missed_by_verifier(
