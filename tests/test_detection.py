@@ -179,7 +179,7 @@ def test_predict_warns_of_tilted_sensor(model, scene):
     (warning,) = (warning for warning in poses.warnings if "leans by" in warning)
     assert "leans by 20 degrees" in warning or "leans by 19" in warning
     # the suggested up axis is the tilted one
-    suggested = np.array([float(value) for value in warning.rpartition("up=")[2].split(",")])
+    suggested = np.array([float(value) for value in warning.rpartition("--up ")[2].split(",")])
     assert np.linalg.norm(suggested) == pytest.approx(1, abs=2e-3) and suggested @ tilt[:, 2] > np.cos(np.radians(2))
     assert sum(found_at(poses.to_numpy()[:, 0] @ tilt, joints)) >= 4
 
@@ -285,6 +285,18 @@ def test_detect_suggests_no_up_axis_without_people(scene, fake):
     # in a room the up axis is ambiguous, so all are tried
     near = empty[np.abs(empty[:, :2]).max(1) < 6]
     assert lidarpose.detect(near).warnings == () and len(fake.calls) >= 6
+
+
+def test_detect_suggests_feet_that_find_people(scene):
+    boxes = lidarpose.detect(scene[0] / 0.3048)
+    (warning,) = boxes.warnings
+    assert not boxes
+    assert warning == "no people found in meters, but 5 if the units are feet: multiply all coordinates by 0.3048"
+
+
+def test_detect_reports_range_without_sensor(scene):
+    (warning,) = lidarpose.detect(scene[0], sensor_origin="unknown", max_range=20).warnings
+    assert warning == "the sensor position is unknown, so max_range (--range) is not applied"
 
 
 def test_detect_replaces_implausible_sensor_origin_by_unknown(scene, fake):
@@ -419,7 +431,7 @@ def test_detect_excludes_background(scene, tmp_path, fake):
     other = lidarpose.detect(points, background=static + [0, 0, 9.0])
     assert any("from this sensor" in warning for warning in other.warnings) and len(other) == len(PLACES)
     itself = lidarpose.detect(points, background=points)
-    assert len(itself) == 0 and "learned from this scan alone?" in itself.warnings[0]
+    assert len(itself) == 0 and "on which 100% of the points lie" in itself.warnings[0]
 
 
 # ---- errors and commands
@@ -488,7 +500,7 @@ def test_detect_and_predict_commands(file, capsys, fake, tmp_path):
     capsys.readouterr()
     assert main(["predict", file, *fast, "--background", "static.npy", "--picture", "--sensor-origin", "0,0,0.1"]) == 0
     warning, line = capsys.readouterr().err.strip().splitlines()
-    assert "learned from this scan alone?" in warning
+    assert "no people found off the background" in warning
     # the warning states the cause, so there is no further advice
     assert line == "no people found -> sweep.poses.json and sweep.poses.png"
     assert json.loads((tmp_path / "sweep.poses.json").read_text())["people"] == []

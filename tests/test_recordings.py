@@ -554,10 +554,10 @@ def test_summary_merges_warnings_that_differ_in_numbers():
     summary = output.Summary()
     for up in ("-0.342,0.003,0.94", "-0.341,-0.002,0.94", "-0.342,0,0.94", "0.342,0.003,-0.94"):
         summary.add(
-            {"people": [], "error": None, "warnings": [f"the ground leans by 20 degrees: confirm it with up={up}"]}
+            {"people": [], "error": None, "warnings": [f"the ground leans by 20 degrees: confirm it with --up {up}"]}
         )
     (line,) = summary.warning_lines(8)
-    assert line.startswith("4 frames: ") and line.endswith("up=-0.342,0.003,0.94")
+    assert line.startswith("4 frames: ") and line.endswith("--up -0.342,0.003,0.94")
     summary.add({"people": [], "error": None, "warnings": ["under 5 points"]})
     assert len(summary.warning_lines(8)) == 2
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_from_up, up_text
-from lidarpose.inference.detection import DetectedScan, detect_places, least_score, other_up_axis, search_options
+from lidarpose.inference.detection import DetectedScan, detect_places, least_score, search_options, why_nobody
 from lidarpose.inference.inputs import as_origin, as_points, only_returns
 from lidarpose.inference.predict_scan import check_choice, check_up, is_wide, predict_scan, predictor_of
 from lidarpose.inference.predictor import Predictor
@@ -286,8 +286,8 @@ class FramePredictor:
             )
             if isinstance(prepared_scan, DetectedScan) and not self._was_searched:
                 self._was_searched = True
-                if not len(poses) and (hint := other_up_axis(prepared_scan, self._search)):
-                    poses = replace(poses, warnings=(*poses.warnings, hint))
+                if not len(poses):
+                    poses = replace(poses, warnings=why_nobody(prepared_scan, self._search, poses.warnings))
             if people is not None:
                 poses = people.update(time, scan, poses, T_fixed_sensor)
         except InputError as error:
