@@ -251,6 +251,14 @@ def test_detect_does_not_take_tilted_scan_for_wrong_units(scene):
     assert "leans by" in warning
 
 
+def test_predict_does_not_take_scan_in_kilometers_for_crop(model):
+    rng = np.random.default_rng(0)
+    street = rng.uniform((-200, -200, -2), (200, 200, 1), (6000, 3)) / 1000
+    poses = lidarpose.predict(street, model=model)
+    assert not len(poses) and "multiply all coordinates by 1000" in poses.warnings[0]
+    assert len(lidarpose.predict(street[:5000], model=model)) == 1
+
+
 def test_detect_does_not_take_single_person_for_kilometers():
     standing = np.random.default_rng(0).normal([8, 0, 0], [0.08, 0.12, 0.4], (500, 3))
     assert not any("kilometers" in warning for warning in lidarpose.detect(standing).warnings)
@@ -467,16 +475,16 @@ def test_predict_rejects_detection_options_with_boxes_or_crop(model, file, fake,
                 lidarpose.predict(file, **given, **option, model=model)
     with pytest.raises(InputError, match="find is an option of the detection: omit it with boxes"):
         model.predict(scene[0], boxes=[], find=True)
-    # a small file is one person unless find is given
+    # a small file is one person unless find or an option of detection is given
     near = scene[0][np.linalg.norm(scene[0][:, :2] - PLACES[0], axis=1) < 1.5]
     np.save("small.npy", near)
     assert lidarpose.predict("small.npy", model=model)[0].box is None and not fake.calls
-    # detection options without a detection give a warning
-    for option in ({"min_score": 0.5}, {"background": file}):
-        (person,) = lidarpose.predict("small.npy", **option, model=model)
-        assert person.box is None and any(
-            "set find (--find) to detect people" in warning for warning in person.warnings
-        )
+    # options of detection imply find
+    for option in ({"min_score": 0.5}, {"max_range": 9}):
+        assert "find" in lidarpose.predict("small.npy", **option, model=model).timing_ms
+        with pytest.raises(InputError, match="options of the detection: omit them with find=False"):
+            lidarpose.predict("small.npy", **option, find=False, model=model)
+    assert lidarpose.predict(file, find=False, model=model)[0].box is None
     assert lidarpose.predict("small.npy", find=True, sensor_origin="unknown", model=model)[0].box is not None
 
 

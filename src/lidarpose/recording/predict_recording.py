@@ -14,7 +14,7 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_from_up, up_text
 from lidarpose.inference.detection import DetectedScan, detect_places, least_score, search_options, why_nobody
 from lidarpose.inference.inputs import as_origin, as_points, only_returns
-from lidarpose.inference.predict_scan import check_choice, check_up, is_wide, predict_scan, predictor_of
+from lidarpose.inference.predict_scan import check_choice, check_up, is_whole, predict_scan, predictor_of
 from lidarpose.inference.predictor import Predictor
 from lidarpose.inference.results import Poses
 from lidarpose.inference.scan import Scan
@@ -306,7 +306,7 @@ class FramePredictor:
                 check_up(boxes, self.up)
             scan = replace(scan, boxes=boxes or [])
         elif self._is_crop is None and len(points):
-            self._is_crop = not is_wide(scan)
+            self._is_crop = not is_whole(scan)
         if self._origin is not None:
             (origin,) = self._origin
         else:
