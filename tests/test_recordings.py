@@ -759,6 +759,8 @@ def test_frames_copy_sensor_poses_and_make_rotations_exact():
     frame = Frame(points=np.zeros((0, 3)), index=0, id="a", T_world_sensor=T, origin=origin)
     T[0, 3] = origin[0] = 7.0
     np.testing.assert_allclose(frame.T_world_sensor[:3, :3], rotation_about("z", 0.3), atol=1e-12)
+    assert repr(frame) == "Frame(0, 'a', 0 points)"
+    assert repr(replace(frame, time=1.7e9 + 0.2)) == "Frame(0, 'a', 0 points, t=1700000000.2 s)"
     assert frame.T_world_sensor[0, 3] == frame.origin[0] == 0.0
 
 
