@@ -298,6 +298,9 @@ def test_predict_warns_about_rounded_clouds_of_list(model, points):
     far = (points + [5e6, 0, 0]).astype(np.float32)
     warnings = [person.warnings for person in model.predict([points, far, far.astype(float) + 0.01])]
     assert [any("coordinates are rounded to 0.5 m" in line for line in own) for own in warnings] == [False, True, False]
+    half = model.predict((points + [500, 0, 0]).astype(np.float16))
+    assert "coordinates are rounded to 0.25 m, the precision of 16-bit floats" in half.warnings[0]
+    assert not any("rounded" in line for line in model.predict(np.rint(1000 * (points + 1))).warnings)
 
 
 def test_predict_is_accurate_in_map_coordinates(model, points):

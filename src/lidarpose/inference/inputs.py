@@ -206,17 +206,23 @@ def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
 
 
 def rounding_warning(points: np.ndarray) -> str | None:
-    """A warning if points (n, 3) m are rounded too coarsely to show a person, as large map coordinates in 32 bits
+    """A warning if points (n, 3) m are rounded too coarsely to show a person, as large map coordinates in 16 or 32 bits
     are."""
-    # a quantile ignores stray points; a subsample suffices for a large map
-    some = np.abs(points[:: max(len(points) // _LOOKED_AT, 1)])
-    step = float(np.spacing(np.float32(np.quantile(some, 0.9)))) if len(points) else 0.0
-    if step < _COARSE or not np.array_equal(points.astype(np.float32), points):
+    if not len(points):
         return None
-    return (
-        f"coordinates are rounded to {step:g} m, the precision of 32-bit floats at this magnitude: subtract an "
-        "offset before saving"
-    )
+    # a quantile ignores stray points; a subsample suffices for a large map
+    some = points[:: max(len(points) // _LOOKED_AT, 1)]
+    magnitude = np.quantile(np.abs(some), 0.9)
+    for bits, kind in ((16, np.float16), (32, np.float32)):
+        with np.errstate(all="ignore"):
+            step, is_rounded = float(np.spacing(kind(magnitude))), np.array_equal(some.astype(kind), some)
+        # whole numbers are not rounded to 16 bits, but in another unit
+        if step >= _COARSE and is_rounded and (bits == 32 or (some % 1).any()):
+            return (
+                f"coordinates are rounded to {step:g} m, the precision of {bits}-bit floats at this magnitude: "
+                "subtract an offset before saving"
+            )
+    return None
 
 
 def only_returns(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
