@@ -828,7 +828,9 @@ def poses(model, points):
 
 def test_repr_of_predictor_and_results_is_short(model, poses):
     assert repr(model).startswith("Predictor('small', body26, onnx, tta=1")
-    assert repr(poses) == "Poses(2 of 3 people, smpl24)"
+    # the person's own warnings count
+    assert repr(poses) == "Poses(2 of 3 people, smpl24, 1 warning)"
+    assert repr(replace(poses, warnings=("a",))) == "Poses(2 of 3 people, smpl24, 2 warnings)"
     assert re.fullmatch(r"PersonPose\(smpl24, confidence [01]\.\d\d, 590 points\)", repr(poses[0]))
     assert repr(replace(poses[1], id="b")) == "PersonPose(id='b', no pose, 3 points, 1 warning)"
 
@@ -839,6 +841,11 @@ def test_notebooks_show_table_of_poses_and_picture_of_person(poses):
     assert isinstance(picture, bytes) and repr(picture) == f"<PNG, {len(picture):,} bytes>"
     named = replace(poses, people=(replace(poses[0], id="<b>"), poses[1]))
     assert "&lt;b&gt;" in named._repr_html_() and "no pose" in named._repr_html_()
+    assert "score" not in named._repr_html_()
+    rider = replace(poses[0], id=3, box=Box(center=np.zeros(3), size=np.ones(3), score=0.876, mounted=True))
+    table = replace(poses, people=(rider, poses[1]))._repr_html_()
+    assert "<th>score</th><th>mounted</th>" in table and "<td>0.88</td><td>yes</td>" in table
+    assert [panel.label for panel in rider.alone()._panels()[0]] == ["3 · score 0.88 · rides"]
 
 
 def test_poses_indexed_by_id_and_slice(poses):
