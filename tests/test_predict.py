@@ -98,9 +98,10 @@ def test_predict_easy_person_is_upright_and_accurate(model, standing):
         lambda p: pd.DataFrame(p),
         lambda p: records(p),
         lambda p: Cloud(points=p.astype(float)),
+        lambda p: p.astype(object),
     ],
     ids="float64 big-endian rows tuples row-arrays fortran strided four-columns torch torch-grad table plain-table "
-    "records read-from-file".split(),
+    "records read-from-file objects".split(),
 )
 def test_predict_accepts_all_kinds_of_arrays(model, points, kind):
     np.testing.assert_allclose(model.predict(kind(points)).joints, model.predict(points).joints, atol=1e-4)
@@ -130,7 +131,7 @@ def test_predict_keeps_input(model, points):
         (np.zeros((3, 60)), "shape (3, 60): give points.T"),
         (np.zeros((2, 2, 2, 3)), "shape (2, 2, 2, 3)"),
         (np.array([[1, 2, "a"]]), "<U"),
-        (np.array([[1, 2, 3]], object), "objects"),
+        (np.array([[1, 2, "a"]], object), "not all numbers"),
         (np.array([[True, False, True]]), "bool"),
         (np.array([[1j, 2, 3]]), "complex"),
         (np.zeros(4, [("a", "f4"), ("b", "f4"), ("c", "f4")]), "expected columns x, y and z, got a b c"),
@@ -150,6 +151,12 @@ def test_predict_rejects_bad_arrays_in_one_line(model, bad, words):
     with pytest.raises(InputError) as raised:
         model.predict(bad)
     assert words in str(raised.value) and "\n" not in str(raised.value) and "points" in str(raised.value)
+
+
+def test_predict_of_one_scan_rejects_list_of_scans(points):
+    for predict in (lidarpose.predict, lidarpose.detect):
+        with pytest.raises(InputError, match=r"got a list of 2: one call per scan, or lidarpose.load\(\).predict"):
+            predict([points, points[:50]])
 
 
 def test_predict_drops_and_counts_nonfinite_and_huge_points(model, points):
@@ -854,6 +861,8 @@ def test_poses_indexed_by_id_and_slice(poses):
     assert isinstance(named[1:], type(poses)) and [p.id for p in named[1:]] == ["b", 7]
     with pytest.raises(KeyError, match="no person has the id 'c'"):
         named["c"]
+    with pytest.raises(IndexError, match=r"no person at 7: there are 3 people, counted from 0, and ids are text, \['7'\]"):
+        named[7]
 
 
 def test_poses_to_numpy_and_to_dataframe(poses, tmp_path):

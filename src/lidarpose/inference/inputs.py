@@ -117,6 +117,11 @@ def as_points(points: Any, what: str = "points") -> np.ndarray:
     """
     if isinstance(points, str | os.PathLike):
         raise InputError(f"{what} must be an (n, 3) array, got a path: use lidarpose.predict({str(points)!r})")
+    if isinstance(points, list | tuple) and points and getattr(points[0], "ndim", 0) > 1:
+        raise InputError(
+            f"{what} must be one (n, 3) array, got a list of {len(points)}: one call per scan, or "
+            "lidarpose.load().predict([...]) for crops"
+        )
     is_records = getattr(getattr(points, "dtype", None), "names", None) is not None
     points = _by_name(points, what)
     try:
@@ -130,10 +135,12 @@ def as_points(points: Any, what: str = "points") -> np.ndarray:
         frame = ", its points are in .points" if hasattr(points, "points") else ""
         raise InputError(f"{what} must be an (n, 3) array of numbers, got {type(points).__name__}{frame}")
     if array.dtype == object:
-        raise InputError(
-            f"{what} must be an (n, 3) array of numbers, got {type(points).__name__} of objects, shape {array.shape}: "
-            "give many people as a list of arrays"
-        )
+        if array.ndim != 2 or not all(isinstance(value, Real) for value in array.ravel().tolist()):
+            raise InputError(
+                f"{what} must be an (n, 3) array of numbers, got {type(points).__name__} of objects, not all numbers, "
+                f"shape {array.shape}: give columns of numbers only, and many people as a list of arrays"
+            )
+        array = array.astype(float)
     if array.dtype.kind not in "fiu":
         raise InputError(f"{what} must be an (n, 3) array of numbers, got {array.dtype} of shape {array.shape}")
     looks_transposed, looks_depth = is_transposed(array.shape), is_image(array.shape)
