@@ -764,6 +764,13 @@ def test_frames_copy_sensor_poses_and_make_rotations_exact():
     assert frame.T_world_sensor[0, 3] == frame.origin[0] == 0.0
 
 
+def test_first_frame_of_paths_has_warnings_about_source(model, tmp_path):
+    for name in "ab":
+        np.save(tmp_path / f"{name}.npy", np.random.default_rng(0).normal(scale=0.3, size=(99, 3)))
+    first, second = lidarpose.predict_recording(tmp_path, crop=True, model=model)
+    assert "has no times: read as 10 frames per second" in first.poses.warnings[0] and not second.poses.warnings
+
+
 def test_predict_recording_checks_generators_and_their_options(model, tmp_path):
     np.save(tmp_path / "a.npy", np.random.default_rng(0).normal(scale=0.3, size=(99, 3)))
     assert len(list(lidarpose.predict_recording(tmp_path.glob("*.npy"), crop=True, model=model))) == 1

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain
+from itertools import chain, islice
 from typing import Any, TypedDict, Unpack
 
 import numpy as np
@@ -123,7 +123,8 @@ def predict_recording(
             one person.
 
     Yields:
-        `FramePoses` of each frame, including damaged frames.
+        `FramePoses` of each frame, including damaged frames. The warnings of the first include those about the source,
+        if it is given by paths.
 
     Raises:
         InputError: options that exclude each other, a source that cannot be read, or, after the last frame, `boxes` of
@@ -133,14 +134,23 @@ def predict_recording(
         raise TypeError(f"predict_recording() got an unexpected keyword argument {min(unknown)!r}")
     choice: dict[str, Any] = {"rate": rate, "start": start, "end": end, "every": every}
     paths, frames = _frames_among(source)
-    name = getattr(source, "name", None)
+    name, opened = getattr(source, "name", None), None
     if frames is None:
         opened = open_source(paths, columns=columns, topic=topic, meta=meta, **choice)
         name, frames = opened.name, opened.frames()
     elif options := [option for option, value in choice.items() if value != (1 if option == "every" else None)]:
         raise InputError(f"{options[0]} is for paths, got frames: give it to open_source, or filter the frames")
     predictor = FramePredictor(columns=columns, topic=topic, meta=meta, name=name, **posing)
-    return predictor.predict_all(frames)
+    results = predictor.predict_all(frames)
+    return results if opened is None else _with_warnings(results, opened)
+
+
+def _with_warnings(results: Iterator[FramePoses], source: FrameSource) -> Iterator[FramePoses]:
+    """The results, the first with the warnings about the source."""
+    for first in islice(results, 1):
+        poses = first.poses
+        yield replace(first, poses=replace(poses, warnings=(*source.warnings, *poses.warnings)))
+    yield from results
 
 
 def _frames_among(source: Any) -> tuple[Any, Iterator[Frame | DamagedFrame] | None]:
