@@ -99,6 +99,9 @@ def test_tracks_follow_walking_people(tracked):
         track = min(first, key=lambda id: np.hypot(*(first[id][:2] - at)))
         moved = (last[track] - first[track])[:2]
         assert np.hypot(*(first[track][:2] - at)) < 0.25 and np.hypot(*(moved - step * (FRAMES - 1))) < 0.1
+        velocities = [person["velocity"] for line in lines for person in line["people"] if person["track"] == track]
+        # unknown at the first sighting
+        assert velocities[0] is None and np.linalg.norm(velocities[-1] - np.append(step, 0) * 10) < 0.5
     for person in (person for line in lines for person in line["people"]):
         assert person["id"] == person["track"] and person["filled"] is False
         assert len(person["joints"]) == len(person["spread"]) == 24 and person["num_points"] > 50
@@ -108,7 +111,7 @@ def test_untracked_frame_equals_prediction_of_single_file(drive, folder, clouds,
     lines = run(drive, "--every", 3, "--end", 0.4, "--out", folder / "plain.jsonl")
     assert [line["frame"] for line in lines] == [0, 3]
     alone = lidarpose.predict(drive / "frame_8.npy", model=model).to_dict()
-    assert [person | {"track": None, "filled": False} for person in alone["people"]] == lines[1]["people"]
+    assert [person | {"track": None, "velocity": None, "filled": False} for person in alone["people"]] == lines[1]["people"]
     assert lines[1]["people"][0]["score"] > 0.8
 
 
@@ -338,6 +341,11 @@ def test_csv_and_parquet_have_one_row_per_person_and_joint(tracked, tmp_path):
     assert (row.frame, row.frame_id, row.track, row.joint) == (line["frame"], line["id"], person["track"], "pelvis")
     assert [row.x, row.y, row.z] == person["joints"][0] and row.spread == person["spread"][0]
     np.testing.assert_allclose(csv[["x", "y", "z", "confidence"]], parquet[["x", "y", "z", "confidence"]])
+    assert [row.velocity_x, row.velocity_y, row.velocity_z] == person["velocity"]
+    assert lidarpose.read_poses(line)[-1].velocity.tolist() == person["velocity"]
+    # as older versions wrote it
+    older = {key: value for key, value in person.items() if key != "velocity"}
+    assert lidarpose.read_poses(line | {"people": [older]})[0].velocity is None
     # the world frame is known for some frames only
     moved = [in_world(line | {"T_world_sensor": np.eye(4).tolist()}) if line["frame"] % 2 else line for line in lines]
     result_files.write_result(tmp_path / "world.csv", moved)
@@ -370,8 +378,10 @@ def test_in_world_converts_box_heading(up):
     R_level_input, R_world_level = UP_AXES[up], rotation_about("z", 0.4)
     T_world_sensor = rigid_transform(R_world_level @ R_level_input, np.array([1.0, 2.0, 3.0]))
     box = {"center": [4.0, 5.0, 6.0], "size": [0.5, 0.6, 1.8], "yaw": 0.3}
-    line = {"T_world_sensor": T_world_sensor.tolist(), "people": [{"joints": None, "box": box}]}
-    moved = in_world(line, up)["people"][0]["box"]
+    person = {"joints": None, "box": box, "velocity": [1, 2, 3]}
+    person = in_world({"T_world_sensor": T_world_sensor.tolist(), "people": [person]}, up)["people"][0]
+    moved = person["box"]
+    np.testing.assert_allclose(person["velocity"], R_world_level @ R_level_input @ [1, 2, 3], atol=1e-4)
     assert abs(moved["yaw"] - 0.7) < 1e-9
     np.testing.assert_allclose(moved["center"], R_world_level @ R_level_input @ [4, 5, 6] + [1, 2, 3], atol=1e-4)
 

@@ -51,6 +51,7 @@ class PersonPose:
         model: name, version and settings of the network.
         up: up axis of the input frame, used for drawing.
         stored_points: number of points of the crop if `points` does not hold them, see `read_poses`.
+        velocity: (3,) m/s of a tracked person over ground, along the axes of the input frame; None if unknown.
     """
 
     pose: Pose | None
@@ -62,6 +63,7 @@ class PersonPose:
     model: dict = field(default_factory=dict)
     up: str = "z"
     stored_points: int | None = None
+    velocity: np.ndarray | None = None
 
     @property
     def has_pose(self) -> bool:

@@ -57,7 +57,9 @@ class FramePoses:
         del document["timing_ms"]
         people = []
         for person, entry in zip(self.poses, document.pop("people"), strict=True):
-            people.append(entry | {"track": person.id if self.is_tracked else None, "filled": False})
+            velocity = None if person.velocity is None else person.velocity.round(4).tolist()
+            track = person.id if self.is_tracked else None
+            people.append(entry | {"track": track, "velocity": velocity, "filled": False})
         T_world_sensor = None if self.T_world_sensor is None else self.T_world_sensor.tolist()
         frame_entry = {
             "schema": SCHEMA,
