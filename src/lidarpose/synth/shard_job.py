@@ -86,7 +86,7 @@ class SynthesisJob:
         set_names = {change.partition("=")[0] for change in self.set}
         acquisitions = [name for name in ACQUISITIONS if name in set_names and getattr(scene, name)]
         if acquisitions and self.what == "clips":
-            raise InputError(f"{', '.join(acquisitions)} are for single people, not for clips: omit them or --clips")
+            raise InputError(f"clips are scanned in one way only: omit {', '.join(acquisitions)}, or --clips")
         if "sparse" in acquisitions and self.sensors is not None:
             raise InputError("sparse scans with sensors of its own: omit it or --sensor")
         for name in self.sensors or ():
