@@ -861,7 +861,9 @@ def test_poses_indexed_by_id_and_slice(poses):
     assert isinstance(named[1:], type(poses)) and [p.id for p in named[1:]] == ["b", 7]
     with pytest.raises(KeyError, match="no person has the id 'c'"):
         named["c"]
-    with pytest.raises(IndexError, match=r"no person at 7: there are 3 people, counted from 0, and ids are text, \['7'\]"):
+    with pytest.raises(
+        IndexError, match=r"no person at 7: there are 3 people, counted from 0, and ids are text, \['7'\]"
+    ):
         named[7]
 
 

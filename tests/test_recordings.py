@@ -111,7 +111,9 @@ def test_untracked_frame_equals_prediction_of_single_file(drive, folder, clouds,
     lines = run(drive, "--every", 3, "--end", 0.4, "--out", folder / "plain.jsonl")
     assert [line["frame"] for line in lines] == [0, 3]
     alone = lidarpose.predict(drive / "frame_8.npy", model=model).to_dict()
-    assert [person | {"track": None, "velocity": None, "filled": False} for person in alone["people"]] == lines[1]["people"]
+    assert [person | {"track": None, "velocity": None, "filled": False} for person in alone["people"]] == lines[1][
+        "people"
+    ]
     assert lines[1]["people"][0]["score"] > 0.8
 
 

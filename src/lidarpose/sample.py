@@ -351,7 +351,8 @@ class LabeledSample(Sample):
     info: PersonInfo | None = None
 
     def __repr__(self) -> str:
-        return f"LabeledSample({self.sequence!r}, frame {self.frame}, track {self.track!r}, {len(self.points):,} points)"
+        origin = f"{self.sequence!r}, frame {self.frame}, track {self.track!r}"
+        return f"LabeledSample({origin}, {len(self.points):,} points)"
 
     def __post_init__(self):
         super().__post_init__()

@@ -57,8 +57,8 @@ def moved_yaw(yaw: float, T: np.ndarray, R_from: np.ndarray | None = None, R_to:
 
 
 def in_world(line: dict[str, Any], up: str = "z") -> dict[str, Any]:
-    """The line with joints, boxes and velocities in the world frame if the sensor pose is known, else unchanged. up: up axis of the
-    sensor frame."""
+    """The line with joints, boxes and velocities in the world frame if the sensor pose is known, else unchanged. up: up
+    axis of the sensor frame."""
     if line["T_world_sensor"] is None:
         return line
     T = np.array(line["T_world_sensor"])
