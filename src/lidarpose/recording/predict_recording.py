@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain, islice
+from itertools import chain
 from typing import Any, TypedDict, Unpack
 
 import numpy as np
@@ -149,7 +149,7 @@ def predict_recording(
 
 def _with_warnings(results: Iterator[FramePoses], source: FrameSource) -> Iterator[FramePoses]:
     """The results, the first with the warnings about the source."""
-    for first in islice(results, 1):
+    if (first := next(results, None)) is not None:
         poses = first.poses
         yield replace(first, poses=replace(poses, warnings=(*source.warnings, *poses.warnings)))
     yield from results
