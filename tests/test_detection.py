@@ -179,7 +179,7 @@ def test_predict_warns_of_tilted_sensor(model, scene):
     (warning,) = (warning for warning in poses.warnings if "leans by" in warning)
     assert "leans by 20 degrees" in warning or "leans by 19" in warning
     # the suggested up axis is the tilted one
-    suggested = np.array([float(value) for value in warning.rpartition("up=")[2].split(",")])
+    suggested = np.array([float(value) for value in warning.rpartition("--up ")[2].split(",")])
     assert np.linalg.norm(suggested) == pytest.approx(1, abs=2e-3) and suggested @ tilt[:, 2] > np.cos(np.radians(2))
     assert sum(found_at(poses.to_numpy()[:, 0] @ tilt, joints)) >= 4
 
@@ -251,6 +251,14 @@ def test_detect_does_not_take_tilted_scan_for_wrong_units(scene):
     assert "leans by" in warning
 
 
+def test_predict_does_not_take_scan_in_kilometers_for_crop(model):
+    rng = np.random.default_rng(0)
+    street = rng.uniform((-200, -200, -2), (200, 200, 1), (6000, 3)) / 1000
+    poses = lidarpose.predict(street, model=model)
+    assert not len(poses) and "multiply all coordinates by 1000" in poses.warnings[0]
+    assert len(lidarpose.predict(street[:5000], model=model)) == 1
+
+
 def test_detect_does_not_take_single_person_for_kilometers():
     standing = np.random.default_rng(0).normal([8, 0, 0], [0.08, 0.12, 0.4], (500, 3))
     assert not any("kilometers" in warning for warning in lidarpose.detect(standing).warnings)
@@ -285,6 +293,18 @@ def test_detect_suggests_no_up_axis_without_people(scene, fake):
     # in a room the up axis is ambiguous, so all are tried
     near = empty[np.abs(empty[:, :2]).max(1) < 6]
     assert lidarpose.detect(near).warnings == () and len(fake.calls) >= 6
+
+
+def test_detect_suggests_feet_that_find_people(scene):
+    boxes = lidarpose.detect(scene[0] / 0.3048)
+    (warning,) = boxes.warnings
+    assert not boxes
+    assert warning == "no people found in meters, but 5 if the units are feet: multiply all coordinates by 0.3048"
+
+
+def test_detect_reports_range_without_sensor(scene):
+    (warning,) = lidarpose.detect(scene[0], sensor_origin="unknown", max_range=20).warnings
+    assert warning == "the sensor position is unknown, so max_range (--range) is not applied"
 
 
 def test_detect_replaces_implausible_sensor_origin_by_unknown(scene, fake):
@@ -419,7 +439,7 @@ def test_detect_excludes_background(scene, tmp_path, fake):
     other = lidarpose.detect(points, background=static + [0, 0, 9.0])
     assert any("from this sensor" in warning for warning in other.warnings) and len(other) == len(PLACES)
     itself = lidarpose.detect(points, background=points)
-    assert len(itself) == 0 and "learned from this scan alone?" in itself.warnings[0]
+    assert len(itself) == 0 and "on which 100% of the points lie" in itself.warnings[0]
 
 
 # ---- errors and commands
@@ -455,16 +475,16 @@ def test_predict_rejects_detection_options_with_boxes_or_crop(model, file, fake,
                 lidarpose.predict(file, **given, **option, model=model)
     with pytest.raises(InputError, match="find is an option of the detection: omit it with boxes"):
         model.predict(scene[0], boxes=[], find=True)
-    # a small file is one person unless find is given
+    # a small file is one person unless find or an option of detection is given
     near = scene[0][np.linalg.norm(scene[0][:, :2] - PLACES[0], axis=1) < 1.5]
     np.save("small.npy", near)
     assert lidarpose.predict("small.npy", model=model)[0].box is None and not fake.calls
-    # detection options without a detection give a warning
-    for option in ({"min_score": 0.5}, {"background": file}):
-        (person,) = lidarpose.predict("small.npy", **option, model=model)
-        assert person.box is None and any(
-            "set find (--find) to detect people" in warning for warning in person.warnings
-        )
+    # options of detection imply find
+    for option in ({"min_score": 0.5}, {"max_range": 9}):
+        assert "find" in lidarpose.predict("small.npy", **option, model=model).timing_ms
+        with pytest.raises(InputError, match="options of the detection: omit them with find=False"):
+            lidarpose.predict("small.npy", **option, find=False, model=model)
+    assert lidarpose.predict(file, find=False, model=model)[0].box is None
     assert lidarpose.predict("small.npy", find=True, sensor_origin="unknown", model=model)[0].box is not None
 
 
@@ -488,7 +508,7 @@ def test_detect_and_predict_commands(file, capsys, fake, tmp_path):
     capsys.readouterr()
     assert main(["predict", file, *fast, "--background", "static.npy", "--picture", "--sensor-origin", "0,0,0.1"]) == 0
     warning, line = capsys.readouterr().err.strip().splitlines()
-    assert "learned from this scan alone?" in warning
+    assert "no people found off the background" in warning
     # the warning states the cause, so there is no further advice
     assert line == "no people found -> sweep.poses.json and sweep.poses.png"
     assert json.loads((tmp_path / "sweep.poses.json").read_text())["people"] == []
@@ -590,7 +610,13 @@ def test_verified_counts_max_people_without_repeats(monkeypatch):
     scene = detection_scene(5, 5)
     given = Detector(threads=1).detect(scene.points, scene.origin, limit=60), scene.points, scene.origin, {}, 0.5
     everybody = verification.verified(*given).boxes
-    monkeypatch.setattr(verification, "_without_repeats", lambda people, *others: people[1:])
+    surest = []
+
+    def without_surest(people, *others):
+        surest[:] = surest or [people[0][0]]
+        return [person for person in people if person[0] != surest[0]]
+
+    monkeypatch.setattr(verification, "_without_repeats", without_surest)
     (only,) = verification.verified(*given, 1).boxes
     np.testing.assert_array_equal(only.center, everybody[1].center)
 

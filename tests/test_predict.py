@@ -98,9 +98,10 @@ def test_predict_easy_person_is_upright_and_accurate(model, standing):
         lambda p: pd.DataFrame(p),
         lambda p: records(p),
         lambda p: Cloud(points=p.astype(float)),
+        lambda p: p.astype(object),
     ],
     ids="float64 big-endian rows tuples row-arrays fortran strided four-columns torch torch-grad table plain-table "
-    "records read-from-file".split(),
+    "records read-from-file objects".split(),
 )
 def test_predict_accepts_all_kinds_of_arrays(model, points, kind):
     np.testing.assert_allclose(model.predict(kind(points)).joints, model.predict(points).joints, atol=1e-4)
@@ -130,7 +131,7 @@ def test_predict_keeps_input(model, points):
         (np.zeros((3, 60)), "shape (3, 60): give points.T"),
         (np.zeros((2, 2, 2, 3)), "shape (2, 2, 2, 3)"),
         (np.array([[1, 2, "a"]]), "<U"),
-        (np.array([[1, 2, 3]], object), "objects"),
+        (np.array([[1, 2, "a"]], object), "not all numbers"),
         (np.array([[True, False, True]]), "bool"),
         (np.array([[1j, 2, 3]]), "complex"),
         (np.zeros(4, [("a", "f4"), ("b", "f4"), ("c", "f4")]), "expected columns x, y and z, got a b c"),
@@ -150,6 +151,12 @@ def test_predict_rejects_bad_arrays_in_one_line(model, bad, words):
     with pytest.raises(InputError) as raised:
         model.predict(bad)
     assert words in str(raised.value) and "\n" not in str(raised.value) and "points" in str(raised.value)
+
+
+def test_predict_of_one_scan_rejects_list_of_scans(points):
+    for predict in (lidarpose.predict, lidarpose.detect):
+        with pytest.raises(InputError, match=r"got a list of 2: one call per scan, or lidarpose.load\(\).predict"):
+            predict([points, points[:50]])
 
 
 def test_predict_drops_and_counts_nonfinite_and_huge_points(model, points):
@@ -298,6 +305,9 @@ def test_predict_warns_about_rounded_clouds_of_list(model, points):
     far = (points + [5e6, 0, 0]).astype(np.float32)
     warnings = [person.warnings for person in model.predict([points, far, far.astype(float) + 0.01])]
     assert [any("coordinates are rounded to 0.5 m" in line for line in own) for own in warnings] == [False, True, False]
+    half = model.predict((points + [500, 0, 0]).astype(np.float16))
+    assert "coordinates are rounded to 0.25 m, the precision of 16-bit floats" in half.warnings[0]
+    assert not any("rounded" in line for line in model.predict(np.rint(1000 * (points + 1))).warnings)
 
 
 def test_predict_is_accurate_in_map_coordinates(model, points):
@@ -825,7 +835,9 @@ def poses(model, points):
 
 def test_repr_of_predictor_and_results_is_short(model, poses):
     assert repr(model).startswith("Predictor('small', body26, onnx, tta=1")
-    assert repr(poses) == "Poses(2 of 3 people, smpl24)"
+    # the person's own warnings count
+    assert repr(poses) == "Poses(2 of 3 people, smpl24, 1 warning)"
+    assert repr(replace(poses, warnings=("a",))) == "Poses(2 of 3 people, smpl24, 2 warnings)"
     assert re.fullmatch(r"PersonPose\(smpl24, confidence [01]\.\d\d, 590 points\)", repr(poses[0]))
     assert repr(replace(poses[1], id="b")) == "PersonPose(id='b', no pose, 3 points, 1 warning)"
 
@@ -836,6 +848,11 @@ def test_notebooks_show_table_of_poses_and_picture_of_person(poses):
     assert isinstance(picture, bytes) and repr(picture) == f"<PNG, {len(picture):,} bytes>"
     named = replace(poses, people=(replace(poses[0], id="<b>"), poses[1]))
     assert "&lt;b&gt;" in named._repr_html_() and "no pose" in named._repr_html_()
+    assert "score" not in named._repr_html_()
+    rider = replace(poses[0], id=3, box=Box(center=np.zeros(3), size=np.ones(3), score=0.876, mounted=True))
+    table = replace(poses, people=(rider, poses[1]))._repr_html_()
+    assert "<th>score</th><th>mounted</th>" in table and "<td>0.88</td><td>yes</td>" in table
+    assert [panel.label for panel in rider.alone()._panels()[0]] == ["3 · score 0.88 · rides"]
 
 
 def test_poses_indexed_by_id_and_slice(poses):
@@ -844,6 +861,10 @@ def test_poses_indexed_by_id_and_slice(poses):
     assert isinstance(named[1:], type(poses)) and [p.id for p in named[1:]] == ["b", 7]
     with pytest.raises(KeyError, match="no person has the id 'c'"):
         named["c"]
+    with pytest.raises(
+        IndexError, match=r"no person at 7: there are 3 people, counted from 0, and ids are text, \['7'\]"
+    ):
+        named[7]
 
 
 def test_poses_to_numpy_and_to_dataframe(poses, tmp_path):

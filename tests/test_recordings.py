@@ -103,6 +103,9 @@ def test_tracks_follow_walking_people(tracked):
         track = min(first, key=lambda id: np.hypot(*(first[id][:2] - at)))
         moved = (last[track] - first[track])[:2]
         assert np.hypot(*(first[track][:2] - at)) < 0.25 and np.hypot(*(moved - step * (FRAMES - 1))) < 0.1
+        velocities = [person["velocity"] for line in lines for person in line["people"] if person["track"] == track]
+        # unknown at the first sighting
+        assert velocities[0] is None and np.linalg.norm(velocities[-1] - np.append(step, 0) * 10) < 0.5
     for person in (person for line in lines for person in line["people"]):
         assert person["id"] == person["track"] and person["filled"] is False
         assert len(person["joints"]) == len(person["spread"]) == 24 and person["num_points"] > 50
@@ -112,7 +115,9 @@ def test_untracked_frame_equals_prediction_of_single_file(drive, folder, clouds,
     lines = run(drive, "--every", 3, "--end", 0.4, "--out", folder / "plain.jsonl")
     assert [line["frame"] for line in lines] == [0, 3]
     alone = lidarpose.predict(drive / "frame_8.npy", model=model).to_dict()
-    assert [person | {"track": None, "filled": False} for person in alone["people"]] == lines[1]["people"]
+    assert [person | {"track": None, "velocity": None, "filled": False} for person in alone["people"]] == lines[1][
+        "people"
+    ]
     assert lines[1]["people"][0]["score"] > 0.8
 
 
@@ -342,6 +347,11 @@ def test_csv_and_parquet_have_one_row_per_person_and_joint(tracked, tmp_path):
     assert (row.frame, row.frame_id, row.track, row.joint) == (line["frame"], line["id"], person["track"], "pelvis")
     assert [row.x, row.y, row.z] == person["joints"][0] and row.spread == person["spread"][0]
     np.testing.assert_allclose(csv[["x", "y", "z", "confidence"]], parquet[["x", "y", "z", "confidence"]])
+    assert [row.velocity_x, row.velocity_y, row.velocity_z] == person["velocity"]
+    assert lidarpose.read_poses(line)[-1].velocity.tolist() == person["velocity"]
+    # as older versions wrote it
+    older = {key: value for key, value in person.items() if key != "velocity"}
+    assert lidarpose.read_poses(line | {"people": [older]})[0].velocity is None
     # the world frame is known for some frames only
     moved = [in_world(line | {"T_world_sensor": np.eye(4).tolist()}) if line["frame"] % 2 else line for line in lines]
     result_files.write_result(tmp_path / "world.csv", moved)
@@ -374,8 +384,10 @@ def test_in_world_converts_box_heading(up):
     R_level_input, R_world_level = UP_AXES[up], rotation_about("z", 0.4)
     T_world_sensor = rigid_transform(R_world_level @ R_level_input, np.array([1.0, 2.0, 3.0]))
     box = {"center": [4.0, 5.0, 6.0], "size": [0.5, 0.6, 1.8], "yaw": 0.3}
-    line = {"T_world_sensor": T_world_sensor.tolist(), "people": [{"joints": None, "box": box}]}
-    moved = in_world(line, up)["people"][0]["box"]
+    person = {"joints": None, "box": box, "velocity": [1, 2, 3]}
+    person = in_world({"T_world_sensor": T_world_sensor.tolist(), "people": [person]}, up)["people"][0]
+    moved = person["box"]
+    np.testing.assert_allclose(person["velocity"], R_world_level @ R_level_input @ [1, 2, 3], atol=1e-4)
     assert abs(moved["yaw"] - 0.7) < 1e-9
     np.testing.assert_allclose(moved["center"], R_world_level @ R_level_input @ [4, 5, 6] + [1, 2, 3], atol=1e-4)
 
@@ -583,10 +595,10 @@ def test_summary_merges_warnings_that_differ_in_numbers():
     summary = output.Summary()
     for up in ("-0.342,0.003,0.94", "-0.341,-0.002,0.94", "-0.342,0,0.94", "0.342,0.003,-0.94"):
         summary.add(
-            {"people": [], "error": None, "warnings": [f"the ground leans by 20 degrees: confirm it with up={up}"]}
+            {"people": [], "error": None, "warnings": [f"the ground leans by 20 degrees: confirm it with --up {up}"]}
         )
     (line,) = summary.warning_lines(8)
-    assert line.startswith("4 frames: ") and line.endswith("up=-0.342,0.003,0.94")
+    assert line.startswith("4 frames: ") and line.endswith("--up -0.342,0.003,0.94")
     summary.add({"people": [], "error": None, "warnings": ["under 5 points"]})
     assert len(summary.warning_lines(8)) == 2
 
@@ -823,7 +835,16 @@ def test_frames_copy_sensor_poses_and_make_rotations_exact():
     frame = Frame(points=np.zeros((0, 3)), index=0, id="a", T_world_sensor=T, origin=origin)
     T[0, 3] = origin[0] = 7.0
     np.testing.assert_allclose(frame.T_world_sensor[:3, :3], rotation_about("z", 0.3), atol=1e-12)
+    assert repr(frame) == "Frame(0, 'a', 0 points)"
+    assert repr(replace(frame, time=1.7e9 + 0.2)) == "Frame(0, 'a', 0 points, t=1700000000.2 s)"
     assert frame.T_world_sensor[0, 3] == frame.origin[0] == 0.0
+
+
+def test_first_frame_of_paths_has_warnings_about_source(model, tmp_path):
+    for name in "ab":
+        np.save(tmp_path / f"{name}.npy", np.random.default_rng(0).normal(scale=0.3, size=(99, 3)))
+    first, second = lidarpose.predict_recording(tmp_path, crop=True, model=model)
+    assert "has no times: read as 10 frames per second" in first.poses.warnings[0] and not second.poses.warnings
 
 
 def test_predict_recording_checks_generators_and_their_options(model, tmp_path):

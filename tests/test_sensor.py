@@ -37,6 +37,10 @@ def test_unknown_sensor_suggests_nearest_name():
         sensor("vlp32c")
 
 
+def test_repr_of_sensor_is_short():
+    assert repr(sensor("os1-64")) == "Sensor('os1-64', 64 rings, 1024 columns)"
+
+
 def test_sensor_is_frozen():
     s = sensor("vlp-16")
     with pytest.raises(dataclasses.FrozenInstanceError):

@@ -165,6 +165,11 @@ BAD = {
     "short motion": (["-n", "2", "--clips", "--motion", "../short.npz"], "no clip lasts 1.6 s"),
     "nobody seen": (["-n", "3", "--sensor", "../near.json"], "sensors such as near"),
     "scene of streets": (["-n", "1", "--scenes", "--scene", "paper"], "their own scene"),
+    "sparse": (["-n", "1", "--sensor", "os1-64", "--set", "sparse=1"], "sparse scans with sensors of its own: omit it"),
+    "clips": (
+        ["-n", "1", "--clips", "--set", "merged=1,crowded=1"],
+        "clips are scanned in one way only: omit merged, crowded",
+    ),
     "none": (["-n", "0"], "the number of people must be a whole number of at least 1, got 0"),
     "negative": (["-n", "-3"], "got -3"),
     "sensor": (["-n", "5", "--sensor", "os1-129"], "did you mean os1-128"),

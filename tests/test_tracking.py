@@ -109,13 +109,14 @@ def test_predicted_extrapolates_walking_people():
     np.testing.assert_allclose(soon.size, [0.6, 0.6, 1.75])
     assert abs(np.angle(np.exp(1j * (soon.yaw - np.pi + 0.1)))) < 0.15
     assert 0 < soon.position_sd < 0.15 < later.position_sd
+    np.testing.assert_allclose(soon.velocity, [1.4, 0, 0], atol=0.2)
     assert tracker.predicted(10.0) == []
 
 
 def test_low_score_box_is_predicted_after_second_detection():
     tracker = Tracker()
     assert tracker.update(0.0, [person(0, score=0.3), person(5, score=0.95), person(9)]) == [0, 1, 2]
-    assert [state.id for state in tracker.predicted(0.1)] == [1, 2]
+    assert [(state.id, state.velocity) for state in tracker.predicted(0.1)] == [(1, None), (2, None)]
     assert tracker.update(0.1, [person(0, score=0.3)]) == [0]
     assert [state.id for state in tracker.predicted(0.2)] == [0, 1, 2]
     # seen again after a second, without frames in between or with one

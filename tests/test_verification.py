@@ -88,7 +88,7 @@ def test_verification_features_and_score_bound(monkeypatch):
             assert (verification.final_score(possible, header) <= highest).all()
 
 
-def fitted(monkeypatch, scores, places, mounted=0.0, sure=0.5, known=None):
+def fitted(monkeypatch, scores, places, mounted=0.0, sure=0.5, known=None, fit=verification._fit_boxes):
     """Boxes of standing people at places (x, y), fitted to a grid of points around all of them."""
     network = SimpleNamespace(header=SimpleNamespace(skeleton=HUMAN15))
     monkeypatch.setattr(verification, "bundled_backend", lambda name: network)
@@ -99,7 +99,7 @@ def fitted(monkeypatch, scores, places, mounted=0.0, sure=0.5, known=None):
         scores=np.array(scores), logits=np.array(scores), mounted=np.broadcast_to(mounted, len(scores)), joints=joints,
         pelvises=joints[:, HUMAN15.index("pelvis")], near_rows=[np.arange(len(points))] * len(scores),
     )  # fmt: skip
-    people = verification._fit_boxes(detections, points, sure, known or {})
+    people = fit(detections, points, sure, known or {})
     for _, box, rows in people:
         if not known:
             np.testing.assert_array_equal(rows, np.flatnonzero(box.contains(points)))
@@ -136,6 +136,18 @@ def test_fit_boxes_narrows_boxes_beside_neighbors(scores, narrow, monkeypatch):
     people = fitted(monkeypatch, scores, [(0, 0), (0, 0.6)])
     widths = [0.64 + 2 * (0.1 if is_narrow else 0.15) for is_narrow in narrow]
     np.testing.assert_allclose([box.size[1] for _, box, _ in people], widths, atol=1e-3)
+
+
+def test_dropped_duplicates_do_not_narrow_boxes(monkeypatch):
+    def without(people, *_):
+        return [person for person in people if person[0] != 1]
+
+    def distinct(places, points, sure, known):
+        return verification._distinct_people(places, points, None, sure, known)
+
+    monkeypatch.setattr(verification, "_without_repeats", without)
+    ((row, box, _),) = fitted(monkeypatch, [0.9, 0.6], [(0, 0), (0, 0.6)], fit=distinct)
+    assert row == 0 and box.size[1] == pytest.approx(0.64 + 2 * 0.15, abs=1e-3)
 
 
 def test_fit_boxes_keeps_known_box(monkeypatch):

@@ -350,6 +350,10 @@ class LabeledSample(Sample):
     split: str | None = None
     info: PersonInfo | None = None
 
+    def __repr__(self) -> str:
+        origin = f"{self.sequence!r}, frame {self.frame}, track {self.track!r}"
+        return f"LabeledSample({origin}, {len(self.points):,} points)"
+
     def __post_init__(self):
         super().__post_init__()
         if self.pose is None or self.joint_labels.shape != (len(self.pose.skeleton),):

@@ -21,7 +21,7 @@ _ADVICE = (
     "treats all points as one person"
 )
 # parts of the warnings that state why no person was detected: wrong axes, units or background
-_CAUSES = ("try --up", "all coordinates by", "on the background")
+_CAUSES = ("try --up", "all coordinates by", "the background")
 # maximum characters of an id in a warning
 _LONGEST_ID = 40
 
@@ -55,7 +55,7 @@ $ lidarpose predict street.mcap --every 2 --format parquet
 --crop  the file holds one person (assumed under 4 m across)
 {_FRAME.replace("ORIGIN", "unknown for one person, else 0,0,0")}
 [detection, without boxes]
---find  detect people even in a file under 4 m across
+--find  detect people even in a file under 4 m across, as with any of the options below
 {_SEARCH}
 [output]
 --out PATH = .  a folder, or a .json or .csv file (of a recording .jsonl, .csv or .parquet); - prints the JSON
@@ -151,7 +151,9 @@ def prediction_options(options: argparse.Namespace) -> dict[str, Any]:
     from lidarpose.inference.predictor import load
 
     choices = {name: getattr(options, name) for name in ("backend", "device", "decode", "tta")}
-    scan_options = {name: getattr(options, name) for name in ("boxes", "calib", "crop", "find", "skeleton")}
+    scan_options = {name: getattr(options, name) for name in ("boxes", "calib", "crop", "skeleton")}
+    # without --find, the input decides
+    scan_options["find"] = options.find or None
     return scan_options | _reading(options) | {"model": partial(load, options.weights, **choices)}
 
 

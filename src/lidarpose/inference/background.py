@@ -25,6 +25,8 @@ _VOXEL = 0.15
 _SHARE, _PARTS = 0.5, 3
 # number of scans that are read; more do not improve the result
 _MOST_SCANS = 60
+# with fewer scans, most people are part of the background
+_FEW_SCANS = 5
 # number of voxels on each axis
 _SPAN = 1 << 20
 
@@ -54,6 +56,12 @@ def learn_background(
         InputError: no scans, no readable scan, or an unreadable file among those listed.
     """
     sources = _sources(scans, columns, topic, meta)
+    if len(sources) < _FEW_SCANS:
+        few = counted(len(sources), "scan")
+        warnings.warn(
+            f"background: learned from {few}, so people in them become background: give ten seconds or more",
+            stacklevel=2,
+        )
     grid: _Grid | None = None
     problems: list[InputError] = []
     static_voxels, eighths = None, np.zeros(0, np.int64)

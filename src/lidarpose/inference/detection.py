@@ -41,6 +41,8 @@ _FEW_COPIES = 0.01
 _ENOUGH_FOR_UP = 250_000
 # minimum fraction of a scan's points on its background; below it, the background belongs to another sensor or frame
 _LEAST_STATIC = 0.2
+# one foot, m; a sensor lower than this above the ground, m, is not in feet
+_FOOT, _LOW_SENSOR = 0.3048, 3.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -144,23 +146,33 @@ def find_people(scan: Scan, search: Search) -> Scan:
 
 
 def search_alone(scan: Scan, search: Search) -> Scan:
-    """`find_people` for a single scan. If no people are found, it also tries `other_up_axis`."""
+    """`find_people` for a single scan. If no people are found, it adds `why_nobody`."""
     places = detect_places(scan, search)
     result = verify_people(places, search)
-    if result.boxes or not (hint := other_up_axis(places, search)):
-        return result
-    # other warnings of the search would follow from the wrong axis
-    return replace(result, warnings=(*scan.warnings, hint))
+    return result if result.boxes else replace(result, warnings=why_nobody(places, search, result.warnings))
 
 
-def other_up_axis(places: "DetectedScan", search: Search) -> str | None:
-    """For a scan without people: a warning for the user if people are found with another up axis, else None."""
+def why_nobody(places: "DetectedScan", search: Search, warnings: tuple[str, ...]) -> tuple[str, ...]:
+    """The warnings of a scan without people, with a likely reason: another up axis, feet or the background."""
+    if places.detections is None:
+        return warnings
+    other_axis = flat_along_another_axis(places.scan)
+    # in wrong units, no people are found with any up axis
+    is_scaled = scan_unit_warning(places.level, len(places.given.points)) is not None
+    if (other_axis or not is_scaled) and (hint := _other_up_axis(places, search)):
+        # other warnings of the search would follow from the wrong axis
+        return (*places.given.warnings, hint)
+    if other_axis or is_scaled:
+        return warnings
+    hint = _feet(places, search) or _much_background(places)
+    return (*warnings, hint) if hint else warnings
+
+
+def _other_up_axis(places: "DetectedScan", search: Search) -> str | None:
+    """A warning for the user if people are found with another up axis."""
     input_scan, detections = places.given, places.detections
     if detections is None or detections.has_ground and flat_axis(places.scan.points) == input_scan.upright_axis:
         # outdoors: the axis is right
-        return None
-    if scan_unit_warning(places.level, len(input_scan.points)) and not flat_along_another_axis(places.scan):
-        # in wrong units, no people are found with any up axis
         return None
     other_axes = [up for up in UP_AXES if up != input_scan.up]
     boxes = {up: find_people(replace(input_scan, up=up), search).boxes or [] for up in other_axes}
@@ -169,6 +181,30 @@ def other_up_axis(places: "DetectedScan", search: Search) -> str | None:
         return None
     people = counted(len(boxes[best_axis]), "person", "people")
     return f"no people found with up {input_scan.up}, but {people} with up {best_axis}: try --up {best_axis}"
+
+
+def _feet(places: "DetectedScan", search: Search) -> str | None:
+    """A warning for the user if people are found with feet as the unit. Only where the sensor is higher above the
+    ground than most, since a third of a scan in meters may have something of a person's shape."""
+    scan, origin, detections = places.given, places.scan.level_origin, places.detections
+    if detections is None or origin is not None and origin[2] - detections.ground.at(origin[None, :2]) < _LOW_SENSOR:
+        return None
+    feet = replace(scan, points=scan.points * _FOOT, origin=None if scan.origin is None else scan.origin * _FOOT)
+    background = None if search.background is None else search.background * _FOOT
+    boxes = find_people(feet, replace(search, background=background)).boxes
+    if not boxes:
+        return None
+    return f"no people found in meters, but {len(boxes)} if the units are feet: multiply all coordinates by {_FOOT}"
+
+
+def _much_background(places: "DetectedScan") -> str | None:
+    """A warning for the user that people may be part of the background."""
+    if places.moving is None or (static_share := 1 - places.moving.mean()) < _LEAST_STATIC:
+        return None
+    return (
+        f"no people found off the background, on which {static_share:.0%} of the points lie: if people are missing, "
+        "learn the background from ten seconds or more"
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -207,7 +243,7 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
         direction = np.round(up @ scan.R_level_input, 3)
         warnings.append(
             f"the ground leans by {degrees:.0f} degrees, so the sensor is assumed to be tilted: confirm it with "
-            f"up={','.join(f'{value:g}' for value in direction)}"
+            f"--up {','.join(f'{value:g}' for value in direction)}"
         )
         scan = replace(scan, up=up_text(up @ scan.R_level_input))
         level = _leveled(scan)
@@ -219,6 +255,8 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
         # start again: with an unknown sensor, thinning keeps other points, and other points determine the up direction
         scan_warnings = full_scan.warnings if frame_warning else (*full_scan.warnings, warning)
         return replace(detect_places(replace(full_scan, origin=None, warnings=scan_warnings), search), given=input_scan)
+    if origin is None and search.max_range != MAX_RANGE:
+        warnings.append("the sensor position is unknown, so max_range (--range) is not applied")
     is_moving = None
     if search.background is not None:
         is_moving = ~is_static(scan.points, search.background)
@@ -226,11 +264,6 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
             warnings.append(
                 f"only {static_share:.0%} of the points lie on the background: is the background "
                 "from this sensor and in this frame?"
-            )
-        elif not is_moving.any():
-            warnings.append(
-                "all points lie on the background, so no people can be found: was it learned from this scan alone? "
-                "record for ten seconds or more"
             )
     detector = search.detector or _detector()
     detections = detector.detect(level, origin, max_range=search.max_range, limit=MOST_POSED, moving=is_moving)

@@ -118,6 +118,11 @@ def as_points(points: Any, what: str = "points") -> np.ndarray:
     """
     if isinstance(points, str | os.PathLike):
         raise InputError(f"{what} must be an (n, 3) array, got a path: use lidarpose.predict({str(points)!r})")
+    if isinstance(points, list | tuple) and points and getattr(points[0], "ndim", 0) > 1:
+        raise InputError(
+            f"{what} must be one (n, 3) array, got a list of {len(points)}: one call per scan, or "
+            "lidarpose.load().predict([...]) for crops"
+        )
     is_records = getattr(getattr(points, "dtype", None), "names", None) is not None
     points = _by_name(points, what)
     try:
@@ -131,10 +136,12 @@ def as_points(points: Any, what: str = "points") -> np.ndarray:
         frame = ", its points are in .points" if hasattr(points, "points") else ""
         raise InputError(f"{what} must be an (n, 3) array of numbers, got {type(points).__name__}{frame}")
     if array.dtype == object:
-        raise InputError(
-            f"{what} must be an (n, 3) array of numbers, got {type(points).__name__} of objects, shape {array.shape}: "
-            "give many people as a list of arrays"
-        )
+        if array.ndim != 2 or not all(isinstance(value, Real) for value in array.ravel().tolist()):
+            raise InputError(
+                f"{what} must be an (n, 3) array of numbers, got {type(points).__name__} of objects, not all numbers, "
+                f"shape {array.shape}: give columns of numbers only, and many people as a list of arrays"
+            )
+        array = array.astype(float)
     if array.dtype.kind not in "fiu":
         raise InputError(f"{what} must be an (n, 3) array of numbers, got {array.dtype} of shape {array.shape}")
     looks_transposed, looks_depth = is_transposed(array.shape), is_image(array.shape)
@@ -207,17 +214,23 @@ def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
 
 
 def rounding_warning(points: np.ndarray) -> str | None:
-    """A warning if points (n, 3) m are rounded too coarsely to show a person, as large map coordinates in 32 bits
+    """A warning if points (n, 3) m are rounded too coarsely to show a person, as large map coordinates in 16 or 32 bits
     are."""
-    # a quantile ignores stray points; a subsample suffices for a large map
-    some = np.abs(points[:: max(len(points) // _LOOKED_AT, 1)])
-    step = float(np.spacing(np.float32(np.quantile(some, 0.9)))) if len(points) else 0.0
-    if step < _COARSE or not np.array_equal(points.astype(np.float32), points):
+    if not len(points):
         return None
-    return (
-        f"coordinates are rounded to {step:g} m, the precision of 32-bit floats at this magnitude: subtract an "
-        "offset before saving"
-    )
+    # a quantile ignores stray points; a subsample suffices for a large map
+    some = points[:: max(len(points) // _LOOKED_AT, 1)]
+    magnitude = np.quantile(np.abs(some), 0.9)
+    for bits, kind in ((16, np.float16), (32, np.float32)):
+        with np.errstate(all="ignore"):
+            step, is_rounded = float(np.spacing(kind(magnitude))), np.array_equal(some.astype(kind), some)
+        # whole numbers are not rounded to 16 bits, but in another unit
+        if step >= _COARSE and is_rounded and (bits == 32 or (some % 1).any()):
+            return (
+                f"coordinates are rounded to {step:g} m, the precision of {bits}-bit floats at this magnitude: "
+                "subtract an offset before saving"
+            )
+    return None
 
 
 def only_returns(points: np.ndarray) -> tuple[np.ndarray, list[str]]:

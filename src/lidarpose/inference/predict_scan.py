@@ -12,6 +12,7 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, rotation_from_up, up_text
+from lidarpose.inference.checks import scan_unit_warning
 from lidarpose.inference.detection import DetectedScan, Search, search_alone, search_options, verify_people
 from lidarpose.inference.inputs import as_origin
 from lidarpose.inference.known_places import KnownPlaces
@@ -28,6 +29,10 @@ if TYPE_CHECKING:
 
 # an input smaller than this is treated as a crop of one person, m
 CROP_SIZE = 4.0
+# a smaller one with more points is a whole scan if the unit seems wrong
+_MANY_POINTS = 5000
+# the options of `predict` that choose detection
+_SEARCH_OPTIONS = "min_score, max_range, max_people and background"
 # maximum difference of equal up directions, as unit vectors: `detect` rounds them to three decimals
 _SAME_UP = 2e-3
 # maximum difference of up directions along the same axis: 45 degrees, the limit for tilted scans
@@ -40,7 +45,7 @@ def predict(
     boxes: "str | os.PathLike | dict | Box | list | tuple | np.ndarray | Poses | None" = None,
     calib: str | os.PathLike | None = None,
     crop: bool = False,
-    find: bool = False,
+    find: bool | None = None,
     min_score: float | None = None,
     max_range: float | None = None,
     max_people: int | None = None,
@@ -55,7 +60,8 @@ def predict(
     """Predicts the poses of all people in a point file or an array, in the coordinate frame of the input.
 
     People come from `boxes`, from detection (`find`), or the input is a crop of one person (`crop`). If none of these
-    is given, an input less than 4 m across is treated as a crop, and people are detected in any other input.
+    is given, people are detected if an option of detection is given, or if the input is at least 4 m across or looks
+    like a whole scan in kilometers. Any other input is treated as a crop.
 
     Args:
         path: path of a point file, or points (n, 3+) m in any frame.
@@ -64,9 +70,9 @@ def predict(
             a direction; length and width are horizontal.
         calib: calibration file of a KITTI label. None means `../calib/N.txt` relative to the label.
         crop: whether the input is a crop of one person.
-        find: whether to detect people, regardless of the size of the input.
+        find: whether to detect people, regardless of the size of the input. None means as above.
         min_score: score threshold of detection, see `detect`. This and the following three options are for detection
-            only: they are rejected with `boxes` or `crop`.
+            only: they are rejected with `boxes`, `crop` or `find=False`.
         max_range: maximum horizontal distance of detected people from the sensor, m. None means 40.
         max_people: maximum number of detected people, see `detect`.
         background: static background that is not searched, see `detect`.
@@ -91,7 +97,10 @@ def predict(
         InputError: input that cannot be read or options that exclude each other; the message says what to do.
     """
     options = (min_score, max_range, max_people, background)
-    check_choice(boxes, crop, find or any(option is not None for option in options), calib)
+    is_searched = any(option is not None for option in options)
+    check_choice(boxes, crop, find or is_searched, calib)
+    if find is False and is_searched:
+        raise InputError(f"{_SEARCH_OPTIONS} are options of the detection: omit them with find=False")
     start = time.perf_counter()
     input_boxes = None if boxes is None else read_boxes(boxes, calib=calib)
     if up is None:
@@ -102,10 +111,8 @@ def predict(
         check_up(input_boxes, up, most=_SAME_AXIS)
     scan = Scan(points=np.zeros((0, 3)), boxes=input_boxes, origin=as_origin(sensor_origin), up=up_text(up))
     scan = read_scan(scan, path, columns)
-    find = find or boxes is None and not crop and (not len(scan.points) or is_wide(scan))
-    if not find and any(option is not None for option in options):
-        note = f"treated as one person because under {CROP_SIZE:g} m across: set find (--find) to detect people"
-        scan = replace(scan, warnings=(*scan.warnings, note))
+    if find is None:
+        find = is_searched or boxes is None and not crop and (not len(scan.points) or is_whole(scan))
     if sensor_origin is None and (find or boxes is not None):
         scan = replace(scan, origin=np.zeros(3))
     read_end = time.perf_counter()
@@ -183,11 +190,13 @@ def predict_scan(
     return scan, replace(poses, timing_ms={name: seconds * 1e3 for name, seconds in times.items()} | poses.timing_ms)
 
 
-def is_wide(scan: Scan) -> bool:
-    """Whether the scan is larger than a crop of one person."""
+def is_whole(scan: Scan) -> bool:
+    """Whether the scan is larger than a crop of one person, or has more points and is too small in meters."""
     # do not rotate a map of 10^8 points unless needed
     upright_points = scan.points if scan.up in UP_AXES else scan.clouds()[0]
-    return bool(np.ptp(upright_points, axis=0).max() >= CROP_SIZE)
+    if np.ptp(upright_points, axis=0).max() >= CROP_SIZE:
+        return True
+    return len(upright_points) > _MANY_POINTS and scan_unit_warning(upright_points, len(upright_points)) is not None
 
 
 def check_up(boxes: Boxes, up: str | Sequence[float], *, most: float = _SAME_UP) -> None:
@@ -207,5 +216,4 @@ def check_choice(boxes: object, crop: bool, searched: bool, calib: object) -> No
     if boxes is not None and crop:
         raise InputError("expected boxes or a crop, got both: a crop contains one person, so omit the boxes")
     if searched and (boxes is not None or crop):
-        options = "find, min_score, max_range, max_people and background"
-        raise InputError(f"{options} are options of the detection: omit them with boxes or a crop")
+        raise InputError(f"find, {_SEARCH_OPTIONS} are options of the detection: omit them with boxes or a crop")

@@ -108,4 +108,6 @@ def _person(entry: dict[str, Any], skeleton: Skeleton, up: str, model: dict) -> 
         warnings=tuple(map(str, entry["warnings"])),
         model=model,
         up=up,
+        # recordings of older versions have none
+        velocity=None if entry.get("velocity") is None else np.array(entry["velocity"], float).reshape(3),
     )

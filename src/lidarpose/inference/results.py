@@ -51,6 +51,7 @@ class PersonPose:
         model: name, version and settings of the network.
         up: up axis of the input frame, used for drawing.
         stored_points: number of points of the crop if `points` does not hold them, see `read_poses`.
+        velocity: (3,) m/s of a tracked person over ground, along the axes of the input frame; None if unknown.
     """
 
     pose: Pose | None
@@ -62,6 +63,7 @@ class PersonPose:
     model: dict = field(default_factory=dict)
     up: str = "z"
     stored_points: int | None = None
+    velocity: np.ndarray | None = None
 
     @property
     def has_pose(self) -> bool:
@@ -247,21 +249,30 @@ class Poses(Sequence[PersonPose]):
             if not matches:
                 raise KeyError(f"no person has the id {index!r}: ids are {[person.id for person in self.people]}")
             return matches[0]
-        return self.people[index]
+        try:
+            return self.people[index]
+        except IndexError:
+            expected = f"there are {counted(len(self), 'person', 'people')}, counted from 0"
+            raise IndexError(f"no person at {index}: {expected}, and ids are text, [{str(index)!r}]") from None
 
     def __repr__(self) -> str:
         num_posed = sum(person.has_pose for person in self.people)
         source = "" if self.source is None else f", from {self.source!r}"
-        return f"Poses({num_posed} of {len(self)} people, {self.skeleton.name}{source}{_warning_count(self.warnings)})"
+        warnings = [*self.warnings, *(warning for person in self.people for warning in person.warnings)]
+        return f"Poses({num_posed} of {len(self)} people, {self.skeleton.name}{source}{_warning_count(warnings)})"
 
     def _repr_html_(self) -> str:
-        rows = [("th", ("id", "points", "confidence", "warnings"))]
+        known = [name for name in ("score", "mounted") if any(getattr(p, name) is not None for p in self.people)]
+        rows = [("th", ("id", "points", "confidence", *known, "warnings"))]
         for person in self.people:
             confidence = "no pose" if person.pose is None else _mean(person.pose.confidence)
             name = "" if person.id is None else str(person.id)
-            rows.append(("td", (name, f"{person.num_points:,}", confidence, "; ".join(person.warnings))))
-        cells = ("".join(f"<{tag}>{escape(cell)}</{tag}>" for cell in row) for tag, row in rows)
-        return f"<p>{escape(repr(self))}</p><table>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
+            values = {"score": "" if person.score is None else f"{person.score:.2f}"}
+            values["mounted"] = {None: "", True: "yes", False: "no"}[person.mounted]
+            cells = (name, f"{person.num_points:,}", confidence, *(values[name] for name in known))
+            rows.append(("td", (*cells, "; ".join(person.warnings))))
+        lines = ("".join(f"<{tag}>{escape(cell)}</{tag}>" for cell in row) for tag, row in rows)
+        return f"<p>{escape(repr(self))}</p><table>{''.join(f'<tr>{line}</tr>' for line in lines)}</table>"
 
     def to_numpy(self) -> np.ndarray:
         """Joint positions (N, J, 3) m, NaN for people without a pose."""
@@ -419,9 +430,10 @@ def _box_around(person: PersonPose) -> Box | None:
 
 
 def _label(person: PersonPose) -> str:
-    """The id, and the score if there is one."""
+    """The id, the score if there is one, and whether the person rides."""
     words = [] if person.id is None else [str(person.id)]
-    return " · ".join(words if person.score is None else [*words, f"score {person.score:.2f}"])
+    words += [] if person.score is None else [f"score {person.score:.2f}"]
+    return " · ".join([*words, "rides"] if person.mounted else words)
 
 
 def _rounded(values: np.ndarray | None, digits: int) -> list:

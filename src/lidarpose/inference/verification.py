@@ -221,8 +221,8 @@ def verified(
         places = _add_people_beside(places, known_boxes, points, origin, header, least_score, max_people, detect_beside)
         thresholds = np.append(thresholds, np.full(len(places.scores) - len(thresholds), least_score))
     places.pelvises[places.scores < thresholds] = np.nan
-    people = _fit_boxes(places, points, header.get("default_score", least_score), known_boxes)
-    people = _without_repeats(people, places, points, origin)[:max_people]
+    people = _distinct_people(places, points, origin, header.get("default_score", least_score), known_boxes)
+    people = people[:max_people]
     kept_rows = [row for row, _, _ in people]
     return VerifiedPeople(
         boxes=[replace(box, id=number) for number, (_, box, _) in enumerate(people)],
@@ -334,6 +334,24 @@ def _body_rows(rows: np.ndarray, points: np.ndarray, joints: np.ndarray) -> np.n
     # a cheap test first: it leaves far fewer points
     rows = rows[((near_points > low) & (near_points < high)).all(1)]
     return rows[distance_to_segments(points[rows], joints[starts], joints[ends]) < _BODY]
+
+
+def _distinct_people(
+    places: _ScoredDetections,
+    points: np.ndarray,
+    origin: np.ndarray | None,
+    neighbor_score: float,
+    known_boxes: dict[int, Box],
+) -> list[_FittedBox]:
+    """The people from `_fit_boxes` without duplicates. Pelvises of all other detections become NaN, and boxes that were
+    shrunk to exclude them are fitted again."""
+    while True:
+        num_fitted = len(surest_rows(places.scores, places.pelvises, places.logits))
+        people = _fit_boxes(places, points, neighbor_score, known_boxes)
+        people = _without_repeats(people, places, points, origin)
+        if len(people) == num_fitted:
+            return people
+        places.pelvises[np.setdiff1d(np.arange(len(places.pelvises)), [row for row, _, _ in people])] = np.nan
 
 
 def _without_repeats(

@@ -184,6 +184,8 @@ def _entries(content: object) -> list | tuple:
     content = content.tolist() if isinstance(content, np.ndarray) else content
     if not isinstance(content, list | tuple):
         raise FormatError('{"people": [...]} or a list of people', _show(content), "write the boxes in this form")
+    if _as_numbers(content, 7) is not None:
+        raise FormatError(_FORM, "one row of numbers", "put it in a list, [row]")
     return content
 
 

@@ -56,6 +56,9 @@ class Sensor:
     ring_lags: np.ndarray | None = None
     turn_time: float = 0.1
 
+    def __repr__(self) -> str:
+        return f"Sensor({self.name!r}, {self.rows} rings, {self.columns} columns)"
+
     def __post_init__(self):
         elevations = _frozen("elevations", self.elevations, _ANGLES)
         if not len(elevations):

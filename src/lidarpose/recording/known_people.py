@@ -134,8 +134,18 @@ class KnownPeople:
         self._verified = {
             id: verification for id, verification in self._verified.items() if time - verification.time < _FORGOTTEN
         }
+        # rotated to the axes of the sensor frame
+        velocities = {
+            state.id: state.velocity @ T_fixed_sensor[:3, :3]
+            for state in self._tracker.predicted(time)
+            if state.velocity is not None
+        }
         people = zip(ids, poses, sensor_boxes, strict=True)
-        return tuple(replace(person, id=id, box=replace(box, id=id)) for id, person, box in people if id >= 0)
+        return tuple(
+            replace(person, id=id, box=replace(box, id=id), velocity=velocities.get(id))
+            for id, person, box in people
+            if id >= 0
+        )
 
     def _steadied(self, time: float, people: tuple[PersonPose, ...], T_fixed_sensor: np.ndarray) -> tuple:
         """Smooths poses with the past of their tracks."""

@@ -13,9 +13,9 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_from_up, up_text
-from lidarpose.inference.detection import DetectedScan, detect_places, least_score, other_up_axis, search_options
+from lidarpose.inference.detection import DetectedScan, detect_places, least_score, search_options, why_nobody
 from lidarpose.inference.inputs import as_origin, as_points, only_returns
-from lidarpose.inference.predict_scan import check_choice, check_up, is_wide, predict_scan, predictor_of
+from lidarpose.inference.predict_scan import check_choice, check_up, is_whole, predict_scan, predictor_of
 from lidarpose.inference.predictor import Predictor
 from lidarpose.inference.results import Poses
 from lidarpose.inference.scan import Scan
@@ -59,7 +59,9 @@ class FramePoses:
         del document["timing_ms"]
         people = []
         for person, entry in zip(self.poses, document.pop("people"), strict=True):
-            people.append(entry | {"track": person.id if self.is_tracked else None, "filled": False})
+            velocity = None if person.velocity is None else person.velocity.round(4).tolist()
+            track = person.id if self.is_tracked else None
+            people.append(entry | {"track": track, "velocity": velocity, "filled": False})
         T_world_sensor = None if self.T_world_sensor is None else self.T_world_sensor.tolist()
         frame_entry = {
             "schema": SCHEMA,
@@ -125,7 +127,8 @@ def predict_recording(
             one person.
 
     Yields:
-        `FramePoses` of each frame, including damaged frames.
+        `FramePoses` of each frame, including damaged frames. The warnings of the first include those about the source,
+        if it is given by paths.
 
     Raises:
         InputError: options that exclude each other, a source that cannot be read, or, after the last frame, `boxes` of
@@ -135,14 +138,23 @@ def predict_recording(
         raise TypeError(f"predict_recording() got an unexpected keyword argument {min(unknown)!r}")
     choice: dict[str, Any] = {"rate": rate, "start": start, "end": end, "every": every}
     paths, frames = _frames_among(source)
-    name = getattr(source, "name", None)
+    name, opened = getattr(source, "name", None), None
     if frames is None:
         opened = open_source(paths, columns=columns, topic=topic, meta=meta, **choice)
         name, frames = opened.name, opened.frames()
     elif options := [option for option, value in choice.items() if value != (1 if option == "every" else None)]:
         raise InputError(f"{options[0]} is for paths, got frames: give it to open_source, or filter the frames")
     predictor = FramePredictor(columns=columns, topic=topic, meta=meta, name=name, **posing)
-    return predictor.predict_all(frames)
+    results = predictor.predict_all(frames)
+    return results if opened is None else _with_warnings(results, opened)
+
+
+def _with_warnings(results: Iterator[FramePoses], source: FrameSource) -> Iterator[FramePoses]:
+    """The results, the first with the warnings about the source."""
+    if (first := next(results, None)) is not None:
+        poses = first.poses
+        yield replace(first, poses=replace(poses, warnings=(*source.warnings, *poses.warnings)))
+    yield from results
 
 
 def _frames_among(source: Any) -> tuple[Any, Iterator[Frame | DamagedFrame] | None]:
@@ -304,8 +316,8 @@ class FramePredictor:
             )
             if isinstance(prepared_scan, DetectedScan) and not self._was_searched:
                 self._was_searched = True
-                if not len(poses) and (hint := other_up_axis(prepared_scan, self._search)):
-                    poses = replace(poses, warnings=(*poses.warnings, hint))
+                if not len(poses):
+                    poses = replace(poses, warnings=why_nobody(prepared_scan, self._search, poses.warnings))
             if people is not None:
                 poses = people.update(time, scan, poses, T_fixed_sensor)
         except InputError as error:
@@ -324,7 +336,7 @@ class FramePredictor:
                 check_up(boxes, self.up)
             scan = replace(scan, boxes=boxes or [])
         elif self._is_crop is None and len(points):
-            self._is_crop = not is_wide(scan)
+            self._is_crop = not is_whole(scan)
         if self._origin is not None:
             (origin,) = self._origin
         else:

@@ -13,7 +13,8 @@ from lidarpose.sample import JOINT_COLUMNS
 FORMATS = ("jsonl", "csv", "parquet")
 # number of frames whose rows are written at a time
 _ROWS_OF = 200
-_COLUMNS = ("frame", "frame_id", "time", "person", "id", "track", "filled", *JOINT_COLUMNS, "coordinates")
+_VELOCITY = ("velocity_x", "velocity_y", "velocity_z")
+_COLUMNS = ("frame", "frame_id", "time", "person", "id", "track", "filled", *JOINT_COLUMNS, "coordinates", *_VELOCITY)
 _TEXT_COLUMNS = ("id", "frame_id", "joint", "coordinates")
 
 
@@ -86,6 +87,7 @@ def _rows(line: dict[str, Any]) -> Iterator[tuple]:
             person["score"],
             person["mounted"],
             line.get("coordinates", "sensor"),
+            *(person.get("velocity") or [None] * 3),
         )
         for j, name in enumerate(joints):
             in_range = name not in person["out_of_range"] if is_known else None

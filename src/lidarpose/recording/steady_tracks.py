@@ -106,6 +106,6 @@ def _with_steady(people: list[dict[str, Any]], entries: dict[int, dict[str, Any]
         yield person | entry
     for id, entry in sorted(entries.items()):
         person_entry: dict[str, Any] = {"id": id, "num_points": 0}
-        person_entry |= dict.fromkeys(("box", "score", "mounted", "person", "second_person", "joints"))
+        person_entry |= dict.fromkeys(("box", "score", "mounted", "person", "second_person", "joints", "velocity"))
         person_entry |= {name: [] for name in ("confidence", "spread", "visible", "out_of_range", "warnings")}
         yield person_entry | {"track": id} | entry

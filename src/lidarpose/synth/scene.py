@@ -43,6 +43,8 @@ class RandomStream(IntEnum):
 
 # maximum standard deviation of the ground's tilt, rad; a larger value was probably meant in degrees
 _STEEPEST = pi / 4
+# ways of scanning single people other than by one scan of an upright sensor
+ACQUISITIONS = ("merged", "accumulated", "inverted", "integration", "sparse", "crowded")
 # fields with values between 0 and 1
 _SHARES = frozenset(
     "clutter occluder company apart unusual tempo merged double_rate accumulated inverted integration sparse crowded "
@@ -203,7 +205,7 @@ class SceneConfig:
     @property
     def varied(self) -> bool:
         """Whether people may be scanned in other ways than by one scan of an upright sensor."""
-        return any((self.merged, self.accumulated, self.inverted, self.integration, self.sparse, self.crowded))
+        return any(getattr(self, name) for name in ACQUISITIONS)
 
     @property
     def follows_paper(self) -> bool:

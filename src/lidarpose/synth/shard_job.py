@@ -17,7 +17,7 @@ from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.io.files import content_digest, file_error
 from lidarpose.lidar.presets import SENSORS, sensor
 from lidarpose.sample import CLIP_FRAMES
-from lidarpose.synth.scene import RandomStream, scene_config
+from lidarpose.synth.scene import ACQUISITIONS, RandomStream, scene_config
 
 if TYPE_CHECKING:
     from lidarpose.synth.generator import Generator
@@ -83,6 +83,12 @@ class SynthesisJob:
         scene = scene_config(self.scene).eased(self.hard).changed(self.set)
         if scene.recorded and self.what == "clips":
             raise InputError("recorded=1 keeps the positions of single poses: omit it or --clips")
+        set_names = {change.partition("=")[0] for change in self.set}
+        acquisitions = [name for name in ACQUISITIONS if name in set_names and getattr(scene, name)]
+        if acquisitions and self.what == "clips":
+            raise InputError(f"clips are scanned in one way only: omit {', '.join(acquisitions)}, or --clips")
+        if "sparse" in acquisitions and self.sensors is not None:
+            raise InputError("sparse scans with sensors of its own: omit it or --sensor")
         for name in self.sensors or ():
             sensor(name)
         if self.sensors is not None and not self.sensors:

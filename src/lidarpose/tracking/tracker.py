@@ -41,7 +41,8 @@ _SURE, _UNSURE_GAP = 0.6, 0.6
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackState:
     """An expected person: id of the track; center (3,) and size (3,) m, yaw rad of the box; age: seconds since the
-    person was last seen; position_sd: standard deviation of the center on a horizontal axis, m."""
+    person was last seen; position_sd: standard deviation of the center on a horizontal axis, m; velocity (3,) m/s, None
+    if the person was seen only once."""
 
     id: int
     center: np.ndarray
@@ -49,6 +50,7 @@ class TrackState:
     yaw: float
     age: float
     position_sd: float
+    velocity: np.ndarray | None = None
 
 
 @dataclass(kw_only=True, eq=False)
@@ -169,6 +171,7 @@ class Tracker:
                 yaw=float(np.arctan2(tracks.heading[i, 1], tracks.heading[i, 0])),
                 age=float(tracks.age[i]),
                 position_sd=float(deviations[i]),
+                velocity=tracks.state[i, :, 1] if tracks.sightings[i] > 1 else None,
             )
             for i in range(len(tracks))
         ]

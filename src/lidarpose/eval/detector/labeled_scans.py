@@ -123,7 +123,8 @@ def labeled_scans(folder: str | os.PathLike, limit: int | None = None) -> ScanSe
         InputError: the folder has no labels, or a label file has no scan.
     """
     folder = Path(folder)
-    labels = sorted(folder.glob("*.json"))
+    # boxes and poses that `detect` and `predict` wrote there are not labels
+    labels = [path for path in sorted(folder.glob("*.json")) if not path.name.endswith((".boxes.json", ".poses.json"))]
     clouds = [next((p for s in SUFFIXES if (p := path.with_suffix(s)).is_file()), None) for path in labels]
     if not labels:
         raise file_error(folder, "expected labeled scans, SCAN.json of people beside SCAN.pcd or another, got no .json")

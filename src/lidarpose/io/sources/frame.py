@@ -59,6 +59,10 @@ class Frame(Sweep):
     id: str
     time: float | None = None
 
+    def __repr__(self) -> str:
+        time = "" if self.time is None else f", t={self.time} s"
+        return f"Frame({self.index}, {self.id!r}, {len(self.points):,} points{time})"
+
     def __post_init__(self):
         if self.origin is not None:
             object.__setattr__(self, "origin", np.array(self.origin, float))
