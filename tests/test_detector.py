@@ -46,6 +46,21 @@ def test_detector_finds_each_person_once(points):
     assert len(Detector(upright).detect(points, ORIGIN, limit=2)) == 2
 
 
+def test_context_of_people_at_end_of_range_is_kept(points, monkeypatch):
+    """The network reads 10 m around a candidate: without them, a shorter range lowers scores inside it."""
+    read = []
+
+    class Recording(detector.SceneIndex):
+        def __init__(self, points, *arguments, **named):
+            read.append(points)
+            super().__init__(points, *arguments, **named)
+
+    monkeypatch.setattr(detector, "SceneIndex", Recording)
+    Detector(upright).detect(points, ORIGIN, max_range=9)
+    distance, kept = (np.hypot(*cloud[:, :2].T) for cloud in (points, read[0]))
+    assert distance.max() > 25 and 19 < kept.max() < 24
+
+
 def test_detector_separates_close_people_without_duplicates(points):
     """Candidates 0.4 m apart are kept, those refined to the same place are merged."""
     pair = np.concatenate([plane(), column(6, 0), column(6, 0.4, seed=3)])

@@ -825,6 +825,31 @@ def test_predict_without_confidence_uses_whole_cloud(points):
     assert joints[1, 2] - joints[0, 2] == pytest.approx(len(cloud) * 1e-3, abs=1e-3)
 
 
+@pytest.mark.parametrize(("confidence", "is_searched"), [(0.3, True), (0.9, False)])
+def test_predict_searches_narrow_crop_of_unsure_pose(points, confidence, is_searched, monkeypatch):
+    """1.8 m wide: narrower than crops that are always searched. With a box, its center tells who is meant."""
+    clouds = []
+
+    def poses(self, given, origin, **settings):
+        clouds.append([len(cloud) for cloud in given])
+        sure = [confidence if len(cloud) > 0.9 * len(crop) else 0.8 for cloud in given]
+        own = [np.zeros((26, 3)) + cloud.mean(0) for cloud in given]
+        pairs = zip(own, sure, strict=True)
+        return [Pose(joints=joints, skeleton=BODY26, confidence=np.full(26, value)) for joints, value in pairs]
+
+    wide = cluttered(points)
+    crop = wide[(np.abs(wide[:, :2] - np.median(points[:, :2], axis=0)) < 0.9).all(1)]
+    assert len(candidates(crop)) == 1 and len(candidates(crop, 1.3)) > 1
+    monkeypatch.setattr(Predictor, "poses", poses)
+    model = lidarpose.load("tiny")
+    person = model.predict_in([crop], None, check_upside_down=False)[0]
+    assert clouds[0] == [len(crop)] and bool(clouds[1:] and clouds[1]) == is_searched
+    assert (person.confidence.mean() > confidence + 0.1) == is_searched
+    del clouds[:]
+    model.predict_in([crop], None, box_centers=crop.mean(0)[None], check_upside_down=False)
+    assert [each for each in clouds if each] == [[len(crop)]]
+
+
 # ---- results in Python and in notebooks
 
 

@@ -433,8 +433,9 @@ class Predictor(PoseEstimator):
                     if not is_placed[i] and pose is not None and 0 < _confidence(pose) < _UNSURE
                     for part in (candidates(cloud, WIDE_IF_UNSURE)[1:] if len(candidates(cloud)) == 1 else ())
                 ]
-                parts += more_parts
-                poses += self.poses([part for _, part in more_parts], origin, progress=progress)
+                if more_parts:
+                    parts += more_parts
+                    poses += self.poses([part for _, part in more_parts], origin, progress=progress)
         poses_by_person: dict[int, list[tuple[Pose, np.ndarray]]] = {}
         for (i, part), pose in zip(parts, poses, strict=True):
             if pose is not None:
