@@ -4,8 +4,9 @@
 
 FOLDER holds sweep_N.pcd, .bin or .ply, each with a sweep_N.json of boxes in the format of `lidarpose predict`. Prints
 for each person: points, distance, the angle between the pose's facing and the box's heading (also with `--tta 4`), the
-share of points within 15 cm of the skeleton's bones, lean of the trunk, and confidence. For tracks in two sweeps it
-also prints the mean joint distance between the two poses after their pelvises are aligned.
+share of points within 15 cm of the skeleton's bones, lean of the trunk, confidence, and the mean joint distance to the
+pose of the same person if nobody gives boxes. For tracks in two sweeps it also prints the mean joint distance between
+the two poses after their pelvises are aligned.
 """
 
 import argparse
@@ -19,7 +20,7 @@ import numpy as np
 import lidarpose
 from lidarpose.geometry import distance_to_segments
 from lidarpose.inference.predictor import TTA, Predictor
-from lidarpose.inference.results import PersonPose
+from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.io.files import write_atomic
 from lidarpose.models import DEFAULT
 from lidarpose.sample import facing
@@ -41,6 +42,7 @@ def rows_of(model: Predictor, four: Predictor, folder: Path, least: int) -> Iter
         sweep = next(path for path in sorted(folder.glob(f"{labels.stem}.*")) if path.suffix != ".json")
         boxes = {"people": json.loads(labels.read_text())["people"]}
         people = (lidarpose.predict(sweep, boxes=boxes, model=predictor) for predictor in (model, four))
+        found = lidarpose.predict(sweep, model=model)
         for person, other in zip(*people, strict=True):
             if person.num_points < least or person.pose is None:
                 continue
@@ -55,8 +57,19 @@ def rows_of(model: Predictor, four: Predictor, folder: Path, least: int) -> Iter
                 "near": float((distance_to_bones(person.points, person.joints) < NEAR).mean()),
                 "lean": float(np.degrees(np.arccos(trunk[2] / np.linalg.norm(trunk)))),
                 "confidence": float(person.confidence.mean()),
+                "found": found_distance(person, found),
             }
             yield {key: round(value, 3) if isinstance(value, float) else value for key, value in row.items()}, person
+
+
+def found_distance(person: PersonPose, found: Poses) -> float | None:
+    """The mean joint distance, mm, between the pose in the labeled box and the pose of the same person among those
+    found without boxes; None if the person was not found."""
+    distances = [np.linalg.norm(other.box.center[:2] - person.box.center[:2]) for other in found]
+    if not distances or min(distances) > 0.5:
+        return None
+    joints = found[int(np.argmin(distances))].joints
+    return float(np.linalg.norm(joints - person.joints, axis=-1).mean() * 1e3)
 
 
 def turn(person: PersonPose) -> float:
@@ -92,6 +105,7 @@ def main() -> None:
             f"{row['sweep']} {row['person']}  {row['points']:4d} points {row['distance']:5.1f} m"
             f"  facing {row['turn']:5.0f} deg off the box, with --tta 4 {row['turn_of_four']:5.0f}"
             f"  {row['near']:4.0%} near bones  lean {row['lean']:3.0f} deg  confidence {row['confidence']:.2f}"
+            + ("  not found" if row["found"] is None else f"  found {row['found']:.0f} mm away")
         )
     tracks = list(moved(people))
     for entry in tracks:

@@ -7,8 +7,8 @@
 
 docs/scores/paper is the output of `lidarpose paper`, NAME.json that of `lidarpose evaluate NAME bench`, NAME-2.json the
 same for bench-2, NAME-unknown.json with `--sensor-unknown`, and stability/NAME.json the additional output with
-`--stability`; NAME-own.json are scores on 1,000 people of the paper's scene. The other files are the output of the
-benchmarks with the same names.
+`--stability`; NAME-own.json are scores on 1,000 people of the paper's scene. heldout.json is of goal_tables.py. The
+other files are the output of the benchmarks with the same names.
 
 A table stands between `<!-- table NAME -->` and `<!-- end -->`; the text around it is not changed.
 """
@@ -23,6 +23,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import ablation_tables as changed
+import goal_tables as aimed
 import speed_tables as timed
 import stability_tables as disturbed
 from ablation_tables import figures, own_lines
@@ -351,11 +352,12 @@ def real() -> str:
             f"{100 * entry['near']:.0f} %",
             f"{entry['lean']:.0f} deg",
             f"{entry['confidence']:.2f}",
+            "not found" if entry["found"] is None else f"{entry['found']:.0f}",
         )
         for entry in _read("real")["people"]
     ]
     header = ("sweep", "person", "points", "distance m", "facing relative to the box", "the same, `--tta 4`")
-    return table((*header, "points within 15 cm of a bone", "trunk lean", "confidence"), rows)
+    return table((*header, "points within 15 cm of a bone", "trunk lean", "confidence", "pose found, mm away"), rows)
 
 
 def clips() -> str:
@@ -536,6 +538,7 @@ def tables() -> dict[str, Callable[[], str]]:
     makers["stability"] = lambda: table(("", "undisturbed", *5 * ("",)), disturbed.curves(DEFAULT))
     makers["stability sensors"] = lambda: table(("sensor", "points", "MPJPE mm"), disturbed.sensors(DEFAULT))
     makers["stability ends"] = lambda: table(("", "mean, mm", "deviation"), disturbed.ends(DEFAULT))
+    makers |= {"goals": lambda: table(*aimed.goals()), "heldout": lambda: table(*aimed.heldout())}
     makers["strays"] = partial(
         strays,
         paper="the paper's design, faster rates, 98,304 people",

@@ -24,7 +24,7 @@ from lidarpose.cli import demo, main, predicting
 from lidarpose.errors import InputError
 from lidarpose.inference import predictor
 from lidarpose.models import BUNDLED, DEFAULT, bundled_path, weights_file
-from lidarpose.models.checkpoint import DIGEST, SafetensorsFile
+from lidarpose.models.checkpoint import DIGEST, SafetensorsFile, read_header, runs_of
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.viz import contact_sheet
@@ -205,6 +205,20 @@ def test_info_sums_people_of_all_runs(monkeypatch, capsys):
     monkeypatch.setattr("lidarpose.models.checkpoint.read_header", lambda path: header)
     assert run("info", "--verbose") == 0
     assert "  500 people, 0.50 hours; all its runs 1,500 people, 1.75 hours" in capsys.readouterr().out
+
+
+def test_info_of_checkpoint_prints_network_and_runs(capsys):
+    path = bundled_path("tiny")
+    card = read_header(path).card
+    assert run("info", path, "--json") == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["config"] == json.loads(json.dumps(read_header(path).config.to_dict()))
+    assert [entry["command"] for entry in facts["runs"]] == [entry["command"] for entry in runs_of(card)]
+    assert run("info", "tiny") == 0
+    text = capsys.readouterr().out
+    assert f"tiny, {facts['parameters']:,} parameters" in text
+    assert f"trained  {card['command']}\n         {card['people_seen']:,} people, {card['hours']:.2f} hours" in text
+    assert run("info", "nowhere.safetensors") == 2
 
 
 @pytest.mark.long

@@ -16,7 +16,9 @@ from lidarpose.models import BUNDLED, DEFAULT, bundled_path
 
 _INFO = """
 show versions, device, bundled weights and their scores
+With a checkpoint: what network it is, and how it was trained.
 $ lidarpose info
+<weights> FILE?  a checkpoint of your own
 -v,--verbose  also show how the weights were trained, and all scores
 --json  print everything as JSON
 """
@@ -55,8 +57,40 @@ def add(commands) -> None:
 
 
 def _info(options: argparse.Namespace) -> None:
-    facts = installed()
-    print(json.dumps(facts, indent=1) if options.json else "\n".join(_lines(facts, verbose=options.verbose)))
+    if options.weights:
+        facts = checkpoint_facts(options.weights)
+        lines = _checkpoint_lines(facts)
+    else:
+        facts = installed()
+        lines = _lines(facts, verbose=options.verbose)
+    print(json.dumps(facts, indent=1) if options.json else "\n".join(lines))
+
+
+def checkpoint_facts(weights: str) -> dict[str, Any]:
+    """A checkpoint's network, configuration, number of parameters, and training runs, the last first. weights: a file
+    or the name of a bundled network."""
+    from lidarpose.models import weights_path
+    from lidarpose.models.checkpoint import parameter_count, read_header, runs_of
+
+    path = weights_path(weights)
+    header = read_header(path)
+    return {
+        "file": str(path),
+        "lidarpose": header.version,
+        "network": header.network,
+        "parameters": parameter_count(path),
+        "config": header.config.to_dict(),
+        "runs": [{key: value for key, value in run.items() if key != "init_card"} for run in runs_of(header.card)],
+    }
+
+
+def _checkpoint_lines(facts: dict[str, Any]) -> Iterator[str]:
+    name = facts["config"].get("size") or facts["config"].get("name") or facts["network"]
+    yield f"{facts['file']}: {name}, {facts['parameters']:,} parameters, written by lidarpose {facts['lidarpose']}"
+    for run in facts["runs"]:
+        seen = next((f"{value:,} {key[:-5]}" for key, value in run.items() if key.endswith("_seen")), "")
+        yield f"trained  {run.get('command', 'unknown')}"
+        yield f"         {seen or 'unknown length'}, {run.get('hours', 0):.2f} hours"
 
 
 def installed() -> dict[str, Any]:
