@@ -231,10 +231,10 @@ def card(model: str) -> str:
         ("seed", str(card["recipe"]["seed"])),
         ("people seen", _in_all(runs, "people_seen", ",")),
         ("hours", _in_all(runs, "hours", ".2f")),
-        ("captured motion", f"{card['motion']}, subjects {', '.join(card['recipe']['subjects']) or 'all'}"),
+        ("captured motion", f"{card['motion']}, subjects {', '.join(card['recipe'].get('subjects', ())) or 'all'}"),
     ]
     stages = [
-        f"{run['recipe']['init']} ({previous_run['people_seen']:,} people)" for run, previous_run in pairwise(runs)
+        f"{run['recipe'].get('init', model)} ({previous_run['people_seen']:,} people)" for run, previous_run in pairwise(runs)
     ]
     if stages:
         rows.append(("started from", ", itself from ".join(stages)))
@@ -270,7 +270,7 @@ def progress(model: str) -> str:
         held_out = (scores.get(f"sensor known, {group}", "- -").split()[1] for group in ("all", _PLAIN))
         # a run that was stopped early has no validation
         validation = f"{run['validation_mm']:.1f}" if "validation_mm" in run else "-"
-        rows.append((f"`{run['recipe']['size']}`", f"{people:,}", f"{hours:.1f}", validation, *held_out))
+        rows.append((f"`{run['recipe'].get('size', model)}`", f"{people:,}", f"{hours:.1f}", validation, *held_out))
     return table(("", "people in total", "hours", "validation mm", "`heldout.py` mm", "`heldout.py` plain mm"), rows)
 
 

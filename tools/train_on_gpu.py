@@ -403,14 +403,16 @@ def save(
     students: list[Student], options: argparse.Namespace, step: int, fresh: int, seconds: float, init_card: dict
 ) -> None:
     command = " ".join(["python tools/train_on_gpu.py OUT", *sys.argv[2:]])
-    card = {"command": command, "recipe": {"seed": options.seed}, "people_seen": fresh * options.batch}
+    recipe = {"seed": options.seed, "batch": options.batch}
+    card = {"command": command, "recipe": recipe, "people_seen": fresh * options.batch}
     card |= {
         "shown": step * options.batch,
         "hours": round(seconds / 3600, 3),
         "motion": Path(options.motion or "").name,
     }
     for size, student in zip(options.sizes, students, strict=True):
-        student.save(options.out / f"{size}.safetensors", card | {"init_card": init_card})
+        own = {"recipe": recipe | {"size": size, "init": options.init}, "init_card": init_card}
+        student.save(options.out / f"{size}.safetensors", card | own)
 
 
 def check(
