@@ -234,7 +234,8 @@ def card(model: str) -> str:
         ("captured motion", f"{card['motion']}, subjects {', '.join(card['recipe'].get('subjects', ())) or 'all'}"),
     ]
     stages = [
-        f"{run['recipe'].get('init', model)} ({previous_run['people_seen']:,} people)" for run, previous_run in pairwise(runs)
+        f"{run['recipe'].get('init', model)} ({previous_run['people_seen']:,} people)"
+        for run, previous_run in pairwise(runs)
     ]
     if stages:
         rows.append(("started from", ", itself from ".join(stages)))
