@@ -650,7 +650,7 @@ def test_read_scores_rejects_other_files(written, tmp_path):
         changed = json.loads(json.dumps(good))
         change(changed["results"][0])
         cases.append((changed, f"not a scores.json .*{words}" if words != "not a scores.json" else words))
-    for content, words in [*((json.dumps(content), words) for content, words in cases), ("a", "not a scores.json")]:
+    for content, words in [*((json.dumps(content), words) for content, words in cases), ("a", "is not JSON")]:
         (tmp_path / "scores.json").write_text(content)
         for read in (evaluation.read_scores, evaluation.table):
             with pytest.raises(InputError, match=words):

@@ -162,9 +162,10 @@ def why_nobody(places: "DetectedScan", search: Search, warnings: tuple[str, ...]
     if (other_axis or not is_scaled) and (hint := _other_up_axis(places, search)):
         # other warnings of the search would follow from the wrong axis
         return (*places.given.warnings, hint)
-    if other_axis or is_scaled:
+    if other_axis:
         return warnings
-    hint = _feet(places, search) or _much_background(places)
+    hint = None if is_scaled else _feet(places, search)
+    hint = hint or _much_background(places)
     return (*warnings, hint) if hint else warnings
 
 
