@@ -113,7 +113,7 @@ def test_cli_evaluate_then_table(tmp_path, monkeypatch, capsys):
     assert run("evaluate", "tiny", "bench", "--limit", "12", "--seed", "3") == 0
     shown = capsys.readouterr()
     assert {path.name for path in (tmp_path / "evaluation/tiny").iterdir()} == {
-        "scores.json", "poses.parquet", "lidarpose-bench-1.1-errors.png", "lidarpose-bench-1-reliability.png",
+        "scores.json", "poses.parquet", "lidarpose-bench-1.1-errors.png", "lidarpose-bench-1.1-reliability.png",
         "lidarpose-bench-1.1-worst.png",
     }  # fmt: skip
     # the headline first, then the setting, printed once
