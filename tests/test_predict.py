@@ -23,6 +23,7 @@ from lidarpose.inference.checks import flat_axis, is_lying, rows_inside, scan_un
 from lidarpose.inference.inputs import MAX_POINTS, as_origin, candidates, clean
 from lidarpose.inference.predict_scan import predictor_of
 from lidarpose.inference.predictor import Predictor, _select_pose
+from lidarpose.inference.results import person_label
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.point_cloud import Cloud
 from lidarpose.models import bundled_path
@@ -865,6 +866,11 @@ def test_repr_of_predictor_and_results_is_short(model, poses):
     assert repr(replace(poses, warnings=("a",))) == "Poses(2 of 3 people, smpl24, 2 warnings)"
     assert re.fullmatch(r"PersonPose\(smpl24, confidence [01]\.\d\d, 590 points\)", repr(poses[0]))
     assert repr(replace(poses[1], id="b")) == "PersonPose(id='b', no pose, 3 points, 1 warning)"
+
+
+def test_person_label_names_score_and_rider():
+    assert person_label("a", 0.954, True) == "a · score 0.95 · rides"
+    assert person_label(3, None, None) == "3" and person_label(None, 0.5, False) == "score 0.50"
 
 
 def test_notebooks_show_table_of_poses_and_picture_of_person(poses):

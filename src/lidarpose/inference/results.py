@@ -375,7 +375,13 @@ class Poses(Sequence[PersonPose]):
 
         upright_people = [_upright(person, self.up) for person in self.people]
         panels = [
-            Panel(points=p.points, pose=p.pose, label=_label(person), box=p.box, distance=self._distance(person))
+            Panel(
+                points=p.points,
+                pose=p.pose,
+                label=person_label(person.id, person.score, person.mounted),
+                box=p.box,
+                distance=self._distance(person),
+            )
             for p, person in zip(upright_people, self.people, strict=True)
         ]
         return panels, None if self.scan is None else self._from_above(self.scan, upright_people)
@@ -429,11 +435,11 @@ def _box_around(person: PersonPose) -> Box | None:
     return Box(center=R_level_local @ ((low + high) / 2), size=high - low + 0.1, yaw=yaw, id=person.id)
 
 
-def _label(person: PersonPose) -> str:
-    """The id, the score if there is one, and whether the person rides."""
-    words = [] if person.id is None else [str(person.id)]
-    words += [] if person.score is None else [f"score {person.score:.2f}"]
-    return " · ".join([*words, "rides"] if person.mounted else words)
+def person_label(id: str | int | None, score: float | None, mounted: bool | None) -> str:
+    """The label of a person in pictures: the id, the score if there is one, and whether the person rides."""
+    words = [] if id is None else [str(id)]
+    words += [] if score is None else [f"score {score:.2f}"]
+    return " · ".join([*words, "rides"] if mounted else words)
 
 
 def _rounded(values: np.ndarray | None, digits: int) -> list:

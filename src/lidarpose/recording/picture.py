@@ -9,6 +9,7 @@ import numpy as np
 from lidarpose.arrays import evenly_spaced
 from lidarpose.errors import counted
 from lidarpose.geometry import transform_points
+from lidarpose.inference.results import person_label
 from lidarpose.io.sources import Frame, FrameSource
 from lidarpose.recording.coordinates import FixedFrame, moved_yaw
 from lidarpose.sample import Box, Pose
@@ -99,12 +100,12 @@ class TrajectoryPicture:
     def _cards(self, points: np.ndarray, skeleton: Skeleton) -> Iterator[Panel]:
         """One panel per person in a recording of one frame with points (n, 3) m."""
         for person in self._people:
-            joints, box, score = person["joints"], person["box"], person["score"]
+            joints, box = person["joints"], person["box"]
             person_points = points if box is None else points[box.contains(points)]
             pose = None
             if joints is not None:
                 pose = Pose(joints=joints, skeleton=skeleton, confidence=person["confidence"] or None)
-            label = f"{person['id']}" if score is None else f"{person['id']} · score {score:.2f}"
+            label = person_label(person["id"], person["score"], person.get("mounted"))
             distance = (
                 np.linalg.norm(np.median(person_points, 0) - self._to_fixed[0][:3, 3]) if len(person_points) else np.nan
             )
