@@ -589,6 +589,8 @@ def test_markdown_of_cells():
     ]  # fmt: skip
     page = markdown({"title": "T", "target": "stand-in", "people": 2000, "hours": 1.5, "cells": entries})
     assert "Budget: 2,000 people a stage of training, 1.5 hours a row." in page
+    real = markdown({"title": "T", "target": "real sets", "people": 2000, "hours": None, "cells": entries})
+    assert "Budget: 2,000 people of pre-training." in real
     for line in (
         "| a | 100.0 [95.0, 105.0] (paper 51.6) |",
         "| b | 110.0 [100.0, 120.0], 2 of 2 seeds, *undertrained* |",

@@ -250,7 +250,9 @@ def _offset(person: EvalSample, result: Result) -> np.ndarray:
 def markdown(content: dict[str, Any]) -> str:
     """A table as a page: the results, the cost of each cell, and the commands."""
     entries = content["cells"]
-    budget = f"Budget: {content['people']:,} people a stage of training"
+    # fine-tuning on real sets takes whole epochs
+    stages = "a stage of training" if content["target"].startswith("stand-in") else "of pre-training"
+    budget = f"Budget: {content['people']:,} people {stages}"
     budget += f", {content['hours']:g} hours a row" if content["hours"] else ""
     printed = _PRINTED if any(entry["published"] is not None for entry in entries) else ""
     lines = [f"# {content['title']}", "", f"Target: {content['target']}. {budget}. {_LEGEND}{printed}", ""]
