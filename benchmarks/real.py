@@ -42,7 +42,7 @@ def rows_of(model: Predictor, four: Predictor, folder: Path, least: int) -> Iter
         sweep = next(path for path in sorted(folder.glob(f"{labels.stem}.*")) if path.suffix != ".json")
         boxes = {"people": json.loads(labels.read_text())["people"]}
         people = (lidarpose.predict(sweep, boxes=boxes, model=predictor) for predictor in (model, four))
-        found = lidarpose.predict(sweep, model=model)
+        detected = lidarpose.predict(sweep, model=model)
         for person, other in zip(*people, strict=True):
             if person.num_points < least or person.pose is None:
                 continue
@@ -57,18 +57,18 @@ def rows_of(model: Predictor, four: Predictor, folder: Path, least: int) -> Iter
                 "near": float((distance_to_bones(person.points, person.joints) < NEAR).mean()),
                 "lean": float(np.degrees(np.arccos(trunk[2] / np.linalg.norm(trunk)))),
                 "confidence": float(person.confidence.mean()),
-                "found": found_distance(person, found),
+                "to_detected": detected_distance(person, detected),
             }
             yield {key: round(value, 3) if isinstance(value, float) else value for key, value in row.items()}, person
 
 
-def found_distance(person: PersonPose, found: Poses) -> float | None:
+def detected_distance(person: PersonPose, detected: Poses) -> float | None:
     """The mean joint distance, mm, between the pose in the labeled box and the pose of the same person among those
-    found without boxes; None if the person was not found."""
-    distances = [np.linalg.norm(other.box.center[:2] - person.box.center[:2]) for other in found]
+    detected; None if the person was not detected."""
+    distances = [np.linalg.norm(other.box.center[:2] - person.box.center[:2]) for other in detected]
     if not distances or min(distances) > 0.5:
         return None
-    joints = found[int(np.argmin(distances))].joints
+    joints = detected[int(np.argmin(distances))].joints
     return float(np.linalg.norm(joints - person.joints, axis=-1).mean() * 1e3)
 
 
@@ -105,7 +105,11 @@ def main() -> None:
             f"{row['sweep']} {row['person']}  {row['points']:4d} points {row['distance']:5.1f} m"
             f"  facing {row['turn']:5.0f} deg off the box, with --tta 4 {row['turn_of_four']:5.0f}"
             f"  {row['near']:4.0%} near bones  lean {row['lean']:3.0f} deg  confidence {row['confidence']:.2f}"
-            + ("  not found" if row["found"] is None else f"  found {row['found']:.0f} mm away")
+            + (
+                "  not detected"
+                if row["to_detected"] is None
+                else f"  {row['to_detected']:.0f} mm to the detected pose"
+            )
         )
     tracks = list(moved(people))
     for entry in tracks:

@@ -353,12 +353,12 @@ def real() -> str:
             f"{100 * entry['near']:.0f} %",
             f"{entry['lean']:.0f} deg",
             f"{entry['confidence']:.2f}",
-            "not found" if entry["found"] is None else f"{entry['found']:.0f}",
+            "not detected" if entry["to_detected"] is None else f"{entry['to_detected']:.0f}",
         )
         for entry in _read("real")["people"]
     ]
     header = ("sweep", "person", "points", "distance m", "facing relative to the box", "the same, `--tta 4`")
-    return table((*header, "points within 15 cm of a bone", "trunk lean", "confidence", "pose found, mm away"), rows)
+    return table((*header, "points within 15 cm of a bone", "trunk lean", "confidence", "detected pose, mm away"), rows)
 
 
 def clips() -> str:

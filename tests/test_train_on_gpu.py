@@ -13,6 +13,8 @@ from lidarpose.skeleton import BODY26
 from lidarpose.train.augment import FLIP_PART
 from lidarpose.train.data_loader import SyntheticSource
 from lidarpose.train.objectives.posenet_objective import PoseNetObjective
+from lidarpose.train.optim import rate_factor
+from lidarpose.train.recipes import Pretrain
 
 PEOPLE = 6
 
@@ -88,9 +90,10 @@ def test_students_learn_the_same_batches(tool, objective, examples, tmp_path):
     index, block = tool.pack(objective.collate(examples), PEOPLE)
     tensors = tool.Inputs(index, PEOPLE, torch.device("cpu"))
     tensors.fill(tool.unpack(block, index, PEOPLE))
-    student = tool.Student(PoseNet(objective.config), 2e-3, 2e-2, torch.device("cpu"))
+    recipe = Pretrain(rate=2e-3, muon_rate=2e-2, cool=0.9)
+    student = tool.Student(PoseNet(objective.config), recipe, torch.device("cpu"))
     errors = [float(student.step(index, tensors, 1.0)[student.names.index("mpjpe")]) for _ in range(12)]
     assert errors[-1] < 0.8 * errors[0]
     student.save(tmp_path / "tiny.safetensors", {"command": "x"})
     assert (tmp_path / "tiny.safetensors").stat().st_size < 1.1e6
-    assert tool.factor_at(0.01, 0.9) == 0.5 and tool.factor_at(1.0, 0.9) == 0 and tool.factor_at(0.1, 0.9) == 1
+    assert rate_factor(0.01, recipe) == 0.5 and rate_factor(1.0, recipe) == 0 and rate_factor(0.09, recipe) == 1

@@ -36,9 +36,9 @@ from lidarpose.models.posenet import PoseNet, expand_weights
 from lidarpose.skeleton import BODY26
 from lidarpose.train.augment import FLIP_PART
 from lidarpose.train.data_loader import SyntheticSource
-from lidarpose.train.objectives.objective import LOGGED, total
+from lidarpose.train.objectives.objective import total
 from lidarpose.train.objectives.posenet_objective import PoseNetObjective
-from lidarpose.train.optim import Muon, average, optimizers
+from lidarpose.train.optim import average, optimizers, rate_factor, set_rates
 from lidarpose.train.recipes import Pretrain
 from lidarpose.train.scan_people import draw_person, populated_scan
 
@@ -51,8 +51,6 @@ SHAPES = (
 CHUNK, SCAN_USES, SCANS_KEPT = 8, 24, 64
 # batches kept on the GPU, and how many must be there before one is shown again
 MOST_KEPT, LEAST_KEPT = 5000, 60
-# share of the time in which the rates rise, and the decay of the mean of the weights
-WARMUP, EMA = 0.02, 0.999
 
 
 def layout(shape: tuple[int, int, int], people: int) -> list[tuple[str, np.dtype, tuple[int, ...]]]:
@@ -200,13 +198,12 @@ class Inputs:
 class Student:
     """A network in training: its optimizers, the mean of its weights, and a graph for each shape."""
 
-    def __init__(self, network: PoseNet, rate: float, muon_rate: float, device: torch.device):
+    def __init__(self, network: PoseNet, recipe: Pretrain, device: torch.device):
         self.network = network.to(device).train()
         self.objective = PoseNetObjective(config=network.config)
         self.parameters = list(self.network.parameters())
         self.mean = {name: value.detach().clone() for name, value in self.network.named_parameters()}
-        self.rates = (rate, muon_rate)
-        self.optimizers = optimizers(self.network, Pretrain(rate=rate, muon_rate=muon_rate, size=network.config.size))
+        self.recipe, self.optimizers = recipe, optimizers(self.network, recipe)
         self.graphs: dict[int, tuple[torch.cuda.CUDAGraph, list[Tensor], Tensor]] = {}
         self.names: list[str] = []
         self.steps = 0
@@ -218,7 +215,7 @@ class Student:
         terms = self.objective.terms(self.network, inputs.tensors, device=next(iter(inputs.tensors.values())).device)
         loss = total(terms)
         loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.parameters, 1.0, foreach=True)
+        norm = torch.nn.utils.clip_grad_norm_(self.parameters, self.recipe.clip, foreach=True)
         self.names = [*terms, "gradient"]
         return torch.stack([value.detach().float() for value in terms.values()] + [norm.detach()])
 
@@ -239,6 +236,7 @@ class Student:
         self.graphs[index] = graph, gradients, terms
 
     def step(self, index: int, inputs: Inputs, factor: float) -> Tensor:
+        """Takes a step at a share `factor` of the peak rates; returns what `gradients` does."""
         if self.graphs:
             graph, gradients, terms = self.graphs[index]
             graph.replay()
@@ -246,11 +244,10 @@ class Student:
                 parameter.grad = gradient
         else:
             terms = self.gradients(inputs)
+        set_rates(self.optimizers, self.recipe, factor)
         for optimizer in self.optimizers:
-            for group in optimizer.param_groups:
-                group["lr"] = self.rates[isinstance(optimizer, Muon)] * factor
             optimizer.step()
-        average(self.mean, self.network, self.steps, EMA)
+        average(self.mean, self.network, self.steps, self.recipe.ema)
         self.steps += 1
         return terms
 
@@ -311,9 +308,12 @@ def main() -> None:
         )
     )
     trained, header = load_checkpoint(weights_path(options.init))
-    students = [
-        Student(expand_weights(trained, replace(SIZES[size], person=True)), rate, 10 * rate, device)
+    recipes = [
+        Pretrain(size=size, rate=rate, muon_rate=10 * rate, cool=options.cool)
         for size, rate in zip(options.sizes, options.rates, strict=True)
+    ]
+    students = [
+        Student(expand_weights(trained, replace(SIZES[recipe.size], person=True)), recipe, device) for recipe in recipes
     ]
     inputs = [Inputs(index, options.batch, device) for index in range(len(SHAPES))]
     if options.check:
@@ -335,11 +335,6 @@ def record(students: list[Student], inputs: list[Inputs]) -> None:
         for student in students:
             student.record(index, inputs[index], pool)
     torch.cuda.synchronize()
-
-
-def factor_at(done: float, cool: float) -> float:
-    """Share of the peak rates after the share `done` of the time."""
-    return min(done / WARMUP, 1.0) * min(max(1 - done, 0.0) / cool, 1.0)
 
 
 def train(
@@ -374,7 +369,8 @@ def train(
             arrays = unpack(block, index, options.batch)
             which = torch.randint(8, (options.batch,), device=device)
             inputs[index].fill(transformed(arrays, which))
-            factor = factor_at((now - start) / (end - start), options.cool)
+            # the share of the time that has passed stands for the share of the run
+            factor = rate_factor((now - start) / (end - start), students[0].recipe)
             terms = [student.step(index, inputs[index], factor).clone() for student in students]
             sums.append(
                 torch.stack([t[student.names.index("mpjpe")] for t, student in zip(terms, students, strict=True)])
@@ -483,7 +479,6 @@ def check(
         next(batches)
         count += 1
     print(f"workers: {count * options.batch / (time.monotonic() - start):.0f} people a second", flush=True)
-    print({name: round(float(value), 3) for name, value in zip(students[0].names, terms, strict=True)}, LOGGED)
 
 
 if __name__ == "__main__":

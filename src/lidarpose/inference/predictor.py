@@ -1,6 +1,7 @@
 """`load` a network and predict the poses of one or many point clouds, of any number type; clouds may be empty."""
 
 import os
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -427,11 +428,12 @@ class Predictor(PoseEstimator):
                     poses[k] = pose
             if box_centers is None:
                 # a box tells which points are the person's; without one, ground and clutter may explain an unsure pose
+                num_parts = Counter(i for i, _ in parts)
                 more_parts = [
                     (i, part)
                     for (i, cloud), pose in zip(parts, poses, strict=True)
-                    if not is_placed[i] and pose is not None and 0 < _confidence(pose) < _UNSURE
-                    for part in (candidates(cloud, WIDE_IF_UNSURE)[1:] if len(candidates(cloud)) == 1 else ())
+                    if num_parts[i] == 1 and not is_placed[i] and pose is not None and 0 < _confidence(pose) < _UNSURE
+                    for part in candidates(cloud, WIDE_IF_UNSURE)[1:]
                 ]
                 if more_parts:
                     parts += more_parts

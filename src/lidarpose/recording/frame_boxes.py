@@ -37,8 +37,8 @@ class FrameBoxes:
         self._read = partial(read_boxes, calib=calib)
         # by number (int) or id (str)
         self._by_frame: dict[int | str, Any] = {}
-        # whether the boxes of frames are found by "id" or by "number"; None before the first frame with boxes
-        self.found_by: str | None = None
+        # whether the boxes of frames are matched by "id" or by "number"; None before the first frame with boxes
+        self.matched_by: str | None = None
         if isinstance(given, Mapping):
             self._by_frame = {
                 int(frame) if isinstance(frame, Integral) else str(frame): boxes for frame, boxes in given.items()
@@ -68,11 +68,11 @@ class FrameBoxes:
             "number": number if number in self._by_frame else self._by_value.get(number),
         }
         # decided once: the number of one frame may be the id of another
-        self.found_by = self.found_by or next((way for way, key in keys.items() if key is not None), None)
-        if self.found_by == "number" and keys["id"] not in (None, keys["number"]):
+        self.matched_by = self.matched_by or next((way for way, key in keys.items() if key is not None), None)
+        if self.matched_by == "number" and keys["id"] not in (None, keys["number"]):
             problem = f"has boxes for the id of frame {id}, but those of earlier frames were found by number"
             raise file_error(self._name, f"{problem}: name all frames by their ids, or all by their numbers")
-        key = None if self.found_by is None else keys[self.found_by]
+        key = None if self.matched_by is None else keys[self.matched_by]
         if key is None:
             return None
         try:
@@ -84,7 +84,7 @@ class FrameBoxes:
     def check_used(self, last: str) -> None:
         """Raises InputError if none of the frames had boxes, which means that the boxes belong to another recording.
         last: id of the last frame."""
-        if self.found_by is None:
+        if self.matched_by is None:
             ids = shorten(", ".join(map(str, list(self._by_frame)[:3])))
             raise file_error(
                 self._name, f"has boxes of frames {ids}, but this recording has other frames, the last one {last}"

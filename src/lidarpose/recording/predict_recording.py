@@ -346,7 +346,7 @@ class FramePredictor:
     def state(self) -> dict[str, Any]:
         """The state after the frames so far, as JSON values."""
         people = None if self.people is None else self.people.state()
-        boxes_by = None if self.boxes is None else self.boxes.found_by
+        boxes_by = None if self.boxes is None else self.boxes.matched_by
         search_state = {"is_crop": self._is_crop, "was_searched": self._was_searched}
         return search_state | {"boxes_by": boxes_by, "people": people}
 
@@ -354,6 +354,6 @@ class FramePredictor:
         """Resumes from the result of `state()`."""
         self._is_crop, self._was_searched = state["is_crop"], state["was_searched"]
         if self.boxes is not None:
-            self.boxes.found_by = state["boxes_by"]
+            self.boxes.matched_by = state["boxes_by"]
         if self.people is not None:
             self.people.restore(state["people"])
