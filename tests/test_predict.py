@@ -16,13 +16,13 @@ import lidarpose
 from lidarpose.cli import main
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
-from lidarpose.inference import inputs as people_module
-from lidarpose.inference import predictor
+from lidarpose.inference import crop_search, predictor
 from lidarpose.inference.backend import Raw
 from lidarpose.inference.checks import flat_axis, is_lying, rows_inside, scan_unit_warning, unit_warning
-from lidarpose.inference.inputs import MAX_POINTS, as_origin, candidates, clean
+from lidarpose.inference.crop_search import candidates, select_pose
+from lidarpose.inference.inputs import MAX_POINTS, as_origin, clean
 from lidarpose.inference.predict_scan import predictor_of
-from lidarpose.inference.predictor import Predictor, _select_pose
+from lidarpose.inference.predictor import Predictor
 from lidarpose.inference.results import person_label
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.point_cloud import Cloud
@@ -275,10 +275,10 @@ def test_candidates_keep_crop_of_person_width(points):
 
 @pytest.mark.parametrize("wide, least", [(4.0, 4), (20.0, 4), (300.0, 1)])
 def test_candidates_search_is_bounded_for_large_clouds(wide, least, monkeypatch):
-    cells, heights = [], people_module._heights
-    monkeypatch.setattr(people_module, "_heights", lambda grid, *ring: cells.append(grid.size) or heights(grid, *ring))
+    cells, heights = [], crop_search._heights
+    monkeypatch.setattr(crop_search, "_heights", lambda grid, *ring: cells.append(grid.size) or heights(grid, *ring))
     cloud = np.random.default_rng(0).random((50_000, 3)) * (wide, wide, 2.5)
-    assert least <= len(candidates(cloud)) <= 1 + people_module._COLUMNS
+    assert least <= len(candidates(cloud)) <= 1 + crop_search._COLUMNS
     # 20 x 20 x 2.3 m in cells of 10 cm
     assert len(cells) == 2 and max(cells) < 1_000_000
 
@@ -801,7 +801,7 @@ def answers(*people):
     ],
 )
 def test_select_pose_by_confidence_and_box_center(people, box_x, best, second):
-    pose, part = _select_pose(list(answers(*people)), None if box_x is None else np.array([box_x, 0, 0]))
+    pose, part = select_pose(list(answers(*people)), None if box_x is None else np.array([box_x, 0, 0]))
     assert part[0, 0] == best and pose.joints[0, 0] == people[best][0] and pose.second_person == second
 
 

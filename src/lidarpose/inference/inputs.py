@@ -14,7 +14,7 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import vector_of
 from lidarpose.io.files import FormatError, one_line
 from lidarpose.io.text import is_image, is_transposed, pick_xyz
-from lidarpose.sample import CLIP_FRAMES, FARTHEST, MIN_POINTS, center_of, clip_windows, within_reach
+from lidarpose.sample import CLIP_FRAMES, FARTHEST, MIN_POINTS, clip_windows, within_reach
 
 # frames per second of a clip without times
 CLIP_RATE = 10.0
@@ -24,20 +24,6 @@ MAX_POINTS = 50_000
 # rounding of coordinates, m, from which people are not recognized; number of points from which the magnitude of a large
 # scan's coordinates is estimated
 _COARSE, _LOOKED_AT = 0.1, 100_000
-
-# a crop wider than this, m, may contain more than one person, so candidates are searched in it; if its pose is unsure,
-# in a crop wider than the second value
-WIDE, WIDE_IF_UNSURE = 2.0, 1.3
-# maximum distance of candidates from the middle of the crop, and size of the grid cells, m
-_SEARCH, _CELL = 10.0, 0.1
-# height range from above the ground to a raised hand, m
-_ABOVE_GROUND, _REACH = 0.25, 2.3
-# inner and outer radius in cells: the column contains a trunk; the ring is emptier around a person than beside a wall
-_COLUMN, _RING = (0.0, 2.0), (3.5, 5.0)
-# weight of the heights filled in the ring, subtracted from the heights filled in the column
-_RING_WEIGHT = 0.5
-# number of columns per crop, minimum distance between them, m, and radius around each that contains the person, m
-_COLUMNS, _APART, _AROUND = 3, 0.6, 0.75
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -260,60 +246,3 @@ def is_few(points: np.ndarray) -> bool:
             return True
         points = points[(points != points[0]).any(1)]
     return False
-
-
-def candidates(points: np.ndarray, width: float = WIDE) -> list[np.ndarray]:
-    """points (n, 3) m, z up, n >= 1 -> candidate clouds (k, 3) for the person, the first of which contains all points.
-
-    A crop narrower than `width` m has only this candidate. In a wider crop with ground and clutter, upright columns
-    that are filled at many heights and have free space around them are candidates too. The network's confidence then
-    decides between the candidates.
-    """
-    if (np.ptp(points[:, :2], axis=0) < width).all():
-        return [points]
-    near_points = points[(np.abs(points - np.median(points, axis=0))[:, :2] < _SEARCH).all(1)]
-    if len(near_points) < MIN_POINTS:
-        return [points]
-    ground = np.percentile(near_points[:, 2], 2)
-    upper_points = near_points[(near_points[:, 2] > ground + _ABOVE_GROUND) & (near_points[:, 2] < ground + _REACH)]
-    if len(upper_points) < MIN_POINTS:
-        return [points]
-    corner = upper_points.min(0)
-    cells = ((upper_points - corner) / _CELL).astype(int)
-    grid = np.zeros(cells.max(0) + 1, bool)
-    grid[tuple(cells.T)] = True
-    score = _heights(grid, *_COLUMN) - _RING_WEIGHT * _heights(grid, *_RING)
-    places = np.argwhere(grid.any(2))
-    score = score[tuple(places.T)]
-    places = corner[:2] + (places + 0.5) * _CELL
-    clouds = [points]
-    for _ in range(_COLUMNS):
-        best_index = int(np.argmax(score))
-        if np.isneginf(score[best_index]):
-            break
-        column_points = upper_points[_distance(upper_points, places[best_index]) < _AROUND / 2]
-        middle = center_of(column_points)[:2] if len(column_points) else places[best_index]
-        # drop what is above the person, such as trees
-        cloud = points[(_distance(points, middle) < _AROUND) & (points[:, 2] < ground + _REACH)]
-        if len(cloud) >= MIN_POINTS:
-            clouds.append(cloud)
-        score[_distance(places, places[best_index]) < _APART] = -np.inf
-    return clouds
-
-
-def _heights(grid: np.ndarray, inner: float, outer: float) -> np.ndarray:
-    """grid (X, Y, Z) bool -> (X, Y): number of heights at which any cell `inner` to `outer` cells away is filled."""
-    reach = int(outer)
-    x, y, _ = grid.shape
-    padded_grid = np.pad(grid, ((reach, reach), (reach, reach), (0, 0)))
-    is_filled = np.zeros_like(grid)
-    for i in range(2 * reach + 1):
-        for j in range(2 * reach + 1):
-            if inner <= np.hypot(i - reach, j - reach) <= outer:
-                is_filled |= padded_grid[i : i + x, j : j + y]
-    return is_filled.sum(2)
-
-
-def _distance(points: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """(n,) m: horizontal distance of points (n, 2+) from place (2,)."""
-    return np.hypot(points[:, 0] - place[0], points[:, 1] - place[1])

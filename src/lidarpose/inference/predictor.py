@@ -20,13 +20,12 @@ from lidarpose.inference.checks import (
     unit_warning,
     upside_down_warning,
 )
+from lidarpose.inference.crop_search import UNSURE, WIDE_IF_UNSURE, candidates, mean_confidence, select_pose
 from lidarpose.inference.estimator import PoseEstimator
 from lidarpose.inference.inputs import (
-    WIDE_IF_UNSURE,
     Clips,
     as_origin,
     as_points,
-    candidates,
     clean,
     clip_times,
     is_few,
@@ -55,11 +54,6 @@ if TYPE_CHECKING:
 BACKENDS = ("onnx", "torch")
 # default number of test-time augmentation passes
 TTA = 1
-# minimum confidence of a candidate pose, as a fraction of the highest confidence; poses nearer than this, m, are of the
-# same person
-_SURE, _SAME = 0.6, 0.3
-# mean confidence below which the pose of a crop is unsure
-_UNSURE = 0.65
 
 
 def load(
@@ -406,80 +400,42 @@ class Predictor(PoseEstimator):
     ) -> dict[int, tuple[Pose, np.ndarray]]:
         """For each person with a pose, by index: the pose, and the part (n, 3) m of the cloud from which it was
         predicted. is_placed (N,) bool: whose pelvises are known."""
-        poses: list[Pose | None]
         if clips is not None:
             # clips index all clouds, so unusable clouds stay in the list
-            parts = list(enumerate(points for points, _ in cleaned_clouds))
-            poses = self.poses([part for _, part in parts], origin, clips=clips.usable(is_usable), progress=progress)
-        else:
-            usable_clouds = [(i, cleaned_clouds[i][0]) for i in np.flatnonzero(is_usable).tolist()]
-            # the first candidate of a person is the whole cloud
-            parts = [
-                (i, part) for i, cloud in usable_clouds for part in ([cloud] if is_placed[i] else candidates(cloud))
-            ]
-            poses = [None] * len(parts)
-            for name, values in (("box_centers", box_centers), ("centers", pelvises)):
-                part_rows = [k for k, (i, _) in enumerate(parts) if is_placed[i] == (name == "centers")]
-                if not part_rows:
-                    continue
-                places = {name: None if values is None else values[[parts[k][0] for k in part_rows]]}
-                new_poses = self.poses([parts[k][1] for k in part_rows], origin, progress=progress, **places)
-                for k, pose in zip(part_rows, new_poses, strict=True):
-                    poses[k] = pose
-            if box_centers is None:
-                # a box tells which points are the person's; without one, ground and clutter may explain an unsure pose
-                num_parts = Counter(i for i, _ in parts)
-                more_parts = [
+            clouds = [points for points, _ in cleaned_clouds]
+            poses = self.poses(clouds, origin, clips=clips.usable(is_usable), progress=progress)
+            return {i: (pose, clouds[i]) for i, pose in enumerate(poses) if pose is not None}
+
+        def posed(parts: list[tuple[int, np.ndarray]], **places) -> list[tuple[int, Pose, np.ndarray]]:
+            """(person, pose, part) of each part (person, cloud) that has a pose. places: see `poses`, by person."""
+            values = {name: value[[i for i, _ in parts]] for name, value in places.items() if value is not None}
+            poses = self.poses([part for _, part in parts], origin, progress=progress, **values) if parts else []
+            return [(i, pose, part) for (i, part), pose in zip(parts, poses, strict=True) if pose is not None]
+
+        clouds_by_person = {i: cleaned_clouds[i][0] for i in np.flatnonzero(is_usable).tolist()}
+        placed = [(i, cloud) for i, cloud in clouds_by_person.items() if is_placed[i]]
+        # the first candidate of a person is the whole cloud
+        parts = [(i, part) for i, cloud in clouds_by_person.items() if not is_placed[i] for part in candidates(cloud)]
+        answers = posed(parts, box_centers=box_centers)
+        if box_centers is None:
+            # a box tells which points are the person's; without one, ground and clutter may explain an unsure pose
+            num_parts = Counter(i for i, _ in parts)
+            answers += posed(
+                [
                     (i, part)
-                    for (i, cloud), pose in zip(parts, poses, strict=True)
-                    if num_parts[i] == 1 and not is_placed[i] and pose is not None and 0 < _confidence(pose) < _UNSURE
+                    for i, pose, cloud in answers
+                    if num_parts[i] == 1 and 0 < mean_confidence(pose) < UNSURE
                     for part in candidates(cloud, WIDE_IF_UNSURE)[1:]
                 ]
-                if more_parts:
-                    parts += more_parts
-                    poses += self.poses([part for _, part in more_parts], origin, progress=progress)
+            )
+        answers += posed(placed, centers=pelvises)
         poses_by_person: dict[int, list[tuple[Pose, np.ndarray]]] = {}
-        for (i, part), pose in zip(parts, poses, strict=True):
-            if pose is not None:
-                poses_by_person.setdefault(i, []).append((pose, part))
+        for i, pose, part in answers:
+            poses_by_person.setdefault(i, []).append((pose, part))
         return {
-            i: _select_pose(person_poses, None if box_centers is None else box_centers[i])
+            i: select_pose(person_poses, None if box_centers is None else box_centers[i])
             for i, person_poses in poses_by_person.items()
         }
-
-
-def _confidence(pose: Pose) -> float:
-    return 0.0 if pose.confidence is None else float(pose.confidence.mean())
-
-
-def _select_pose(answers: list[tuple[Pose, np.ndarray]], box_center: np.ndarray | None) -> tuple[Pose, np.ndarray]:
-    """Selects the pose of the intended person among the poses of a crop's candidates, the first of which is the whole
-    cloud.
-
-    This is the most confident pose; with a box, the most confident pose of the person nearest to the box center. Other
-    people among the candidates raise `second_person` of the selected pose. Without confidence, the first pose is
-    selected.
-    """
-    confidences = [_confidence(pose) for pose, _ in answers]
-    if len(answers) == 1 or not any(confidences):
-        return answers[0]
-    middles = np.stack([pose.joints[list(pose.skeleton.middle)].mean(0)[:2] for pose, _ in answers])
-    is_confident = np.array(confidences) > _SURE * max(confidences)
-    is_eligible = is_confident
-    if box_center is not None:
-        distances = np.where(is_confident, np.linalg.norm(middles - box_center[:2], axis=1), np.inf)
-        is_eligible = is_confident & (np.linalg.norm(middles - middles[distances.argmin()], axis=1) < _SAME)
-    best_row = int(np.where(is_eligible, confidences, -1.0).argmax())
-    pose, part = answers[best_row]
-    if pose.second_person is None or pose.person is None:
-        return pose, part
-    is_beside = np.linalg.norm(middles - middles[best_row], axis=1) > _SAME
-    other_probabilities = [
-        other_pose.person
-        for (other_pose, _), is_other in zip(answers, is_beside & is_confident, strict=True)
-        if is_other
-    ]
-    return replace(pose, second_person=np.max([pose.second_person, *other_probabilities])), part
 
 
 def _range_warning(pose: Pose) -> str | None:
