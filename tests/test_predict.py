@@ -15,7 +15,7 @@ import torch
 import lidarpose
 from lidarpose.cli import main
 from lidarpose.errors import InputError
-from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
+from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about, rotation_from_up, up_text
 from lidarpose.inference import crop_search, predictor
 from lidarpose.inference.backend import Raw
 from lidarpose.inference.checks import flat_axis, is_lying, rows_inside, scan_unit_warning, unit_warning
@@ -23,7 +23,7 @@ from lidarpose.inference.crop_search import candidates, select_pose
 from lidarpose.inference.inputs import MAX_POINTS, as_origin, clean
 from lidarpose.inference.predict_scan import predictor_of
 from lidarpose.inference.predictor import Predictor
-from lidarpose.inference.results import person_label
+from lidarpose.inference.results import PersonPose, person_label
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.point_cloud import Cloud
 from lidarpose.models import bundled_path
@@ -654,12 +654,29 @@ def test_saved_results_follow_schema(model, points, tmp_path, name):
     assert all(0 <= i < len(joints) and 0 <= j < len(joints) for i, j in document["skeleton"]["bones"])
     assert set(document["model"]) == {"name", "version", "backend", "decode"}
     (person,) = document["people"]
-    keys = "id box score mounted num_points person second_person joints confidence spread visible out_of_range warnings"
-    assert list(person) == keys.split()
+    keys = "id box score mounted num_points person second_person facing joints confidence spread visible"
+    assert list(person) == [*keys.split(), "out_of_range", "warnings"]
+    np.testing.assert_allclose(person["facing"], pose.facing, atol=1e-4)
     np.testing.assert_allclose(person["joints"], pose.joints, atol=1e-4)
     assert len(person["confidence"]) == len(person["spread"]) == len(person["visible"]) == len(joints)
     assert set(person["out_of_range"]) <= set(joints)
     assert pose.picture(tmp_path / "pose.png") == (tmp_path / "pose.png").read_bytes()
+
+
+@pytest.mark.parametrize("up", ["z", "-y", "x", (0.1, -0.2, 0.9)])
+def test_facing_is_level_in_the_frame_of_the_input(up):
+    joints = np.full((len(WAYMO14.joints), 3), np.nan)
+    for side, y in (("left", 0.2), ("right", -0.2)):
+        for part, z in (("hip", 0.9), ("shoulder", 1.4)):
+            joints[WAYMO14.joints.index(f"{side}_{part}")] = 0.0, y, z
+    R_input_level = rotation_from_up(up).T
+    heading = rotation_about("z", 0.7)
+    pose = Pose(joints=joints @ (R_input_level @ heading).T, skeleton=WAYMO14)
+    person = PersonPose(pose=pose, skeleton=WAYMO14, points=np.zeros((0, 3)), up=up_text(up))
+    np.testing.assert_allclose(person.facing, (R_input_level @ heading)[:, 0], atol=1e-9)
+    on_the_side = replace(pose, joints=joints @ (R_input_level @ rotation_about("x", 1.5)).T)
+    assert replace(person, pose=on_the_side).facing is None
+    assert replace(person, pose=None).facing is None
 
 
 def test_predict_file_matches_array_by_default(points, tmp_path):

@@ -12,7 +12,7 @@ import numpy as np
 from lidarpose.errors import counted
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
 from lidarpose.io.files import check_suffix, encodable, lined_json, shorten, write_atomic
-from lidarpose.sample import JOINT_COLUMNS, PER_JOINT, Box, Pose, facing_yaw
+from lidarpose.sample import JOINT_COLUMNS, PER_JOINT, Box, Pose, facing, facing_yaw
 from lidarpose.skeleton import Skeleton
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 SCHEMA = "lidarpose.poses/1"
 # decimals of the values in files, by column of tables
-_DECIMALS = {"x": 4, "y": 4, "z": 4, "confidence": 3, "spread": 4, "visible": 3}
+_DECIMALS = {"x": 4, "y": 4, "z": 4, "confidence": 3, "spread": 4, "visible": 3, "facing": 4}
 _DECIMALS |= {"person_probability": 4, "second_person": 4, "score": 4}
 
 
@@ -100,6 +100,16 @@ class PersonPose:
         return self._of_pose("in_range")
 
     @property
+    def facing(self) -> np.ndarray | None:
+        """(3,): the horizontal direction of length 1 in which hips and shoulders face, in the frame of the input; None
+        without a pose and for people who lie on their side."""
+        if self.pose is None:
+            return None
+        R_level_input = rotation_from_up(self.up)
+        forward = facing(replace(self.pose, joints=self.pose.joints @ R_level_input.T))
+        return None if forward is None else forward @ R_level_input
+
+    @property
     def person(self) -> float | None:
         """Probability that the points show a person; None if the network does not predict it."""
         return self._number("person")
@@ -149,6 +159,7 @@ class PersonPose:
             "second_person": None
             if self.second_person is None
             else round(self.second_person, _DECIMALS["second_person"]),
+            "facing": None if (forward := self.facing) is None else _rounded(forward, _DECIMALS["facing"]),
             "joints": None if self.pose is None else _rounded(self.joints, _DECIMALS["x"]),
             "confidence": _rounded(self.confidence, _DECIMALS["confidence"]),
             "spread": _rounded(self.spread, _DECIMALS["spread"]),

@@ -4,6 +4,7 @@ import contextlib
 import copy
 import logging
 import os
+import tempfile
 import warnings
 from collections.abc import Callable, Sequence
 
@@ -36,6 +37,8 @@ _OPSET = 18
 _TRACED, _CHECKED = (300, 60, 700), ((1, 2000, 37, 0, 9), (1,))
 # an exported network may differ from torch by rounding; its logits are of order ten
 _TOLERANCE = 1e-3
+# mean difference of a detector's logits, of order 5, that convolutions in 8 bits may cause
+_QUANTIZED = 0.5
 # an array with fewer values is not worth a cast node
 _WORTH = 64
 
@@ -88,11 +91,20 @@ def export(weights: str | os.PathLike, out: str | os.PathLike, *, format: str = 
         torch.export.save(program, file, extra_files=metadata)
 
 
-def export_detector(network: DetectorNet, out: str | os.PathLike, *, card: dict) -> None:
-    """Exports a detector as ONNX with float16 weights; writes the whole file or nothing.
+def export_detector(
+    network: DetectorNet, out: str | os.PathLike, *, card: dict, examples: Sequence[dict[str, np.ndarray]] = ()
+) -> None:
+    """Exports a detector as ONNX; writes the whole file or nothing.
 
-    card: of its header, see `detector.open_detector`. Raises MissingExtra without onnx, LidarPoseError if the outputs
-    of the file are not those of the network.
+    Args:
+        network: the detector.
+        out: the file.
+        card: of its header, see `detector.open_detector`.
+        examples: inputs of candidates, by which the ranges of the convolutions are determined; these then compute with
+            integers of 8 bits, in less than half of the time. Without examples they compute in float32.
+
+    Raises:
+        MissingExtra: onnx is not installed. LidarPoseError: the outputs of the file are not those of the network.
     """
     check_suffix(out, FORMATS["onnx"])
     check_writable(out)
@@ -109,7 +121,58 @@ def export_detector(network: DetectorNet, out: str | os.PathLike, *, card: dict)
         with torch.inference_mode():
             expected = network(*map(torch.as_tensor, arrays.values())).numpy()
         _check_close(OUTPUT, expected, session.run([OUTPUT], arrays)[0])
+    if examples:
+        content = with_digest(_quantized(content, examples, metadata))
+        _check_quantized(session, open_session(content), examples)
     write_atomic(out, content)
+
+
+def _quantized(content: bytes, examples: Sequence[dict[str, np.ndarray]], metadata: dict[str, str]) -> bytes:
+    """The content of an ONNX file with convolutions in 8 bits. Weights have 7, with which processors without VNNI do
+    not saturate."""
+    import onnx
+    from onnxruntime.quantization import CalibrationDataReader, QuantType, quantize_static
+    from onnxruntime.quantization.shape_inference import quant_pre_process
+
+    class Examples(CalibrationDataReader):
+        def __init__(self):
+            self.rest = iter(examples)
+
+        def get_next(self):
+            return next(self.rest, None)
+
+    with tempfile.TemporaryDirectory() as folder, _silence():
+        original, folded, quantized = (os.path.join(folder, f"{name}.onnx") for name in ("original", "folded", "out"))
+        with open(original, "wb") as file:
+            file.write(content)
+        quant_pre_process(original, folded, skip_symbolic_shape=True)
+        quantize_static(
+            folded,
+            quantized,
+            Examples(),
+            op_types_to_quantize=["Conv"],
+            per_channel=True,
+            reduce_range=True,
+            activation_type=QuantType.QUInt8,
+            weight_type=QuantType.QInt8,
+        )
+        model = onnx.load(quantized)
+    _pack(model.graph)
+    del model.metadata_props[:]
+    onnx.helper.set_model_props(model, metadata)
+    model.producer_name, model.producer_version = "lidarpose", __version__
+    onnx.checker.check_model(model)
+    return model.SerializeToString(deterministic=True)
+
+
+def _check_quantized(session, quantized_session, examples: Sequence[dict[str, np.ndarray]]) -> None:
+    """Raises LidarPoseError if quantization changes the logits by more than `_QUANTIZED` on average."""
+    errors = [np.abs(quantized_session.run(None, e)[0] - session.run(None, e)[0])[:, 0] for e in examples]
+    if not (error := float(np.concatenate(errors).mean())) <= _QUANTIZED:
+        raise LidarPoseError(
+            f"convolutions in 8 bits change the detector's logits by {error:.2f} on average, more than {_QUANTIZED}, "
+            "so nothing was written: train it for longer"
+        )
 
 
 def trace(network: PoseNet) -> torch.export.ExportedProgram:

@@ -19,15 +19,18 @@ from lidarpose.inference.verification import FEATURES, VerifiedPeople, verificat
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.detector.detector import MAX_RANGE, Detections, Detector
 from lidarpose.models.detector.network import DetectorNet
+from lidarpose.models.detector.render import render
 from lidarpose.models.export import export_detector
 from lidarpose.progress import Progress
 from lidarpose.synth.detection_scene import detection_scene
-from lidarpose.train.detector.candidate_source import as_detected
+from lidarpose.train.detector.candidate_source import as_detected, scan_example
 from lidarpose.train.run_dir import MODEL
 
 DETECTOR = "detector.onnx"
 # a seed that neither training runs nor benchmarks use
 _SEED = 2**31 - 11
+# number of training scans whose candidates determine the ranges of the quantized convolutions
+_QUANTIZED_ON = 30
 # false positives per scan at the default score
 FALSE_PER_SCAN = 1.0
 # score threshold of the detections that the calibration is fitted to
@@ -51,7 +54,9 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
     if not isinstance(network, DetectorNet):
         raise InputError(f"{path}: expected a detector, got a network of the kind {header.network}")
     out = Path(folder) / DETECTOR
-    export_detector(network, out, card=header.card)
+    candidates = [scan_example(_SEED, number).candidates for number in range(_QUANTIZED_ON)]
+    examples = [render(scan_candidates) for scan_candidates in candidates if len(scan_candidates)]
+    export_detector(network, out, card=header.card, examples=examples)
     detector = Detector(out)
 
     tables: list[ScanTable] = []
@@ -68,11 +73,11 @@ def calibrate(folder: str | Path, scans: int, *, labeled: str | Path | None = No
             tables.append(ScanTable(detections=detections, features=features, people=people, verify=verify))
             bar.update(number + 1)
     card = header.card | fit(tables) | {"calibrated_on": scans}
-    export_detector(network, out, card=card)
+    export_detector(network, out, card=card, examples=examples)
     if labeled is not None:
         (result,), _ = run_detector(weights=out, heldout=False, folders=[labeled], max_range=MAX_RANGE)
         card |= {"default_score": max(card["default_score"], result.thresholds[f"{FALSE_PER_SCAN:g}"])}
-        export_detector(network, out, card=card | {"labeled_scans": result.scans})
+        export_detector(network, out, examples=examples, card=card | {"labeled_scans": result.scans})
     return out
 
 
