@@ -60,8 +60,8 @@ def _paper(commands, execute: Callable[[list[str]], int], options: argparse.Name
     out = Path(options.out)
     check_out(out)
     if options.name == "fig6":
-        if options.rows:
-            raise InputError("fig6 has no rows: omit --rows")
+        if options.rows or options.data:
+            raise InputError("fig6 shows a synthesized body and has no rows: omit --rows and --data")
         if options.dry_run:
             print("# Figure 6: synthesized bodies\n\nDrawn at once; there is nothing to train.")
             return
