@@ -33,7 +33,7 @@ def run(arguments: list[str] | None = None) -> int:
     if unknown:
         # the error points to the command's own help, which lists its options
         parser.prog = " ".join(filter(None, (parser.prog, options.command)))
-        parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}{_hint(options.command, unknown)}")
     if options.command is None:
         parser.print_help()
         return 0
@@ -70,6 +70,13 @@ def run(arguments: list[str] | None = None) -> int:
         # training puts into the message how to resume
         return _ended(str(interrupt) or "stopped", getattr(interrupt, "status", 130))
     return 0
+
+
+def _hint(command: str | None, unknown: list[str]) -> str:
+    """What to do instead about names of pictures and pages, "" for other arguments."""
+    if command != "predict" or any(os.path.splitext(word)[1].lower() not in (".png", ".html") for word in unknown):
+        return ""
+    return ": --picture and --html take no file name, --out NAME.json also gives NAME.png and NAME.html"
 
 
 def _warning_line(message: Warning | str, *place: object, **line: object) -> str:
