@@ -539,7 +539,7 @@ def with_bytes(content, place, new):
 BAD = {
     "empty": ("a.pcd", b"", ["empty"]),
     "unknown suffix": ("a.las2", ROWS, ["'.las2'", *SUFFIXES]),
-    "livox recording": ("a.lvx2", ROWS, ["'.lvx2'", "Livox Viewer"]),
+    "livox recording": ("a.lvx3", ROWS, ["'.lvx3'", "Livox Viewer"]),
     "ouster recording": ("a.osf", ROWS, ["'.osf'", "ouster-cli source FILE.osf save FILE.pcap"]),
     "e57": ("a.e57", ROWS, ["'.e57'", ".las or .ply"]),
     "no suffix": ("cloud", ROWS, ["suffix ''", ".pcd"]),

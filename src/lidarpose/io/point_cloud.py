@@ -41,7 +41,7 @@ _SIX, _FEWEST_ROWS = 6, 20
 _FAR, _NARROWEST = 1e3, 1e-3
 
 # suffixes of files with many scans
-RECORDINGS = (".mcap", ".bag", ".db3", ".pcap", ".pcapng")
+RECORDINGS = (".mcap", ".bag", ".db3", ".pcap", ".pcapng", ".lvx", ".lvx2")
 # first bytes of other formats that users rename by mistake, with the remedy; too long to occur as float32 coordinates
 _FOREIGN = {
     rb"\x1f\x8b\x08[\x00-\x1f]": "is gzip-compressed: unpack it first (gunzip)",
@@ -56,7 +56,7 @@ _FOREIGN = {
     rb"version https://git-lfs": "is a Git LFS pointer, not the data: run `git lfs pull`",
 }
 # how to convert files of other formats
-_CONVERTED = dict.fromkeys((".lvx", ".lvx2", ".lvx3"), "export it with Livox Viewer as .las or .csv")
+_CONVERTED = {".lvx3": "export it with Livox Viewer as .las or .csv"}
 _CONVERTED |= {".osf": "convert it (ouster-cli source FILE.osf save FILE.pcap)"}
 _CONVERTED |= dict.fromkeys((".e57", ".ptx", ".fls"), "export it as .las or .ply (CloudCompare does)")
 _MAGIC = {

@@ -31,6 +31,7 @@ __all__ = ["RECORDINGS", "DamagedFrame", "Frame", "FrameSource", "is_single_scan
 
 # for each suffix in `RECORDINGS`, the module whose `open_recording(path, options)` reads it
 _READERS = {".mcap": "rosbag", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "ouster", ".pcapng": "ouster"}
+_READERS |= {".lvx": "lvx", ".lvx2": "lvx"}
 # the start time in the name of a part of a ROS 1 recording
 _DATE = re.compile(r"_\d{4}(-\d\d){5}(?=_\d+\.bag$)")
 
@@ -53,7 +54,8 @@ def open_source(
 
     Args:
         paths: one or several of: point files, folders of them, patterns such as "drive/*.pcd", recordings (.mcap .bag
-            .db3 .pcap, folders of ROS 2 bags), folders of KITTI and nuScenes. Several recordings are concatenated.
+            .db3 .pcap .lvx .lvx2, folders of ROS 2 bags), folders of KITTI and nuScenes. Several recordings are
+            concatenated.
         columns: values per row of .bin files, see `read_points`.
         topic: the topic to read if a recording has several with points; for nuScenes, the scene.
         meta: the JSON file of an Ouster sensor; None for the file next to the recording with the same stem.
