@@ -397,3 +397,36 @@ def test_velodyne_capture_beside_another_json_is_read(tmp_path):
     path = write(tmp_path / "a.pcap", [ip4(vlp16(k * 480 % 36000, k * 1330))[0] for k in range(80)], period=1330)
     path.with_suffix(".json").write_text("[]")
     assert len(list(open_source(path))) == 2
+
+
+def livox(points, stamp=0, first_protocol=False):
+    """A packet of a Livox sensor: points (96, 3) m in mm, with reflectivity and tag."""
+    data = b"".join(struct.pack("<3iBB", *row, 9, 0) for row in np.rint(1e3 * points).astype(int).tolist())
+    if first_protocol:
+        return struct.pack("<4BI2BQ", 5, 1, 1, 0, 0, 0, 2, stamp) + data
+    return struct.pack("<BHHHHBBB12xIQ", 0, 36 + len(data), 100, len(points), 0, 0, 1, 0, 0, stamp) + data
+
+
+@pytest.mark.parametrize("first_protocol", [False, True])
+def test_livox_packets_become_frames(tmp_path, first_protocol):
+    rng = np.random.default_rng(0)
+    clouds = np.round(rng.uniform(-30, 30, (30, 96, 3)), 3)
+    clouds[3, 5] = 0
+    packets = [ip4(livox(points, first_protocol=first_protocol))[0] for points in clouds]
+    # measurements of motion, and packets of the same size that are not of points
+    others = [*ip4(bytes(60)), *ip4(bytes(len(livox(clouds[0], first_protocol=first_protocol))))]
+    source = open_source(write(tmp_path / "a.pcap", [*packets[:5], *others, *packets[5:]], period=10_000))
+    frames = list(source)
+    assert [frame.time for frame in frames] == pytest.approx([1000.0005, 1000.1005, 1000.2005, 1000.3005])
+    points = np.concatenate([frame.points for frame in frames])
+    np.testing.assert_allclose(points, clouds.reshape(-1, 3)[clouds.reshape(-1, 3).any(1)], atol=1e-9)
+    assert not source.warnings and frames[0].origin.tolist() == [0, 0, 0]
+    # a JSON file of something else beside it, and changed bytes
+    (tmp_path / "a.json").write_text("[]")
+    assert len(list(open_source(tmp_path / "a.pcap"))) == 4
+    for content in with_changed_bytes((tmp_path / "a.pcap").read_bytes(), rng, 5):
+        (tmp_path / "b.pcap").write_bytes(content)
+        try:
+            list(open_source(tmp_path / "b.pcap"))
+        except InputError as error:
+            assert "\n" not in str(error)

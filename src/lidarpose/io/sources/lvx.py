@@ -19,7 +19,7 @@ from lidarpose.io.sources.frame import IndexedRecording, ReadingOptions, Sweep
 
 _SIGNATURE, _MAGIC = b"livox_tech", 0xAC0EA767
 # duration that frames are joined to, s: one alone, of 50 ms, has few points on a person
-_DURATION = 0.1
+DURATION = 0.1
 # headers: of the file (signature, version, magic number), of the recording (duration of a frame, ms, number of devices)
 # and of a frame (its offset, that of the next frame, its number)
 _PUBLIC, _PRIVATE, _FRAME = struct.Struct("<16s4BI"), struct.Struct("<IB"), struct.Struct("<3q")
@@ -39,7 +39,7 @@ def _spherical(depth: int, angles: int, size: int) -> np.dtype:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Version:
+class Version:
     """A version of the format. device, package: their headers, whose fields are named below; layouts: of points, by
     data type, None for other data; counts: points of a package by data type; empty if a package states its bytes."""
 
@@ -50,8 +50,8 @@ class _Version:
 
 
 # of several returns the first
-_VERSIONS = {
-    1: _Version(
+VERSIONS = {
+    1: Version(
         # serial numbers, index, type, whether the pose is used, roll, pitch, yaw, x, y, z
         device=struct.Struct("<32xBxB6f"),
         # device, data type
@@ -63,7 +63,7 @@ _VERSIONS = {
         },
         counts={0: 100, 1: 100, 2: 96, 3: 96, 4: 48, 5: 48, 6: 1, 7: 30, 8: 30},
     ),
-    2: _Version(
+    2: Version(
         device=struct.Struct("<32xI2xB6f"),
         # device, data type, bytes of data
         package=struct.Struct("<xI12xBI5x"),
@@ -88,7 +88,7 @@ def open_recording(path: Path, options: ReadingOptions) -> IndexedRecording:
         _, major, *minor, magic = _PUBLIC.unpack_from(head)
         duration, num_devices = _PRIVATE.unpack_from(head, _PUBLIC.size)
         number = ".".join(map(str, (major, *minor)))
-        version = _VERSIONS.get(major)
+        version = VERSIONS.get(major)
         if version is None or (major, minor[0]) == (1, 0) or magic != _MAGIC:
             problem = f"expected a recording of version 1.1 or 2.0, got {number}"
             raise file_error(path, f"{problem}: open it in Livox Viewer and export it as .las or .csv")
@@ -98,7 +98,7 @@ def open_recording(path: Path, options: ReadingOptions) -> IndexedRecording:
         places, warnings = _frame_places(file)
     if duration < 1:
         raise file_error(path, "states no duration of its frames: export it again")
-    joined = max(round(1e3 * _DURATION / duration), 1)
+    joined = max(round(1e3 * DURATION / duration), 1)
     groups = [places[k : k + joined] for k in range(0, len(places), joined)]
     if not np.isfinite([values for _, is_used, *values in devices if is_used]).all():
         raise file_error(path, "states a sensor's pose that is no number: export it again")
@@ -137,7 +137,7 @@ def _frame_places(file: BinaryIO) -> tuple[list[tuple[int, int]], list[str]]:
 
 def _read(
     path: Path,
-    version: _Version,
+    version: Version,
     poses: dict[int, np.ndarray],
     num_devices: int,
     groups: Sequence[Sequence[tuple[int, int]]],
@@ -163,7 +163,7 @@ def _read(
                     warnings.add("a package is cut off")
                 if layout is not None:
                     rows = np.frombuffer(package, layout, len(package) // itemsize)
-                    points = _points(rows)
+                    points = decode_points(rows)
                     # a missing return stays 0, 0, 0
                     is_return = points.any(1)
                     T = poses.get(device, np.eye(4))
@@ -173,8 +173,8 @@ def _read(
     return Sweep(points=np.concatenate(clouds), origin=origin, warnings=tuple(sorted(warnings)))
 
 
-def _points(rows: np.ndarray) -> np.ndarray:
-    """(n, 3) m of rows of a layout."""
+def decode_points(rows: np.ndarray) -> np.ndarray:
+    """(n, 3) m of rows of a layout of `VERSIONS`; 0, 0, 0 for missing returns."""
     if "xyz" in (rows.dtype.names or ()):
         # of 32 bits in mm, of 16 bits in cm
         return rows["xyz"] * (1e-3 if rows["xyz"].dtype.itemsize == 4 else 1e-2)

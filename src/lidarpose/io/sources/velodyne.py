@@ -12,6 +12,7 @@ import numpy as np
 from lidarpose.errors import InputError, needs_extra
 from lidarpose.io.files import FormatError, file_error, shorten
 from lidarpose.io.sources.frame import ReadingOptions, Sweep
+from lidarpose.io.sources.livox_packets import recording_of
 from lidarpose.io.sources.pcap import Capture, Datagram, PacketRecording
 
 PACKET_BYTES = 1206
@@ -30,8 +31,8 @@ _RING = 6
 _NUM_TRIED, _NUM_PEEKED = 2000, 5
 
 
-def open_recording(path: Path, options: ReadingOptions) -> "VelodyneRecording":
-    """Opens a capture of a Velodyne sensor.
+def open_recording(path: Path, options: ReadingOptions) -> PacketRecording:
+    """Opens a capture of a Velodyne or Livox sensor.
 
     Raises:
         InputError: The file is not a capture, or is of another sensor.
@@ -41,19 +42,22 @@ def open_recording(path: Path, options: ReadingOptions) -> "VelodyneRecording":
     sizes = [len(payload) for payload in payloads]
     if PACKET_BYTES in sizes:
         return VelodyneRecording(path)
+    if (livox := recording_of(path, payloads)) is not None:
+        return livox
     if not sizes:
-        raise file_error(path, "has no UDP packets; expected packets of an Ouster or Velodyne sensor")
+        raise file_error(path, "has no UDP packets; expected packets of an Ouster, Velodyne or Livox sensor")
     for vendor, preamble in _OTHERS.items():
         if sum(payload.startswith(preamble) for payload in payloads) > len(payloads) / 4:
-            problem = f"has packets of a {vendor} sensor; expected those of an Ouster or Velodyne sensor"
+            problem = f"has packets of a {vendor} sensor; expected those of an Ouster, Velodyne or Livox sensor"
             raise file_error(path, f"{problem}: convert it to a ROS bag with {vendor}'s driver, or to .pcd files")
     problem = f"an Ouster recording needs its metadata {path.stem}.json beside it, or the path of another file (meta)"
     raise file_error(path, f"{problem} (a Velodyne's packets have {PACKET_BYTES} bytes, these have up to {max(sizes)})")
 
 
 def is_capture_of(path: Path) -> bool:
-    """Whether a capture has packets of a Velodyne sensor. Raises InputError if it cannot be read."""
-    return any(len(payload) == PACKET_BYTES for payload in _first_payloads(path))
+    """Whether `open_recording` reads a capture's packets. Raises InputError if it cannot be read."""
+    payloads = _first_payloads(path)
+    return any(len(payload) == PACKET_BYTES for payload in payloads) or recording_of(path, payloads) is not None
 
 
 def _first_payloads(path: Path) -> list[bytes]:
