@@ -398,7 +398,8 @@ def train(
 def save(
     students: list[Student], options: argparse.Namespace, step: int, fresh: int, seconds: float, init_card: dict
 ) -> None:
-    command = " ".join(["python tools/train_on_gpu.py OUT", *sys.argv[2:]])
+    words = [Path(word).name if word == options.motion else word for word in sys.argv[2:]]
+    command = " ".join(["python tools/train_on_gpu.py OUT", *words])
     recipe = {"seed": options.seed, "batch": options.batch}
     card = {"command": command, "recipe": recipe, "people_seen": fresh * options.batch}
     card |= {
