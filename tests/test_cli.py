@@ -651,7 +651,10 @@ def test_quiet_prints_errors_only(crop, tmp_path, capsys):
         ("predct a.pcd", "invalid choice: 'predct', did you mean predict?; see lidarpose --help"),
         ("qqqq", "invalid choice: 'qqqq' (choose from"),
         ("detect a.pcd --picture", "unrecognized arguments: --picture; see lidarpose detect --help"),
-        ("predict a.pcd --picture a.png", "--picture and --html take no file name, --out NAME.json also gives"),
+        (
+            "predict a.pcd --picture a.png",
+            "--picture and --html take no file name, they are named as --out, NAME.png beside NAME.json",
+        ),
     ],
 )
 def test_usage_errors_refer_to_help(words, problem, capsys):

@@ -11,6 +11,7 @@ import lidarpose
 from lidarpose.cli import main
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
+from lidarpose.io.sources import lvx
 
 MAGIC = 0xAC0EA767
 # number of points and bytes of a package by type of data, in version 1
@@ -37,10 +38,11 @@ def spherical_rows(points, size, is_dual):
     return b"".join(rows)
 
 
-def package(major, kind, data, device=1):
+def package(major, kind, data, device=1, stamp_type=0, seconds=5):
+    stamp = seconds * 10**9
     if major == 1:
-        return struct.pack("<5BI2BQ", device, 5, 0, 0, 0, 0, 0, kind, 123) + data
-    return struct.pack("<BIBBQHBIB4x", 0, device, 0, 0, 123, 0, kind, len(data), 0) + data
+        return struct.pack("<5BI2BQ", device, 5, 0, 0, 0, 0, stamp_type, kind, stamp) + data
+    return struct.pack("<BIBBQHBIB4x", 0, device, 0, stamp_type, stamp, 0, kind, len(data), 0) + data
 
 
 def recording(major, frames, devices=((1, 0, (0.0,) * 6),), duration=50, minor=1):
@@ -69,12 +71,15 @@ def cloud(count, seed=0):
 def test_lvx2_frames_are_joined_to_a_tenth_of_a_second(tmp_path):
     clouds = [cloud(30, seed=k) for k in range(5)]
     frames = frames_of(tmp_path, recording(2, [package(2, 1, rows_of(points, 14)) for points in clouds]))
-    assert [frame.time for frame in frames] == pytest.approx([0.0, 0.1, 0.2])
+    assert [frame.time for frame in frames] == pytest.approx([5.0, 5.1, 5.2])
     for k, frame in enumerate(frames):
         np.testing.assert_allclose(frame.points, np.concatenate(clouds[2 * k : 2 * k + 2]), atol=1e-9)
         assert frame.origin.tolist() == [0, 0, 0] and frame.T_world_sensor is None and frame.warnings == ()
+    assert [len(f.points) for f in frames_of(tmp_path, (tmp_path / "walk.lvx2").read_bytes(), start=0.05, end=0.1)] == [
+        60
+    ]
     slow = frames_of(tmp_path, recording(2, [package(2, 1, rows_of(clouds[0], 14))] * 3, duration=200))
-    assert [frame.time for frame in slow] == pytest.approx([0.0, 0.2, 0.4])
+    assert [frame.time for frame in slow] == pytest.approx([5.0, 5.2, 5.4])
 
 
 def test_lvx2_types_of_points(tmp_path):
@@ -115,6 +120,28 @@ def test_poses_of_sensors_apply_if_they_are_used(tmp_path, major):
     (frame,) = frames_of(tmp_path, both)
     np.testing.assert_allclose(frame.points, np.concatenate([there, points]), atol=1e-5)
     assert frame.origin is None
+    warning = "1 of 2 sensors have no pose in use, so their points may overlap"
+    assert lidarpose.open_source(tmp_path / "walk.lvx2").warnings == (warning,)
+
+
+def test_recordings_of_a_folder_follow_one_another(tmp_path):
+    for k, name in enumerate("abc"):
+        packages = package(2, 1, rows_of(cloud(30, seed=k), 14), seconds=10 * k)
+        (tmp_path / f"{name}.lvx2").write_bytes(recording(2, [packages] * 4))
+    source = lidarpose.open_source(tmp_path)
+    assert [frame.time for frame in source] == pytest.approx([0, 0.1, 10, 10.1, 20, 20.1]) and not source.warnings
+    # a date instead of nanoseconds
+    dated = recording(1, [package(1, 2, rows_of(cloud(96), 14), stamp_type=3)] * 2)
+    assert frames_of(tmp_path, dated)[0].time == 0
+
+
+@pytest.mark.parametrize("empty", [0, 2, 5])
+def test_frames_may_be_empty(tmp_path, empty):
+    packages = [package(2, 1, rows_of(cloud(30, seed=k), 14)) for k in range(6)]
+    packages[empty] = b""
+    frames = frames_of(tmp_path, recording(2, packages))
+    assert [len(frame.points) for frame in frames] == [60 - 30 * (empty // 2 == k) for k in range(3)]
+    assert not lidarpose.open_source(tmp_path / "walk.lvx2").warnings
 
 
 def test_damaged_lvx2_recordings(tmp_path):
@@ -128,13 +155,22 @@ def test_damaged_lvx2_recordings(tmp_path):
     frames = frames_of(tmp_path, unknown)
     assert "type 9" in frames[1].error
     assert len(frames[0].points) == len(frames[2].points) == 60
-    # frames after a wrong offset are lost
-    start = len(content) - 2 * frame_size
-    source = tmp_path / "offset.lvx2"
-    source.write_bytes(content[:start] + struct.pack("<q", 5) + content[start + 8 :])
-    recorded = lidarpose.open_source(source)
-    assert [len(frame.points) for frame in recorded] == [60, 60]
-    assert recorded.warnings == ("frame 4 is damaged: the recording ends there",)
+
+
+@pytest.mark.parametrize("offset, place", [(5, 0), (0, 8), (5, 8), (-1, 8), (2**40, 8)])
+def test_frames_after_a_wrong_offset_are_lost(tmp_path, monkeypatch, offset, place):
+    packages = [package(2, 1, rows_of(cloud(30, seed=k), 14)) for k in range(6)]
+    content = recording(2, packages)
+    frame_size = 24 + len(packages[0])
+    start = len(content) - 2 * frame_size + place
+    path = tmp_path / "offset.lvx2"
+    path.write_bytes(content[:start] + struct.pack("<q", offset) + content[start + 8 :])
+    monkeypatch.setattr(lvx, "_MOST_BYTES", len(packages[0]))
+    source = lidarpose.open_source(path)
+    # the frame whose own offset is wrong is lost, too
+    assert [len(frame.points) for frame in source] == [60, 60] + [30] * (place > 0)
+    seconds = "0.20" if place == 0 else "0.25"
+    assert source.warnings == (f"ends after {seconds} s, within a damaged or cut off frame",)
 
 
 @pytest.mark.parametrize(
@@ -143,9 +179,9 @@ def test_damaged_lvx2_recordings(tmp_path):
         (b"", "expected a recording of Livox Viewer"),
         (b"x,y,z\n1,2,3\n" * 20, "expected a recording of Livox Viewer"),
         (recording(1, [b""], minor=0), "expected a recording of version 1.1 or 2.0, got 1.0.0.0"),
-        (recording(2, [b""]).replace(struct.pack("<I", MAGIC), b"1234"), "version 1.1 or 2.0"),
-        (recording(2, [b""], duration=0), "states no duration"),
-        (recording(2, [b""], devices=[(1, 1, (np.nan,) * 6)]), "states a sensor's pose that is no number"),
+        (recording(2, [b""]).replace(struct.pack("<I", MAGIC), b"1234"), "damaged in its first bytes"),
+        (recording(2, [b""], duration=0), "damaged in its first bytes"),
+        (recording(2, [b""], devices=[(1, 1, (np.nan,) * 6)]), "damaged in its first bytes"),
         (recording(2, []), "has no frames"),
     ],
 )
@@ -158,13 +194,17 @@ def test_other_files_are_refused(tmp_path, capsys, content, problem):
     assert problem in capsys.readouterr().err and not list(tmp_path.glob("*.json*"))
 
 
-@given(place=st.integers(0, 400), value=st.integers(0, 255), length=st.integers(0, 600))
-def test_changed_bytes_never_raise_other_errors(tmp_path_factory, place, value, length):
-    content = bytearray(recording(2, [package(2, 1, rows_of(cloud(9), 14)), package(2, 2, rows_of(cloud(9), 8, 1e-2))]))
-    content[place % len(content)] = value
+@given(major=st.sampled_from([1, 2]), place=st.integers(0, 700), value=st.integers(0, 255), length=st.integers(0, 3000))
+def test_changed_bytes_raise_no_other_errors(tmp_path_factory, major, place, value, length):
+    points, pose = cloud(96), (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+    packages = package(major, 1 if major == 2 else 2, rows_of(points, 14)) + package(major, 0, b"\0" * 1300)
+    content = bytearray(recording(major, [packages, b"", packages], devices=[(1, 1, pose)]))
+    content[place] = value
     path = tmp_path_factory.mktemp("lvx") / "a.lvx2"
     path.write_bytes(bytes(content[:length]))
     try:
-        list(lidarpose.open_source(path))
+        frames = list(lidarpose.open_source(path))
     except InputError as error:
         assert "\n" not in str(error)
+    else:
+        assert not any(frame.error.startswith("cannot be read") for frame in frames if hasattr(frame, "error"))

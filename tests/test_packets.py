@@ -413,14 +413,17 @@ def test_livox_packets_become_frames(tmp_path, first_protocol):
     clouds = np.round(rng.uniform(-30, 30, (30, 96, 3)), 3)
     clouds[3, 5] = 0
     packets = [ip4(livox(points, first_protocol=first_protocol))[0] for points in clouds]
-    # measurements of motion, and packets of the same size that are not of points
-    others = [*ip4(bytes(60)), *ip4(bytes(len(livox(clouds[0], first_protocol=first_protocol))))]
-    source = open_source(write(tmp_path / "a.pcap", [*packets[:5], *others, *packets[5:]], period=10_000))
+    # packets of the same size that are not of points, one of a Velodyne's size, and measurements of motion
+    others = [*ip4(bytes(len(livox(clouds[0], first_protocol=first_protocol))), port=443), *ip4(bytes(1206), port=443)]
+    others += ip4(bytes(60))
+    ips = [*others[:2], *packets[:5], *others, *packets[5:]]
+    source = open_source(write(tmp_path / "a.pcap", ips, period=10_000))
     frames = list(source)
-    assert [frame.time for frame in frames] == pytest.approx([1000.0005, 1000.1005, 1000.2005, 1000.3005])
+    assert [frame.time for frame in frames] == pytest.approx([1000.0205, 1000.1205, 1000.2205, 1000.3205])
     points = np.concatenate([frame.points for frame in frames])
     np.testing.assert_allclose(points, clouds.reshape(-1, 3)[clouds.reshape(-1, 3).any(1)], atol=1e-9)
-    assert not source.warnings and frames[0].origin.tolist() == [0, 0, 0]
+    assert source.warnings == ("2 lidar packets of another sensor are left out",)
+    assert frames[0].origin.tolist() == [0, 0, 0]
     # a JSON file of something else beside it, and changed bytes
     (tmp_path / "a.json").write_text("[]")
     assert len(list(open_source(tmp_path / "a.pcap"))) == 4

@@ -410,6 +410,7 @@ def test_paper_dry_run_runs_nothing(tmp_path, monkeypatch, capsys):
         (["table1", "--data", "waymo=nowhere"], "is not a prepared dataset"),
         (["table1", "--data", "freemotion-poses=x"], "needs a dataset to score on"),
         (["fig6", "--rows", "dapt"], "omit --rows and --data"),
+        (["fig6", "--data", "waymo=x"], "omit --rows and --data"),
         (["table1", "--held-out", "2"], "--motion"),
         (["table1", "--out", "file"], "give another by --out"),
     ],

@@ -76,7 +76,7 @@ def _hint(command: str | None, unknown: list[str]) -> str:
     """What to do instead about names of pictures and pages, "" for other arguments."""
     if command != "predict" or any(os.path.splitext(word)[1].lower() not in (".png", ".html") for word in unknown):
         return ""
-    return ": --picture and --html take no file name, --out NAME.json also gives NAME.png and NAME.html"
+    return ": --picture and --html take no file name, they are named as --out, NAME.png beside NAME.json or NAME.jsonl"
 
 
 def _warning_line(message: Warning | str, *place: object, **line: object) -> str:

@@ -54,14 +54,14 @@ def _paper(commands, execute: Callable[[list[str]], int], options: argparse.Name
     from lidarpose.paper.tables import TABLES, Options, cells
 
     check_name("table or figure", options.name, _NAMES)
+    if options.name == "fig6" and (options.rows or options.data):
+        raise InputError("fig6 shows a synthesized body and has no rows: omit --rows and --data")
     budget = {name: getattr(options, name) for name in ("people", "hours", "seeds", "workers", "size")}
     budget |= {"subjects": options.subjects or "", "held_out": options.held_out or ""}
     paper_options = Options(data=_data(options.data), motion=names(options.motion or ""), **budget)
     out = Path(options.out)
     check_out(out)
     if options.name == "fig6":
-        if options.rows or options.data:
-            raise InputError("fig6 shows a synthesized body and has no rows: omit --rows and --data")
         if options.dry_run:
             print("# Figure 6: synthesized bodies\n\nDrawn at once; there is nothing to train.")
             return

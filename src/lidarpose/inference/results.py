@@ -101,8 +101,9 @@ class PersonPose:
 
     @property
     def facing(self) -> np.ndarray | None:
-        """(3,): the horizontal direction of length 1 in which hips and shoulders face, in the frame of the input; None
-        without a pose and for people who lie on their side."""
+        """(3,): the horizontal direction of length 1 in which hips and shoulders face, in the frame of the input; for
+        people who lie on the back or belly, toward their feet or head. None without a pose and for people who lie on
+        their side."""
         if self.pose is None:
             return None
         R_level_input = rotation_from_up(self.up)

@@ -5,7 +5,7 @@ Avia, Horizon, Tele-15); all numbers are little-endian.
 """
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -13,11 +13,12 @@ import numpy as np
 
 from lidarpose.io.sources.frame import Sweep
 from lidarpose.io.sources.lvx import DURATION, VERSIONS, decode_points
-from lidarpose.io.sources.pcap import PacketRecording
+from lidarpose.io.sources.pcap import Datagram, PacketRecording
 
 # headers: of the first protocol (version, data type), and of the second (version, bytes, number of points, data type)
 _FIRST, _SECOND = struct.Struct("<B8xB8x"), struct.Struct("<BH2xH3xB25x")
-# version that packets of the first protocol state
+# more packets than a sensor sends in a frame; version that packets of the first protocol state
+_MOST_PACKETS = 2000
 _FIRST_VERSION = 5
 
 
@@ -46,8 +47,8 @@ class LivoxRecording(PacketRecording):
         for packet in self.packets():
             if points_layout(packet.payload) is None:
                 continue
-            # a jump back in time begins a frame, too
-            if payloads and not start <= packet.time < start + DURATION:
+            # a jump back in time begins a frame, too, as do more packets than a sensor sends, if times are not known
+            if payloads and (not start <= packet.time < start + DURATION or len(payloads) >= _MOST_PACKETS):
                 yield start, partial(_sweep, payloads)
                 payloads = []
             start = start if payloads else packet.time
@@ -56,10 +57,15 @@ class LivoxRecording(PacketRecording):
             yield start, partial(_sweep, payloads)
 
 
-def recording_of(path: Path, payloads: Sequence[bytes]) -> LivoxRecording | None:
-    """The recording if the first payloads of a capture are of a Livox sensor, else None."""
-    size = next((len(payload) for payload in payloads if points_layout(payload) is not None), None)
-    return None if size is None else LivoxRecording(path, size)
+def recording_of(path: Path, packets: Iterable[Datagram]) -> LivoxRecording | None:
+    """The recording of the sensor that sent the first packet of points among the first packets of a capture, or None
+    without any."""
+    first_packet = next((packet for packet in packets if points_layout(packet.payload) is not None), None)
+    if first_packet is None:
+        return None
+    recording = LivoxRecording(path, len(first_packet.payload))
+    recording.flow = first_packet.flow
+    return recording
 
 
 def _sweep(payloads: Sequence[bytes]) -> Sweep:

@@ -38,12 +38,14 @@ def open_recording(path: Path, options: ReadingOptions) -> PacketRecording:
         InputError: The file is not a capture, or is of another sensor.
         MissingExtra: The library that decodes it is not installed.
     """
-    payloads = _first_payloads(path)
+    packets = _first_packets(path)
+    # before Velodyne's, which have nothing but their size in common
+    if (livox := recording_of(path, packets)) is not None:
+        return livox
+    payloads = [packet.payload for packet in packets]
     sizes = [len(payload) for payload in payloads]
     if PACKET_BYTES in sizes:
         return VelodyneRecording(path)
-    if (livox := recording_of(path, payloads)) is not None:
-        return livox
     if not sizes:
         raise file_error(path, "has no UDP packets; expected packets of an Ouster, Velodyne or Livox sensor")
     for vendor, preamble in _OTHERS.items():
@@ -56,19 +58,19 @@ def open_recording(path: Path, options: ReadingOptions) -> PacketRecording:
 
 def is_capture_of(path: Path) -> bool:
     """Whether `open_recording` reads a capture's packets. Raises InputError if it cannot be read."""
-    payloads = _first_payloads(path)
-    return any(len(payload) == PACKET_BYTES for payload in payloads) or recording_of(path, payloads) is not None
+    packets = _first_packets(path)
+    return any(len(packet.payload) == PACKET_BYTES for packet in packets) or recording_of(path, packets) is not None
 
 
-def _first_payloads(path: Path) -> list[bytes]:
+def _first_packets(path: Path) -> list[Datagram]:
     """Raises InputError if the capture is damaged before its first datagram."""
-    payloads: list[bytes] = []
+    packets: list[Datagram] = []
     try:
-        payloads += (datagram.payload for datagram in islice(Capture(path), _NUM_TRIED))
+        packets += islice(Capture(path), _NUM_TRIED)
     except InputError:
-        if not payloads:
+        if not packets:
             raise
-    return payloads
+    return packets
 
 
 class VelodyneRecording(PacketRecording):
