@@ -71,7 +71,7 @@ def recording_of(path: Path, packets: Iterable[Datagram]) -> LivoxRecording | No
 def _sweep(payloads: Sequence[bytes]) -> Sweep:
     clouds = []
     for payload in payloads:
-        if (found := points_layout(payload)) is not None:
-            place, layout = found
+        if (place_and_layout := points_layout(payload)) is not None:
+            place, layout = place_and_layout
             clouds.append(decode_points(np.frombuffer(payload, layout, offset=place)))
     return Sweep(points=np.concatenate(clouds), origin=np.zeros(3))

@@ -122,7 +122,7 @@ def _open(path: Path, file: BinaryIO) -> IndexedRecording:
         name=str(path),
         ids=[f"{k:06d}" for k in range(len(groups))],
         times=[start + 1e-3 * duration * joined * k for k in range(len(groups))],
-        read=partial(_read, path, version, {id: _pose(*pose) for id, pose in poses.items()}, num_devices, groups),
+        read=partial(_read, path, version, {key: _pose(*pose) for key, pose in poses.items()}, num_devices, groups),
         warnings=warnings,
     )
 
