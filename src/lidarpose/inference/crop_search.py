@@ -84,6 +84,7 @@ def _distance(points: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 
 def mean_confidence(pose: Pose) -> float:
+    """The mean over joints, 0 if the network does not predict it."""
     return 0.0 if pose.confidence is None else float(pose.confidence.mean())
 
 

@@ -30,7 +30,7 @@ from lidarpose.io.sources.nuscenes import open_nuscenes
 __all__ = ["RECORDINGS", "DamagedFrame", "Frame", "FrameSource", "is_single_scan", "open_source"]
 
 # for each suffix in `RECORDINGS`, the module whose `open_recording(path, options)` reads it
-_READERS = {".mcap": "rosbag", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "ouster", ".pcapng": "ouster"}
+_READERS = {".mcap": "rosbag", ".bag": "rosbag", ".db3": "rosbag", ".pcap": "captures", ".pcapng": "captures"}
 _READERS |= {".lvx": "lvx", ".lvx2": "lvx"}
 # the start time in the name of a part of a ROS 1 recording
 _DATE = re.compile(r"_\d{4}(-\d\d){5}(?=_\d+\.bag$)")

@@ -16,8 +16,7 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.io.files import FormatError, file_error, read_bytes, shorten
-from lidarpose.io.sources import velodyne
-from lidarpose.io.sources.frame import ReadingOptions, Recording, Sweep
+from lidarpose.io.sources.frame import Sweep
 from lidarpose.io.sources.pcap import Datagrams, PacketRecording
 
 # bytes of a pixel, by profile. The range comes first: for RNG15 in 15 bits and steps of 8 mm, for others in 19 bits
@@ -49,31 +48,6 @@ PACKET_TYPES = tuple(f"{package}/{folder}PacketMsg" for package in _PACKAGES for
 PACKET_DEFINITION = "uint8[] buf"
 # number of datagrams that are searched for the port in the metadata
 _NUM_PEEKED = 2000
-
-
-def open_recording(path: Path, options: ReadingOptions) -> Recording:
-    """Opens a capture of an Ouster sensor, or, if there is no metadata, of a Velodyne sensor.
-
-    The Ouster metadata is the JSON file `meta`, else the one next to the capture with the same stem, or with the number
-    that Ouster's recorder appends (STEM_0.json).
-
-    Raises:
-        InputError: The file is not a capture, is of another sensor, or is of an Ouster sensor without metadata.
-        MissingExtra: The capture is of a Velodyne sensor, and the library that decodes it is not installed.
-    """
-    if options.meta is not None:
-        return OusterRecording(path, options.meta)
-    candidates = (path.with_suffix(".json"), path.with_name(f"{path.stem}_0.json"))
-    metadata = next((file for file in candidates if file.exists()), None)
-    if metadata is None:
-        return velodyne.open_recording(path, options)
-    try:
-        return OusterRecording(path, metadata)
-    except InputError:
-        # the JSON file may belong to something else
-        if velodyne.is_capture_of(path):
-            return velodyne.open_recording(path, options)
-        raise
 
 
 class OusterFormat:

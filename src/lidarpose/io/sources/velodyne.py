@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.errors import InputError, needs_extra
+from lidarpose.errors import needs_extra
 from lidarpose.io.files import FormatError, file_error, shorten
-from lidarpose.io.sources.frame import ReadingOptions, Sweep
-from lidarpose.io.sources.livox_packets import recording_of
-from lidarpose.io.sources.pcap import Capture, Datagram, PacketRecording
+from lidarpose.io.sources.frame import Sweep
+from lidarpose.io.sources.pcap import Datagram, PacketRecording
 
 PACKET_BYTES = 1206
 # messages of the ROS driver: the packets of a turn
@@ -22,55 +21,10 @@ SCAN_DEFINITIONS = {
     "velodyne_msgs/msg/VelodynePacket": f"builtin_interfaces/Time stamp\nuint8[{PACKET_BYTES}] data",
     SCAN_TYPES[0]: "std_msgs/Header header\nVelodynePacket[] packets",
 }
-# first bytes of other vendors' packets with points
-_OTHERS = {"Hesai": b"\xee\xff", "RoboSense": b"\x55\xaa"}
 # column of the ring in the decoder's rows
 _RING = 6
-# number of packets that are searched for those of a Velodyne, and of packets that are checked for a model number in
-# their last bytes
-_NUM_TRIED, _NUM_PEEKED = 2000, 5
-
-
-def open_recording(path: Path, options: ReadingOptions) -> PacketRecording:
-    """Opens a capture of a Velodyne or Livox sensor.
-
-    Raises:
-        InputError: The file is not a capture, or is of another sensor.
-        MissingExtra: The library that decodes it is not installed.
-    """
-    packets = _first_packets(path)
-    # before Velodyne's, which have nothing but their size in common
-    if (livox := recording_of(path, packets)) is not None:
-        return livox
-    payloads = [packet.payload for packet in packets]
-    sizes = [len(payload) for payload in payloads]
-    if PACKET_BYTES in sizes:
-        return VelodyneRecording(path)
-    if not sizes:
-        raise file_error(path, "has no UDP packets; expected packets of an Ouster, Velodyne or Livox sensor")
-    for vendor, preamble in _OTHERS.items():
-        if sum(payload.startswith(preamble) for payload in payloads) > len(payloads) / 4:
-            problem = f"has packets of a {vendor} sensor; expected those of an Ouster, Velodyne or Livox sensor"
-            raise file_error(path, f"{problem}: convert it to a ROS bag with {vendor}'s driver, or to .pcd files")
-    problem = f"an Ouster recording needs its metadata {path.stem}.json beside it, or the path of another file (meta)"
-    raise file_error(path, f"{problem} (a Velodyne's packets have {PACKET_BYTES} bytes, these have up to {max(sizes)})")
-
-
-def is_capture_of(path: Path) -> bool:
-    """Whether `open_recording` reads a capture's packets. Raises InputError if it cannot be read."""
-    packets = _first_packets(path)
-    return any(len(packet.payload) == PACKET_BYTES for packet in packets) or recording_of(path, packets) is not None
-
-
-def _first_packets(path: Path) -> list[Datagram]:
-    """Raises InputError if the capture is damaged before its first datagram."""
-    packets: list[Datagram] = []
-    try:
-        packets += islice(Capture(path), _NUM_TRIED)
-    except InputError:
-        if not packets:
-            raise
-    return packets
+# number of packets that are checked for a model number in their last bytes
+_NUM_PEEKED = 5
 
 
 class VelodyneRecording(PacketRecording):
