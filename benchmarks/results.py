@@ -445,6 +445,16 @@ def background() -> str:
     return table(header, rows)
 
 
+def tilted() -> str:
+    """Detected people with a tilted sensor and on slopes; see tilted.py."""
+    rows = [
+        (row["scene"], *(f"{row[name]:.1f}" for name in ("all", "many_points", "default")), f"{row['false']:.2f}")
+        for row in _read("tilted")["rows"]
+    ]
+    header = ("scenes", "all", "50 points and more", "the same at the default score", "false people a scan there")
+    return table(header, rows)
+
+
 def calibration() -> str:
     """Calibration of confidence and visibility; see calibration.py."""
     rows = [(entry["what"], f"{entry['ece']:.3f}", f"{entry['auroc']:.3f}") for entry in _read("calibration")["stated"]]
@@ -524,7 +534,7 @@ def tables() -> dict[str, Callable[[], str]]:
             f"detector {name} by {group}": partial(detector, name, *recall_groups) for name in ("heldout", "real")
         }
     makers |= {"visibility": visibility, "real": real, "tracks": tracks, "detected boxes": detected_boxes}
-    makers |= {"background": background, "detector seeds": detector_seeds} | {
+    makers |= {"background": background, "tilted": tilted, "detector seeds": detector_seeds} | {
         f"{name} card": partial(finding_card, name) for name in FINDING
     }
     makers |= {f"paper {path.stem}": partial(paper, path.stem) for path in sorted((SCORES / "paper").glob("*.json"))}

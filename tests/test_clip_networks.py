@@ -291,6 +291,8 @@ def test_setup_rejects_settings_that_clip_networks_lack(folder, tmp_path):
         make_setup(recipe(Finetune, "lidarcap", data=(str(folder),), split="all", head="coordinates"))
     with refused("keep_anchors is an option of the paper's network"):
         make_setup(recipe(Finetune, "lidarcap", data=(str(folder),), split="all", keep_anchors=False))
+    with refused("heatmap_rate is for the paper's network with heatmaps, lidarcap has none: omit it"):
+        make_setup(recipe(Finetune, "lidarcap", data=(str(folder),), split="all", heatmap_rate=10.0))
     with refused("leave --mix at 0, and --augment at none or turn"):
         make_setup(recipe(Finetune, "ne", data=(str(folder),), split="all", mix=0.25))
     with refused("shift_windows is for clip networks, tiny reads single frames"):

@@ -491,17 +491,22 @@ def test_damaged_files_of_steps_are_named(tmp_path):
     cell = cells(TABLES["table1"], Options(people=64), ["dapt"])[0]
     state, results = tmp_path / "runs" / f"{cell.evaluation.name}.json", report._path(cell.evaluation, tmp_path)
     curves = cell.evaluation.product(tmp_path) / "stability.json"
-    for path in (state, results, curves, tmp_path / run_dir.CONFIG):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text('{"done": tr')
+
+    def curves_of_done_cell():
+        steps._note(cell.evaluation, tmp_path, done=True)
+        return figures._picture("fig7", {"ours": cell}, tmp_path)
+
     for path, read in (
         (state, lambda: steps.is_done(cell.evaluation, tmp_path)),
         (results, lambda: report._entry(cell, tmp_path, "")),
-        (curves, lambda: figures._picture("fig7", {"ours": cell}, tmp_path)),
+        (curves, curves_of_done_cell),
         (tmp_path / run_dir.CONFIG, lambda: steps._people(tmp_path)),
     ):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text('{"done": tr')
         with pytest.raises(InputError, match=f"^{re.escape(str(path))}: is not JSON"):
             read()
+        path.unlink()
 
 
 def test_run_steps_waits_for_step_of_another_process(tmp_path):
@@ -633,6 +638,21 @@ def test_fig7_and_fig8_draw_several_networks(tmp_path, name, monkeypatch):
     words = " ".join(text.get_text() for text in drawn[0].findobj(Text))
     assert "the stand-in" in words and "synth-9-abc" not in words
     assert path.read_bytes() != _drawn_alone(name, selected[:1], tmp_path)
+
+
+def test_fig7_is_drawn_from_copied_cells(tmp_path):
+    """Without the evaluations' folders; a cell without curves is run again."""
+    (cell,) = cells(TABLES["fig7"], Options(), ["ours"])
+    results = report._path(cell.evaluation, tmp_path)
+    results.parent.mkdir(parents=True)
+    results.write_text(json.dumps({"state": "done"}))
+    assert not report._is_there(TABLES["fig7"], cell.evaluation, tmp_path)
+    assert figures.draw("fig7", [cell], tmp_path) == []
+    results.write_text(json.dumps({"state": "done", "stability": _study(1)}))
+    assert report._is_there(TABLES["fig7"], cell.evaluation, tmp_path)
+    (path,) = figures.draw("fig7", [cell], tmp_path)
+    assert path.read_bytes().startswith(b"\x89PNG")
+    assert "stability" not in report._entry(cell, tmp_path, "")
 
 
 def test_compare_stability_aligns_amounts_without_poses(monkeypatch):

@@ -429,6 +429,13 @@ def test_recipe_rejects_invalid_settings(change, message):
         (Pretrain, {"size": "paper-small", "neck": "giraffe"}, "unknown neck 'giraffe'"),
         (Pretrain, {"size": "paper-small", "neck": "prn", "head": "heatmaps"}, "has coordinates and no heatmaps"),
         (Pretrain, {"size": "paper-small", "drop_path": 1.5}, "drop_path must be a probability below 1"),
+        (
+            Pretrain,
+            {"size": "paper-small", "heatmap_rate": 10},
+            "heatmap_rate is for the paper's network with heatmaps",
+        ),
+        (Pretrain, {"heatmap_rate": 10}, "heatmap_rate is for .*, tiny has none: omit it"),
+        (Pretrain, {"size": "paper-small", "muon_rate": 0.01}, "muon_rate is for the package's own networks, .*: omit"),
         (Finetune, {"data": "a", "neck": "prn"}, "a checkpoint has its own neck: omit --neck"),
     ],
 )

@@ -10,8 +10,9 @@ import numpy as np
 from lidarpose.eval.charts import compare_ends, compare_stability
 from lidarpose.eval.dataset import open_eval_dataset
 from lidarpose.eval.predictions import read_poses
-from lidarpose.io.files import read_json, write_atomic
-from lidarpose.paper.steps import POSES, Step, is_done
+from lidarpose.io.files import write_atomic
+from lidarpose.paper.report import can_be_drawn, stability_study
+from lidarpose.paper.steps import POSES, Step
 from lidarpose.paper.tables import Cell
 from lidarpose.sample import Pose, facing
 from lidarpose.skeleton import SMPL24
@@ -34,7 +35,9 @@ def draw(name: str, cells: Sequence[Cell], out: Path) -> list[Path]:
     paths = []
     for column in columns:
         first_seed_cells = [cell for cell in cells if cell.seed == 0 and cell.column == column]
-        done_cells = {cell.row: cell for cell in first_seed_cells if cell.evaluation and is_done(cell.evaluation, out)}
+        done_cells = {
+            cell.row: cell for cell in first_seed_cells if cell.evaluation and can_be_drawn(name, cell.evaluation, out)
+        }
         if done_cells:
             paths.append(out / (f"{name}.png" if len(columns) == 1 else f"{name}-{column}.png"))
             write_atomic(paths[-1], _picture(name, done_cells, out))
@@ -45,13 +48,10 @@ def _picture(name: str, cells: dict[str, Cell], out: Path) -> bytes:
     """A figure of one column, from its finished cells."""
     if name == "fig5":
         return _side_by_side(cells, out)
-    paths = {row: cell.evaluation.product(out) / "stability.json" for row, cell in cells.items() if cell.evaluation}
     target = next(iter(cells.values())).target
     title = "the stand-in" if isinstance(target.test, Step) else target.title
-    studies = {
-        row: _titled(read_json(path, expected="a study of stability")["studies"][0], title)
-        for row, path in paths.items()
-    }
+    found_studies = {row: stability_study(cell.evaluation, out) for row, cell in cells.items() if cell.evaluation}
+    studies = {row: _titled(study, title) for row, study in found_studies.items() if study}
     return (compare_stability if name == "fig7" else compare_ends)(studies)
 
 

@@ -47,6 +47,8 @@ _PRINTED = (
 )
 # maximum number of people that the mean pose is computed from
 _MEAN_POSE = 5_000
+# the file of an evaluation's studies of perturbed points
+_STUDIES = "stability.json"
 
 
 def run_table(
@@ -84,9 +86,15 @@ def check_targets(selected: Sequence[Cell]) -> None:
 
 
 def _is_there(table: Table, evaluation: Step, out: Path) -> bool:
-    """Whether a cell's results exist. A figure also needs the files that it is drawn from, which are not copied along
-    with the results."""
-    return _path(evaluation, out).is_file() and (not table.name.startswith("fig") or is_done(evaluation, out))
+    """Whether a cell's results exist, for a figure with all that it is drawn from."""
+    is_drawn = table.name.startswith("fig")
+    return _path(evaluation, out).is_file() and (not is_drawn or can_be_drawn(table.name, evaluation, out))
+
+
+def can_be_drawn(name: str, evaluation: Step, out: Path) -> bool:
+    """Whether everything exists that a cell of fig5, fig7 or fig8 is drawn from: the curves are part of the cell's
+    results, the poses of fig5 only of the evaluation's own folder."""
+    return is_done(evaluation, out) if name == "fig5" else stability_study(evaluation, out) is not None
 
 
 def write_table(table: Table, options: Options, out: Path, failed: dict[int, str] | None = None) -> dict[str, Any]:
@@ -123,7 +131,7 @@ def _entry(cell: Cell, out: Path, failure: str) -> dict[str, Any]:
         return entry | {"state": "failed", "reason": failure}
     path = _path(cell.evaluation, out)
     if path.is_file():
-        return entry | read_json(path, expected="a cell's results")
+        return entry | _without_study(read_json(path, expected="a cell's results"))
     if not is_done(cell.evaluation, out):
         return entry | {"state": "not run", "reason": "its command was not run, or did not finish"}
     try:
@@ -131,7 +139,12 @@ def _entry(cell: Cell, out: Path, failure: str) -> dict[str, Any]:
     except LidarPoseError as error:
         return entry | {"state": "failed", "reason": str(error)}
     write_atomic(path, json.dumps(figures, indent=1) + "\n")
-    return entry | figures
+    return entry | _without_study(figures)
+
+
+def _without_study(results: dict[str, Any]) -> dict[str, Any]:
+    """A cell's results without the curves of a figure, which no table shows."""
+    return {name: value for name, value in results.items() if name != "stability"}
 
 
 def _reference(table: Table, cell: Cell, all_cells: Sequence[Cell]) -> Cell | None:
@@ -165,6 +178,17 @@ def _path(evaluation: Step, out: Path) -> Path:
     return out / CELLS / f"{evaluation.name}.json"
 
 
+def stability_study(evaluation: Step, out: Path) -> dict[str, Any] | None:
+    """The evaluation's study of perturbed points: from the cell's results, which may have been copied here, else from
+    its own folder; None if there is none."""
+    path = _path(evaluation, out)
+    study = read_json(path, expected="a cell's results").get("stability") if path.is_file() else None
+    path = evaluation.product(out) / _STUDIES
+    if study is None and path.is_file() and is_done(evaluation, out):
+        study = read_json(path, expected="a study of stability")["studies"][0]
+    return study
+
+
 def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
     """An evaluation's results, the cost of the training, and the mean pose's error on the same people."""
     result = read_scores(evaluation.product(out) / FILE).results[0]
@@ -173,7 +197,7 @@ def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
     commands = [" ".join([line, *length]) for line, length in lengths.items()]
     network, header = load_checkpoint(cell.training[-1].product(out))
     runs, entry = runs_of(header.card), last_entry(cell.training[-1].folder(out))
-    row = result.line("mpjpe")
+    row, study = result.line("mpjpe"), stability_study(evaluation, out)
     mean_pose = mean_pose_error(cell.target, result, out)
     return {
         **{name: _value(result, name) for name in COLUMNS},
@@ -191,6 +215,7 @@ def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
         "mean_pose": mean_pose,
         "undertrained": row.value is None or row.value > (1 - _UNDERTRAINED) * mean_pose,
         "scores": str(evaluation.product(out) / FILE),
+        **({} if study is None else {"stability": study}),
         **({"commands": commands} if any(lengths.values()) else {}),
     }
 
