@@ -44,10 +44,11 @@ from lidarpose import evaluation
 from lidarpose._version import __version__
 from lidarpose.inference.predictor import Predictor
 from lidarpose.inference.torch_backend import TorchBackend
-from lidarpose.io.files import write_atomic
+from lidarpose.io.atomic import write_atomic
 from lidarpose.models.checkpoint import Header, SafetensorsFile, load_checkpoint, read_header
 from lidarpose.models.config import NetworkConfig, preset
-from lidarpose.models.posenet import PoseNet, expand_weights
+from lidarpose.models.expand import expand_weights
+from lidarpose.models.posenet import PoseNet
 from lidarpose.synth.generator import BLOCK, Generator
 from lidarpose.synth.scene import SCENES, SceneConfig
 from lidarpose.train.augment import Example

@@ -19,7 +19,7 @@ import numpy as np
 import lidarpose
 from lidarpose.eval.detector.detection_scores import LEAST_POINTS, match
 from lidarpose.inference.background import learn_background
-from lidarpose.io.files import write_atomic
+from lidarpose.io.atomic import write_atomic
 from lidarpose.synth.street import street
 
 FRAMES, SEARCHED, MOVES = 40, (0, 19, 39), 1.0

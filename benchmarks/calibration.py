@@ -18,7 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from lidarpose.inference.predictor import load
-from lidarpose.io.files import write_atomic
+from lidarpose.io.atomic import write_atomic
 from lidarpose.metrics import auroc, calibration_error
 from lidarpose.models import DEFAULT
 from lidarpose.sample import CONFIDENCE_RADIUS

@@ -22,7 +22,7 @@ import numpy as np
 from stored import digest, is_stored, write_note
 
 from lidarpose.inference.predictor import TTA, load
-from lidarpose.io.files import write_atomic
+from lidarpose.io.atomic import write_atomic
 from lidarpose.metrics import acceleration_errors, aligned_errors, interval, joint_errors
 from lidarpose.models import DEFAULT, weights_path
 from lidarpose.skeleton import BODY26, HUMAN15

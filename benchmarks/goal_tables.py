@@ -16,7 +16,7 @@ import stability_tables as disturbed
 from ablation_tables import own_lines
 
 from lidarpose.eval.scores import read_scores
-from lidarpose.io.files import write_atomic
+from lidarpose.io.atomic import write_atomic
 
 SCORES = Path(__file__).parents[1] / "docs" / "scores"
 # motion of held-out people: as in the names of files, and in words

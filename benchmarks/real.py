@@ -21,7 +21,7 @@ import lidarpose
 from lidarpose.geometry import distance_to_segments
 from lidarpose.inference.predictor import TTA, Predictor
 from lidarpose.inference.results import PersonPose, Poses
-from lidarpose.io.files import write_atomic
+from lidarpose.io.atomic import write_atomic
 from lidarpose.models import DEFAULT
 from lidarpose.sample import facing
 from lidarpose.skeleton import SMPL24

@@ -30,8 +30,10 @@ from ablation_tables import figures, own_lines
 from ablations import VARIANTS
 from against_paper import WAYS
 
-from lidarpose.eval.scores import BASELINE, MetricRow, Scores, published, read_scores
-from lidarpose.io.files import content_digest, lined_json, write_atomic
+from lidarpose.eval.scores import BASELINE, MetricRow, Scores, read_scores
+from lidarpose.eval.table import published
+from lidarpose.io.atomic import write_atomic
+from lidarpose.io.files import content_digest, lined_json
 from lidarpose.models import BUNDLED, DEFAULT, VERIFIER, bundled_path, weights_file
 from lidarpose.models.checkpoint import load_checkpoint, parameter_count, read_header, runs_of
 from lidarpose.paper import report

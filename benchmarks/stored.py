@@ -5,7 +5,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from lidarpose.io.files import content_digest, write_atomic
+from lidarpose.io.atomic import write_atomic
+from lidarpose.io.files import content_digest
 
 
 def digest(weights: Path) -> str:

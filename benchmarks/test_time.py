@@ -19,7 +19,7 @@ from ablation_tables import figures
 from lidarpose import evaluation
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.inference.tta import IDENTITY, MIRRORED, TRANSFORMS, TTATransform
-from lidarpose.io.files import write_atomic
+from lidarpose.io.atomic import write_atomic
 
 
 @dataclass(frozen=True)

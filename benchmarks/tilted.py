@@ -21,7 +21,7 @@ from lidarpose.eval.detector.labeled_scans import heldout_scans
 from lidarpose.geometry import rotation_about
 from lidarpose.inference.detection import Search, find_people
 from lidarpose.inference.scan import Scan
-from lidarpose.io.files import write_atomic
+from lidarpose.io.atomic import write_atomic
 from lidarpose.models.detector.detector import Detector
 from lidarpose.sample import Box
 

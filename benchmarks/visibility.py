@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 
-from lidarpose.io.files import write_atomic
+from lidarpose.io.atomic import write_atomic
 
 EDGES = np.array([-0.01, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.8, 1.01])
 LEAST = 10

@@ -10,7 +10,8 @@ from lidarpose.errors import InputError
 from lidarpose.models import bundled_path
 from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
 from lidarpose.models.config import preset
-from lidarpose.models.posenet import Batch, PoseNet, expand_weights
+from lidarpose.models.expand import expand_weights
+from lidarpose.models.posenet import Batch, PoseNet
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 from lidarpose.train.augment import example

@@ -16,19 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
-from lidarpose.io import files
-from lidarpose.io.files import (
-    LOCK,
-    atomic_path,
-    check_suffix,
-    file_error,
-    is_unused,
-    locked,
-    read_bytes,
-    read_json,
-    write_all_atomic,
-    write_atomic,
-)
+from lidarpose.io import atomic
+from lidarpose.io.atomic import LOCK, atomic_path, check_suffix, is_unused, locked, write_all_atomic, write_atomic
+from lidarpose.io.files import file_error, read_bytes, read_json
 from lidarpose.io.npz import read_npz
 from lidarpose.io.point_cloud import read_points
 
@@ -101,7 +91,7 @@ def test_atomic_path_temporary_names_are_unique(tmp_path, monkeypatch):
             names.add(temporary.name)
             temporary.write_text("new")
     assert len(names) == 2 and (tmp_path / "a.txt").read_text() == "new"
-    assert all(re.fullmatch(files._TEMPORARY + "a.txt", name) for name in (*names, ".1-8-a.txt"))
+    assert all(re.fullmatch(atomic._TEMPORARY + "a.txt", name) for name in (*names, ".1-8-a.txt"))
 
 
 def test_atomic_path_nested_calls_use_different_files(tmp_path):
@@ -143,9 +133,9 @@ def test_atomic_path_reports_disk_errors(tmp_path, monkeypatch, call, number):
         raise error
 
     if call == "mkdir":
-        monkeypatch.setattr(files.Path, "mkdir", refuse)
+        monkeypatch.setattr(atomic.Path, "mkdir", refuse)
     elif call != "write":
-        monkeypatch.setattr(files.os, call, refuse)
+        monkeypatch.setattr(atomic.os, call, refuse)
     path = tmp_path / "made" / "a.txt"
     with pytest.raises(InputError) as caught, atomic_path(path):
         if call == "write":

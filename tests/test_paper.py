@@ -25,7 +25,8 @@ from lidarpose.data.shards import open_dataset
 from lidarpose.errors import InputError
 from lidarpose.eval import charts
 from lidarpose.eval.predictions import read_poses
-from lidarpose.eval.scores import published, read_scores
+from lidarpose.eval.scores import read_scores
+from lidarpose.eval.table import published
 from lidarpose.models.checkpoint import read_header
 from lidarpose.paper import figures, report, steps
 from lidarpose.paper.report import markdown, mean_pose_error, run_table, write_table

@@ -21,7 +21,7 @@ from training_runs import BATCHES, FEW, few_to_validate_on, refused, train_until
 
 from lidarpose.cli import main
 from lidarpose.errors import InputError
-from lidarpose.io.files import LOCK
+from lidarpose.io.atomic import LOCK
 from lidarpose.models import weights_path
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.config import preset

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import onnx
 
-from lidarpose.io.files import content_digest, write_atomic
+from lidarpose.io.atomic import write_atomic
+from lidarpose.io.files import content_digest
 from lidarpose.models import onnx as onnx_files
 from lidarpose.models.checkpoint import DIGEST, with_digest
 

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch.nn import functional as F
 
-from lidarpose.io.files import atomic_path
+from lidarpose.io.atomic import atomic_path
 from lidarpose.metrics import auroc
 from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
 from lidarpose.models.onnx import voxelize_people

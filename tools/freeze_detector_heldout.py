@@ -10,7 +10,7 @@ import argparse
 import json
 from pathlib import Path
 
-from lidarpose.io.files import atomic_path
+from lidarpose.io.atomic import atomic_path
 from lidarpose.synth.detection_scene import detection_scene
 from lidarpose.synth.environment.layouts import LEFT_OUT
 from lidarpose.synth.environment.things import THINGS

@@ -24,7 +24,7 @@ import pyarrow.parquet as pq
 from lidarpose._version import __version__
 from lidarpose.body.mocap import load_motion
 from lidarpose.eval.dataset import BENCHES
-from lidarpose.io.files import atomic_path
+from lidarpose.io.atomic import atomic_path
 from lidarpose.sample import Box, Sample
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import PoseBank

@@ -36,7 +36,7 @@ import numpy as np
 from lidarpose.body.mocap import load_motion
 from lidarpose.body.rig import forward_kinematics, mean_adult_joints
 from lidarpose.errors import InputError
-from lidarpose.io.files import write_atomic
+from lidarpose.io.atomic import write_atomic
 from lidarpose.skeleton import SMPL24
 
 SUFFIXES = (".amc", ".bvh", ".npz")

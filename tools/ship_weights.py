@@ -19,7 +19,7 @@ import torch
 from torch import nn
 
 from lidarpose.inference.predictor import load
-from lidarpose.io.files import write_atomic
+from lidarpose.io.atomic import write_atomic
 from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
 from lidarpose.models.export import export
 

@@ -32,7 +32,8 @@ from torch.utils.data import DataLoader, IterableDataset
 from lidarpose.models import weights_path
 from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
 from lidarpose.models.config import SIZES
-from lidarpose.models.posenet import PoseNet, expand_weights
+from lidarpose.models.expand import expand_weights
+from lidarpose.models.posenet import PoseNet
 from lidarpose.skeleton import BODY26
 from lidarpose.train.augment import FLIP_PART
 from lidarpose.train.data_loader import SyntheticSource

@@ -14,7 +14,8 @@ from lidarpose.eval.predictions import Predictions, read_poses
 from lidarpose.eval.protocols import PROTOCOLS
 from lidarpose.eval.robustness import Stability
 from lidarpose.eval.run import Run, check_folder, evaluate, new_folder, run, write
-from lidarpose.eval.scores import MetricRow, Result, Scores, Setting, published, read_scores, scores_path, table
+from lidarpose.eval.scores import MetricRow, Result, Scores, Setting, read_scores, scores_path
+from lidarpose.eval.table import published, table
 
 # aliases with the names used until 0.2
 Judged, Line = Predictions, MetricRow

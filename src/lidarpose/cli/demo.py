@@ -8,7 +8,7 @@ import numpy as np
 
 from lidarpose.errors import check_int
 from lidarpose.inference.predictor import TTA, Predictor, load
-from lidarpose.io.files import check_writable, write_all_atomic
+from lidarpose.io.atomic import check_writable, write_all_atomic
 from lidarpose.models import DEFAULT
 from lidarpose.progress import Progress
 

@@ -164,7 +164,8 @@ def _detector_lines(result) -> Iterator[str]:
 
 def _table(options: argparse.Namespace) -> None:
     from lidarpose import evaluation
-    from lidarpose.io.files import check_not_input, check_suffix, write_atomic
+    from lidarpose.io.atomic import check_suffix, write_atomic
+    from lidarpose.io.files import check_not_input
 
     if options.out is not None:
         check_not_input(options.out, *map(evaluation.scores_path, options.scores))

@@ -93,7 +93,7 @@ def add(commands) -> None:
 
 def _predict(options: argparse.Namespace) -> None:
     from lidarpose.inference.predict_scan import predict
-    from lidarpose.io.files import write_all_atomic
+    from lidarpose.io.atomic import write_all_atomic
 
     file = Path(options.source[0])
     result, picture, page = output_paths(options, file.stem, ("json", "csv"))
@@ -126,7 +126,8 @@ def output_paths(
 ) -> tuple[Path | None, Path | None, Path | None]:
     """Where `predict` writes its result, in one of the formats, a picture and a page, None for what it does not write.
     Raises InputError where one cannot be written, or is a file that is read."""
-    from lidarpose.io.files import check_not_input, check_writable
+    from lidarpose.io.atomic import check_writable
+    from lidarpose.io.files import check_not_input
     from lidarpose.io.point_cloud import SUFFIXES
     from lidarpose.io.sources.folders import is_result, list_folder
 
@@ -159,7 +160,8 @@ def prediction_options(options: argparse.Namespace) -> dict[str, Any]:
 
 def _detect(options: argparse.Namespace) -> None:
     from lidarpose.inference.detection import detect
-    from lidarpose.io.files import check_not_input, check_writable
+    from lidarpose.io.atomic import check_writable
+    from lidarpose.io.files import check_not_input
 
     result = _result_path(options.out, Path(options.file).stem, "boxes", ".json")
     if result is not None:

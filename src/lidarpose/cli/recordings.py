@@ -75,7 +75,7 @@ def _predict_recording(
     posing_options: dict[str, Any],
 ) -> None:
     """Poses all frames, and says what came of it. posing_options: as of `FramePredictor`."""
-    from lidarpose.io.files import write_atomic
+    from lidarpose.io.atomic import write_atomic
     from lidarpose.io.sources import open_source
     from lidarpose.recording.output import write_recording
     from lidarpose.recording.page import RecordingPage

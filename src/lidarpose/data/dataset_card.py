@@ -9,7 +9,8 @@ from typing import Any
 from lidarpose._version import __version__
 from lidarpose.data.rows import TABLES
 from lidarpose.errors import InputError, counted
-from lidarpose.io.files import file_error, read_json, write_atomic
+from lidarpose.io.atomic import write_atomic
+from lidarpose.io.files import file_error, read_json
 from lidarpose.skeleton import BODY26, skeleton
 
 SCHEMA = 1

@@ -15,7 +15,8 @@ import numpy as np
 from lidarpose.data.dataset_card import DatasetCard, read_card
 from lidarpose.data.rows import TABLES, Column, check_lengths, sample_of
 from lidarpose.errors import InputError, MissingExtra
-from lidarpose.io.files import atomic_path, encodable, file_error
+from lidarpose.io.atomic import atomic_path
+from lidarpose.io.files import encodable, file_error
 from lidarpose.sample import LabeledSample
 
 # rows per row group, which writers and readers hold in memory. A revolution of 128 rings has up to 260,000 points

@@ -21,7 +21,8 @@ from lidarpose.data.dataset_card import CARD, DatasetCard, read_card
 from lidarpose.data.rows import TABLES
 from lidarpose.data.shards import rows_of_shard, shard_path
 from lidarpose.errors import InputError
-from lidarpose.io.files import file_error, is_unused, locked
+from lidarpose.io.atomic import is_unused, locked
+from lidarpose.io.files import file_error
 
 # yields the number of people, clips or streets done since the last yield
 Counts = Generator[int, None, None]
@@ -37,7 +38,7 @@ _BUSY = "another process writes this dataset: wait for its end, or give another 
 
 @contextmanager
 def open_folder(folder: Path, card: DatasetCard, rows: Mapping[str, int] | None = None) -> Iterator[list[int]]:
-    """Locks a dataset's folder, see `files.locked`, and yields the numbers of the shards that are missing, damaged or,
+    """Locks a dataset's folder, see `atomic.locked`, and yields the numbers of the shards that are missing, damaged or,
     according to `rows`, incomplete.
 
     rows: by table, the number of rows of each of the `card.count` items, if known. Raises InputError unless the folder

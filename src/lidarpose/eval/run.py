@@ -24,7 +24,8 @@ from lidarpose.eval.protocols import EvalSetup, Model, eval_setup
 from lidarpose.eval.robustness import Stability, people_to_perturb, study, to_json
 from lidarpose.eval.scores import BASELINE, FILE, MetricRow, Result, Scores, Setting
 from lidarpose.inference.predictor import Predictor, load
-from lidarpose.io.files import check_writable, content_digest, file_error, listed, write_all_atomic
+from lidarpose.io.atomic import check_writable, write_all_atomic
+from lidarpose.io.files import content_digest, file_error, listed
 from lidarpose.models import weights_path
 from lidarpose.models.checkpoint import runs_of
 from lidarpose.sample import UNLABELED

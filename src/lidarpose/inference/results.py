@@ -11,7 +11,8 @@ import numpy as np
 
 from lidarpose.errors import counted
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
-from lidarpose.io.files import check_suffix, encodable, lined_json, shorten, write_atomic
+from lidarpose.io.atomic import check_suffix, write_atomic
+from lidarpose.io.files import encodable, lined_json, shorten
 from lidarpose.sample import JOINT_COLUMNS, PER_JOINT, Box, Pose, facing, facing_yaw
 from lidarpose.skeleton import Skeleton
 

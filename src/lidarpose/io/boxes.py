@@ -19,7 +19,8 @@ import numpy as np
 from lidarpose.arrays import to_numpy
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, rotation_from_up
-from lidarpose.io.files import FormatError, check_suffix, file_error, lined_json, read_bytes, shorten, write_atomic
+from lidarpose.io.atomic import check_suffix, write_atomic
+from lidarpose.io.files import FormatError, file_error, lined_json, read_bytes, shorten
 from lidarpose.io.npz import load_array
 from lidarpose.sample import FARTHEST, Box, box_id
 

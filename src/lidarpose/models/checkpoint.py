@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING, Any
 
 from lidarpose._version import __version__
 from lidarpose.errors import InputError, check_name
-from lidarpose.io.files import file_error, read_bytes, write_atomic
+from lidarpose.io.atomic import write_atomic
+from lidarpose.io.files import file_error, read_bytes
 from lidarpose.models import NETWORKS
 from lidarpose.skeleton import SKELETONS, Skeleton
 

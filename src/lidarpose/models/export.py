@@ -14,7 +14,8 @@ from torch import Tensor, nn
 
 from lidarpose._version import __version__
 from lidarpose.errors import InputError, LidarPoseError, check_name, needs_extra
-from lidarpose.io.files import atomic_path, check_not_input, check_suffix, check_writable, content_digest, write_atomic
+from lidarpose.io.atomic import atomic_path, check_suffix, check_writable, write_atomic
+from lidarpose.io.files import check_not_input, content_digest
 from lidarpose.models import weights_path
 from lidarpose.models.checkpoint import DIGEST, ENTRY, Header, load_checkpoint
 from lidarpose.models.detector.detector_config import INPUTS, OUTPUT

@@ -10,7 +10,7 @@ import numpy as np
 from lidarpose.eval.charts import compare_ends, compare_stability
 from lidarpose.eval.dataset import open_eval_dataset
 from lidarpose.eval.predictions import read_poses
-from lidarpose.io.files import write_atomic
+from lidarpose.io.atomic import write_atomic
 from lidarpose.paper.report import can_be_drawn, stability_study
 from lidarpose.paper.steps import POSES, Step
 from lidarpose.paper.tables import Cell

@@ -14,8 +14,10 @@ from lidarpose.eval.dataset import EvalSample, open_eval_dataset
 from lidarpose.eval.metrics import aggregate
 from lidarpose.eval.predictions import read_poses
 from lidarpose.eval.protocols import DAPT, check_protocol
-from lidarpose.eval.scores import COLUMNS, FILE, Result, read_scores
-from lidarpose.io.files import content_digest, read_json, write_atomic
+from lidarpose.eval.scores import FILE, Result, read_scores
+from lidarpose.eval.table import COLUMNS
+from lidarpose.io.atomic import write_atomic
+from lidarpose.io.files import content_digest, read_json
 from lidarpose.models.checkpoint import load_checkpoint, runs_of
 from lidarpose.paper.steps import (
     CELLS,

@@ -22,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from lidarpose.errors import InputError, LidarPoseError
-from lidarpose.io.files import exclusive_lock, read_json, write_atomic
+from lidarpose.io.atomic import exclusive_lock, write_atomic
+from lidarpose.io.files import read_json
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.run_dir import CONFIG, LENGTHS, MODEL, read_config, read_log
 

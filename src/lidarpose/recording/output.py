@@ -16,7 +16,8 @@ from typing import Any, BinaryIO
 from zlib import crc32
 
 from lidarpose.errors import InputError, counted
-from lidarpose.io.files import check_writable, file_error, write_error
+from lidarpose.io.atomic import check_writable, write_error
+from lidarpose.io.files import file_error
 from lidarpose.io.sources import DamagedFrame, Frame, FrameSource
 from lidarpose.progress import Progress
 from lidarpose.recording.coordinates import in_world

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from lidarpose.errors import needs_extra
-from lidarpose.io.files import atomic_path, encodable
+from lidarpose.io.atomic import atomic_path
+from lidarpose.io.files import encodable
 from lidarpose.sample import JOINT_COLUMNS
 
 FORMATS = ("jsonl", "csv", "parquet")

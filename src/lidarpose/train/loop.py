@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from lidarpose.arrays import evenly_spaced
 from lidarpose.errors import InputError, check_name
-from lidarpose.io.files import write_atomic
+from lidarpose.io.atomic import write_atomic
 from lidarpose.models.checkpoint import save_checkpoint
 from lidarpose.progress import Progress
 from lidarpose.synth.scene import RandomStream

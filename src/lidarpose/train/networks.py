@@ -23,7 +23,8 @@ from lidarpose.models.baselines.baseline_config import (
 from lidarpose.models.checkpoint import build, load_checkpoint
 from lidarpose.models.config import SIZES, NetworkConfig
 from lidarpose.models.dapt.dapt_config import CONFIGS, FAULTS, DaptConfig
-from lidarpose.models.posenet import PoseNet, expand_weights
+from lidarpose.models.expand import expand_weights
+from lidarpose.models.posenet import PoseNet
 from lidarpose.skeleton import HUMAN15, SMPL24, Skeleton
 from lidarpose.train.objectives.baseline_objective import with_joints
 from lidarpose.train.objectives.dapt_objective import REDUCED, finetuning_config, pretraining_config

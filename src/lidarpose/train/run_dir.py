@@ -21,7 +21,8 @@ from torch import Tensor, nn
 
 from lidarpose._version import __version__
 from lidarpose.errors import InputError
-from lidarpose.io.files import file_error, is_unused, locked, read_bytes, write_atomic
+from lidarpose.io.atomic import is_unused, locked, write_atomic
+from lidarpose.io.files import file_error, read_bytes
 from lidarpose.models.checkpoint import SafetensorsFile, with_digest
 from lidarpose.train.optim import Muon
 from lidarpose.train.recipes import FREE, AnyRecipe, Recipe
@@ -85,7 +86,7 @@ def check_new(folder: Path) -> None:
 
 
 def lock(folder: Path) -> AbstractContextManager[None]:
-    """Locks the run's folder against other processes, see `files.locked`."""
+    """Locks the run's folder against other processes, see `atomic.locked`."""
     return locked(folder, _NAMES, busy="another process trains there: stop it, or wait for its end", wait=LOCK_WAIT)
 
 

@@ -25,7 +25,8 @@ from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.dapt.dapt_config import DaptConfig
 from lidarpose.models.detector.detector import detector_path
 from lidarpose.models.detector.detector_config import DetectorConfig
-from lidarpose.models.posenet import PoseNet, expand_weights
+from lidarpose.models.expand import expand_weights
+from lidarpose.models.posenet import PoseNet
 from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import Skeleton, skeleton
 from lidarpose.synth.scene import scene_config

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.arrays import evenly_spaced
-from lidarpose.io.files import check_suffix
+from lidarpose.io.atomic import check_suffix
 from lidarpose.models.detector.ground import Ground, estimate_ground
 from lidarpose.models.detector.proposals import heights_above
 from lidarpose.sample import Box, Pose

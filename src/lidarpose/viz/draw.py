@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.arrays import evenly_spaced
-from lidarpose.io.files import check_suffix, write_atomic
+from lidarpose.io.atomic import check_suffix, write_atomic
 from lidarpose.sample import Pose
 from lidarpose.skeleton import SMPL24
 from lidarpose.viz.person_view import (

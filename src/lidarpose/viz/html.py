@@ -13,7 +13,7 @@ import numpy as np
 
 from lidarpose._version import __version__
 from lidarpose.arrays import evenly_spaced
-from lidarpose.io.files import check_suffix, write_atomic
+from lidarpose.io.atomic import check_suffix, write_atomic
 from lidarpose.sample import Pose, within_reach
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.viz.bird_eye import ScanPanel

@@ -17,7 +17,7 @@ from lidarpose.eval.detector.labeled_scans import ScanSet, heldout_scans, labele
 from lidarpose.inference.detection import Search, find_people
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.inference.scan import Scan
-from lidarpose.io.files import write_all_atomic
+from lidarpose.io.atomic import write_all_atomic
 from lidarpose.models.detector.candidates import suppress_near
 from lidarpose.models.detector.detector import SAME, Detector
 from lidarpose.models.detector.ground import estimate_ground, without_ground

@@ -11,7 +11,8 @@ from pathlib import Path
 import torch
 
 from lidarpose.errors import InputError
-from lidarpose.io.files import check_not_input, check_suffix, file_error
+from lidarpose.io.atomic import check_suffix
+from lidarpose.io.files import check_not_input, file_error
 from lidarpose.models.checkpoint import Header, SafetensorsFile, save_checkpoint
 from lidarpose.models.dapt.dapt_config import CONFIGS, RELEASED_FAULTS, DaptConfig, named_config
 from lidarpose.models.dapt.dapt_net import DaptNet
