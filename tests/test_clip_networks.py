@@ -25,10 +25,10 @@ from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about
 from lidarpose.inference.inputs import Clips
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.inference.torch_backend import ClipBackend
-from lidarpose.models.baselines import ne
 from lidarpose.models.baselines.baseline_config import CLOUDS, FRAME_POINTS, LidarcapConfig, NeConfig, pad_frames
 from lidarpose.models.baselines.lidarcap import rest_offsets
 from lidarpose.models.checkpoint import Header, build, save_checkpoint
+from lidarpose.models.layers import DropPath
 from lidarpose.sample import CLIP_FRAMES, clip_windows
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth.generator import Generator
@@ -127,10 +127,12 @@ def test_dataset_clips_counts_skipped_frames_by_reason(clips, tmp_path):
     longer = [*clips[0], *clips[1][:4]]
     dataset = InMemoryDataset.load([write_clips(tmp_path / "d", [longer, clips[1][:7], without])])
     rows, skipped = dataset.clips()
-    assert dict(skipped) == {"frames without rotations": 3, "frames of fewer than 16 consecutive ones": 7}
-    assert (rows == clip_windows(np.arange(20))).all() and rows.shape == (2, CLIP_FRAMES)
+    assert dict(skipped) == {"frames without rotations": 3}
+    # a short run is filled with its last frame, as the last clip of a long one is
+    filled = np.concatenate([clip_windows(np.arange(20)), clip_windows(np.arange(20, 27))])
+    assert (rows == filled).all() and rows.shape == (3, CLIP_FRAMES) and (rows[2, 6:] == 26).all()
     source = make_setup(recipe(Pretrain, "lidarcap", shards=(str(tmp_path / "d"),)))
-    assert source.frames == CLIP_FRAMES and sum("left out" in warning for warning in source.warnings) == 2
+    assert source.frames == CLIP_FRAMES and sum("left out" in warning for warning in source.warnings) == 1
 
 
 def test_clip_example_is_centered_per_frame(clips):
@@ -338,7 +340,7 @@ def test_clip_networks_overfit_two_clips(size, monkeypatch):
     """Narrow networks for CPUs, with the rates of the paper's tables and without dropout. The error at the true
     rotations is 20.6 mm, because the networks use the bones of the mean adult."""
     monkeypatch.setattr(torch.nn.functional, "dropout", lambda x, *_: x)
-    monkeypatch.setattr(ne, "drop_path", lambda branch, *_: branch)
+    monkeypatch.setattr(DropPath, "forward", lambda _, branch: branch)
     generator = Generator(scene="paper", measure=False)
     made = [[thinned(person.sample) for person in generator.clip(3, k)] for k in (1, 12)]
     examples = [clip_example(clip, np.random.default_rng(1), trans_center=False, pelvis_centered=0.0) for clip in made]

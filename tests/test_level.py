@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from motion_files import a_clip, joints_of
 
+from lidarpose.body.mocap.leveling import LEAST_FRAMES, leveling, up_of_people
 from lidarpose.data.prepare import prepare, reader
-from lidarpose.data.readers.lidarhuman26m import LEAST_FRAMES, leveling, up_of_people
 from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_about
 

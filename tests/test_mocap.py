@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from lidarpose.body.mocap import digest, joint_tree, load_motion, retarget, skeleton_files
 from lidarpose.errors import InputError
-from lidarpose.geometry import UP_AXES
+from lidarpose.geometry import UP_AXES, rotation_about
 from lidarpose.synth.shard_job import SynthesisJob
 
 J, MAIN = files.J, files.MAIN
@@ -347,6 +347,22 @@ def test_load_motion_lidarhuman26m_round_trip(tmp_path, up):
     (folder / "000009.json").unlink()
     motion = load_motion(tmp_path, up=up)
     assert motion.names == ("labels/3d/pose/24", "labels/3d/pose/24#2") and tuple(motion.length) == (4, 7)
+
+
+def test_load_motion_levels_lidarhuman26m(tmp_path):
+    """The frame of a sensor that looks down is turned level, as by `prepare`; up="z" keeps it."""
+    rotations, way = files.a_clip(120)
+    rotations[:, 1:] = np.eye(3)
+    # upright people who turn around
+    rotations[:, 0] = rotation_about("z", np.linspace(0, 2 * np.pi, len(rotations)))
+    tilted, tilted_way = rotations.copy(), way @ rotation_about("y", np.radians(15)).T
+    tilted[:, 0] = rotation_about("y", np.radians(15)) @ rotations[:, 0]
+    folder = files.write_pose_json(tmp_path / "labels/3d/pose/24", tilted, tilted_way)
+    check_same(load_motion(folder, up="z"), tilted, tilted_way)
+    level = load_motion(folder)
+    up = level.rotations[:, 0] @ [0, 0, 1]
+    assert np.degrees(np.arccos(up[:, 2])).max() < 2
+    np.testing.assert_allclose(level.translation, way, atol=0.03 * np.abs(way).max())
 
 
 @pytest.mark.parametrize(

@@ -281,7 +281,10 @@ def test_table_commands_follow_paper_protocol(data):
     assert (
         "--recipe paper --size paper" in lines["DAPT", "waymo"][0]
         and f"--motion {data['lidarhuman26m-poses']}" in lines["DAPT", "waymo"][0]
+        and "--set ground_window=1,clothes=0" in lines["DAPT", "waymo"][0]
     )
+    recorded = cells(TABLES["table4"], options, ["pre-training"])[0].training[0]
+    assert "--set ground_window=1,clothes=0,recorded=1,keep=1" in " ".join(recorded.command(Path("o")))
     assert all(cell.evaluation for cell in cells(TABLES["table2"], options))
     # people with a corpus's poses have the body of the user's SMPL file if given, others the shipped body
     assert "--body" not in lines["DAPT", "waymo"][0]

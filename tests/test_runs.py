@@ -389,7 +389,8 @@ def test_stopped_run_saves_and_resumes_to_same_losses(monkeypatch, tmp_path, unb
 
 
 @pytest.mark.long
-def test_stop_request_in_last_chunk_finishes_run(monkeypatch, tmp_path):
+def test_stop_request_in_last_chunk_finishes_run_and_is_reported(monkeypatch, tmp_path):
+    """A command that runs several trainings must not begin the next one."""
     original = PoseNetObjective.terms
 
     def interrupted(*args, **kwargs):
@@ -398,8 +399,13 @@ def test_stop_request_in_last_chunk_finishes_run(monkeypatch, tmp_path):
         return original(*args, **kwargs)
 
     monkeypatch.setattr(PoseNetObjective, "terms", interrupted)
-    assert loop.train(replace(RECIPE, people=CHUNK), tmp_path / "run") == tmp_path / "run" / run_dir.MODEL
-    assert people_of(tmp_path / "run") == [CHUNK]
+    recipe, folder = replace(RECIPE, people=CHUNK), tmp_path / "run"
+    with pytest.raises(Interrupted, match=f"stopped after all {CHUNK} samples: the run is complete"):
+        loop.train(recipe, folder)
+    assert people_of(folder) == [CHUNK]
+    # nothing is left to do
+    assert loop.train(recipe, folder, resume=True) == folder / run_dir.MODEL
+    assert people_of(folder) == [CHUNK]
 
 
 @pytest.mark.parametrize(("people", "steps"), [(CHUNK, BATCHES), (CHUNK + 1, BATCHES + 1), (1, 1)])

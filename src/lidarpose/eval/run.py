@@ -315,7 +315,7 @@ def _described(model: Any) -> Model:
         raise InputError(
             f"{kind}.skeleton: expected a Skeleton or its name, got {skeleton!r}: give the skeleton of its joints"
         )
-    names = ("predict", "predict_in", "outputs", "backend", "header")
+    names = ("predict", "predict_in", "outputs", "backend", "header", "uses_box_centers")
     parts: dict[str, Any] = {name: getattr(model, name) for name in names if hasattr(model, name)}
     known = {"name": kind} | (known if isinstance(known, dict) else {})
     return cast(Model, SimpleNamespace(**parts, skeleton=as_skeleton(skeleton), model=known))

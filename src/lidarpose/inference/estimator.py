@@ -51,6 +51,8 @@ class PoseEstimator:
         # whether the pose of the first pass is averaged with the others, and the transform of the first pass
         self._averaged = self.header.network == NetworkConfig.kind
         self._first = MIRRORED if self._averaged else IDENTITY
+        # whether the centers of boxes affect poses
+        self.uses_box_centers = self._averaged
         self._middle = list(self.skeleton.middle)
 
     def outputs(

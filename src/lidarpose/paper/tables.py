@@ -255,10 +255,19 @@ def _paper(options: Options, *words: str) -> tuple[str, ...]:
     return ("--recipe", "paper", *(() if options.size == PAPER else _FASTER), *words)
 
 
-def _pretrained(options: Options, *words: str, motion: tuple[str, ...] | None = None) -> tuple[str, ...]:
-    """Options of the paper's pre-training."""
+def _pretrained(
+    options: Options, *words: str, motion: tuple[str, ...] | None = None, changes: tuple[str, ...] = ()
+) -> tuple[str, ...]:
+    """Options of the paper's pre-training; changes: fields of its scene."""
     poses = _motion(options) if motion is None else motion
-    return _paper(options, "--size", options.size, *poses, *words)
+    return _paper(options, "--size", options.size, *poses, *words, *_scene(options, *changes))
+
+
+def _scene(options: Options, *changes: str) -> tuple[str, ...]:
+    """Changes of the scene `paper`. For real sets it is the paper's exactly: bodies without clothes, and the window of
+    Eq. 3 over body and ground."""
+    exact = ("ground_window=1", "clothes=0") if options.real else ()
+    return ("--set", ",".join((*exact, *changes))) if (*exact, *changes) else ()
 
 
 def _motion(options: Options) -> tuple[str, ...]:
@@ -334,7 +343,7 @@ def _methods(options: Options) -> list[Row]:
         Row(
             name="ours",
             finetune=(*released_options, *equal_people),
-            pretrain=("--size", size, "--scene", "paper", *_motion(options)),
+            pretrain=("--size", size, "--scene", "paper", *_motion(options), *_scene(options)),
         ),
     ]
 
@@ -402,9 +411,8 @@ def _components(options: Options) -> list[Row]:
 def _augmentations(options: Options) -> list[Row]:
     """Table 4a, and Table 4b, where r_keep 0.6 equals the last row of 4a."""
     finetune, motion = _tuned(options), _motion(options)
-    pretrain_recorded, pretrain_sampled = (
-        _pretrained(options, *words) for words in (("--set", "recorded=1,keep=1"), ("--keep", "1"))
-    )
+    pretrain_recorded = _pretrained(options, changes=("recorded=1", "keep=1"))
+    pretrain_sampled = _pretrained(options, "--keep", "1")
     source = f"--data {_POSES_OF_PAPER}" if options.real else "--motion FILE"
     why = "" if motion else f"recorded positions need captured motion: give {source}"
     rows = [

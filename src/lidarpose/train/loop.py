@@ -263,7 +263,10 @@ class _Run:
                         os.fsync(log.fileno())
                         self._save()
                         save_time = time.monotonic()
-                if is_stopping and not is_last:
+                if is_stopping and is_last:
+                    # whoever runs several commands in turn must learn that the next one is not wanted
+                    raise Interrupted(f"stopped after all {self.seen:,} samples: the run is complete", stop.number)
+                if is_stopping:
                     # all processes take this branch: the request was reduced together with the losses
                     folder_option = ("--out " if recipe.kind == "finetune" else "") + shlex.quote(str(self.folder))
                     remedy = f"go on with lidarpose {recipe.kind} {folder_option} --resume"

@@ -294,9 +294,8 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
     card |= {"data": folder_names(recipe.data), "held_out_sequences": list(held_out_sequences)}
     source: Source = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=kind)
     if recipe.mix:
-        synthetic_source = SyntheticSource(
-            scene=recipe.scene, seed=recipe.seed, objects=_OBJECTS if getattr(config, "person", False) else 0.0
-        )
+        objects = _OBJECTS if getattr(config, "person", False) else 0.0
+        synthetic_source = SyntheticSource(scene=recipe.scene, set=recipe.set, seed=recipe.seed, objects=objects)
         source = MixedSource(main=source, other=synthetic_source, share=recipe.mix)
 
     def validation() -> list[Example]:
@@ -363,7 +362,8 @@ def _of_clips(setup: TrainSetup, source: ClipSource) -> TrainSetup:
     parts = source.dataset.parts
     if len(config.clouds) > 1 and all(rows["background"].null_count == rows.num_rows for _, rows, _ in parts):
         warnings.append(f"the surroundings of these people are not known: {config.name} sees only the people")
-    return replace(setup, source=source, frames=config.frames, warnings=(*setup.warnings, *warnings))
+    card = setup.card | {"warnings": warnings}
+    return replace(setup, source=source, frames=config.frames, card=card, warnings=(*setup.warnings, *warnings))
 
 
 def _held_out(

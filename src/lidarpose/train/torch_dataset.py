@@ -120,9 +120,7 @@ class InMemoryDataset:
         skipped = Counter({"frames without rotations": len(part_rows) - len(usable_rows)})
         frame_rows = part_rows[usable_rows].tolist()
         runs = consecutive([tracks[k] for k in frame_rows], [frames[k] for k in frame_rows])
-        reason = f"frames of fewer than {CLIP_FRAMES} consecutive ones"
-        skipped[reason] = sum(len(run) for run in runs if len(run) < CLIP_FRAMES)
-        clips = [usable_rows[clip_windows(run, following=following)] for run in runs if len(run) >= CLIP_FRAMES]
+        clips = [usable_rows[clip_windows(run, following=following)] for run in runs]
         return np.concatenate([np.zeros((0, CLIP_FRAMES + following), int), *clips]), +skipped
 
     def without(self, sequences: Sequence[str]) -> "InMemoryDataset":

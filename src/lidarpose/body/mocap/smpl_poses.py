@@ -26,17 +26,21 @@ with the same `seq_path` or `motion_id`, in order, form a clip.
 import os
 import reprlib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from lidarpose.body.mocap.leveling import leveling
 from lidarpose.body.mocap.motion import Motion, is_of, join, standing_axis, usable_clips
 from lidarpose.body.mocap.retarget import motion_from_joints
+from lidarpose.body.rig import forward_kinematics, mean_adult_joints
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_from_up
 from lidarpose.io.files import FRAME_NUMBER, file_error, read_json
 from lidarpose.io.npz import read_npz
 from lidarpose.io.pickles import load_pickle
+from lidarpose.skeleton import SMPL24
 
 _R_LEVEL_SMPL = UP_AXES["y"]
 # larger rotations mean that the unit is degrees, rad
@@ -244,14 +248,31 @@ def pose_files(folder: Path) -> list[Path]:
 
 
 def load_lidarhuman26m(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
-    """The motion of a folder of numbered pose files, or of a single file; z is up unless `up` says otherwise. A missing
-    number ends a clip."""
+    """The motion of a folder of numbered pose files, or of a single file. A missing number ends a clip.
+
+    The sensor's frame is tilted as it was mounted: unless `up` is given, the sequence is turned level by one rotation,
+    as `lidarpose prepare` does. up="z" keeps the frame.
+    """
     path = Path(path)
     files = pose_files(path) if path.is_dir() else [path]
     poses, trans = zip(*(_read_pose_file(file) for file in files), strict=True)
     number = np.array([int(file.stem) for file in files]) if path.is_dir() else None
     fps = fps or LIDARHUMAN26M_FPS
-    return motion_from_smpl(path, poses, trans, name=path.stem, fps=fps, up=up, kind="LiDARHuman26M", number=number)
+    motion = motion_from_smpl(path, poses, trans, name=path.stem, fps=fps, up=up, kind="LiDARHuman26M", number=number)
+    return _leveled(motion) if up is None else motion
+
+
+def _leveled(motion: Motion) -> Motion:
+    """The motion in a level frame, if its people show that its own is tilted."""
+    origin = np.zeros((len(motion.rotations), 3))
+    joints = forward_kinematics(SMPL24.parents, mean_adult_joints()[None], motion.rotations, origin)[1]
+    R_level_sensor = leveling(joints)
+    if R_level_sensor is None:
+        return motion
+    rotations = motion.rotations.copy()
+    rotations[:, 0] = R_level_sensor @ rotations[:, 0]
+    translation = (motion.translation @ R_level_sensor.T).astype(np.float32)
+    return replace(motion, rotations=rotations, translation=translation)
 
 
 def _read_pose_file(path: Path) -> tuple[np.ndarray, np.ndarray]:
