@@ -179,9 +179,22 @@ def test_predict_warns_of_tilted_sensor(model, scene):
     (warning,) = (warning for warning in poses.warnings if "leans by" in warning)
     assert "leans by 20 degrees" in warning or "leans by 19" in warning
     # the suggested up axis is the tilted one
-    suggested = np.array([float(value) for value in warning.rpartition("--up ")[2].split(",")])
+    direction, _, level_advice = warning.partition("--up ")[2].partition(", or, ")
+    assert level_advice == "if the ground slopes, give --up z"
+    suggested = np.array([float(value) for value in direction.split(",")])
     assert np.linalg.norm(suggested) == pytest.approx(1, abs=2e-3) and suggested @ tilt[:, 2] > np.cos(np.radians(2))
     assert sum(found_at(poses.to_numpy()[:, 0] @ tilt, joints)) >= 4
+
+
+def test_given_up_axis_is_exact(scene, fake):
+    """The ground then slopes, and the sensor is level; a camera's y axis may still be tilted."""
+    sloped = scene[0] @ np.array([[1, 0, 0.25], [0, 1, 0], [0, 0, 1]])
+    for up in ("z", (0, 0, 1), "0,0,1"):
+        assert lidarpose.detect(sloped, up=up).warnings == ()
+        np.testing.assert_allclose(fake.calls[-1]["points"].mean(0), sloped.mean(0), atol=0.5)
+    for up, points in ((None, sloped), ("-y", sloped @ UP_AXES["-y"])):
+        (warning,) = lidarpose.detect(points, up=up).warnings
+        assert "the ground leans by 14 degrees" in warning and ("--up z" in warning) == (up is None)
 
 
 @pytest.mark.long
@@ -191,8 +204,9 @@ def test_boxes_of_tilted_scan_store_up_axis(model, scene, tmp_path, axis):
     path = tmp_path / "sweep.npy"
     points = scene[0] @ tilt.T @ UP_AXES[axis]
     np.save(path, points)
-    searched = lidarpose.predict(path, model=model, up=axis)
-    boxes = lidarpose.detect(path, up=axis)
+    up = None if axis == "z" else axis
+    searched = lidarpose.predict(path, model=model, up=up)
+    boxes = lidarpose.detect(path, up=up)
     assert searched.up == boxes.up and len(boxes.up.split(",")) == 3 and boxes[:2].up == boxes.up
     boxes.save(tmp_path / "sweep.boxes.json")
     searched.save(tmp_path / "sweep.poses.json")
@@ -289,10 +303,36 @@ def test_detect_suggests_up_axis_that_finds_people(scene, file, up):
 
 def test_detect_suggests_no_up_axis_without_people(scene, fake):
     empty = scene[0][alone(scene[0])]
-    assert lidarpose.detect(empty).warnings == () and len(fake.calls) == 1
+    # with ground below, it may only be upside down
+    assert lidarpose.detect(empty).warnings == () and len(fake.calls) == 2
     # in a room the up axis is ambiguous, so all are tried
     near = empty[np.abs(empty[:, :2]).max(1) < 6]
     assert lidarpose.detect(near).warnings == () and len(fake.calls) >= 6
+
+
+def test_detect_suggests_opposite_up_axis(scene):
+    """Also where the ceiling is taken for the ground, and where a few false people are found."""
+    points = scene[0] * [1, -1, -1]
+    (*_, warning) = lidarpose.detect(points).warnings
+    number = len(lidarpose.detect(points, up="-z"))
+    assert number >= 4 and f"but {number} people with up -z: try --up -z" in warning
+    places = detection.detect_places(detection.Scan(points=points, origin=np.zeros(3)), detection.Search())
+    few = [Box(center=np.zeros(3), size=np.ones(3), score=0.9)]
+    hint = detection._opposite_up(places, detection.Search(), few)
+    assert hint == f"1 found with up z, but {number} people with up -z: try --up -z"
+    # not if as many are found as given
+    assert detection._opposite_up(places, detection.Search(), few * 6) is None
+
+
+def test_detect_does_not_suggest_axis_for_single_person(scene, monkeypatch):
+    """One person may be false."""
+    single = [Box(center=np.zeros(3), size=np.ones(3), score=0.99)]
+    near = scene[0][alone(scene[0]) & (np.abs(scene[0][:, :2]).max(1) < 6)]
+    places = detection.detect_places(detection.Scan(points=near, origin=np.zeros(3)), detection.Search())
+    for boxes, is_sure in ((single, False), (single * 2, True)):
+        monkeypatch.setattr(detection, "find_people", lambda scan, search, b=boxes: replace(scan, boxes=b))
+        hint = detection._other_up_axis(places, detection.Search())
+        assert (hint is not None) == is_sure
 
 
 def test_detect_suggests_feet_that_find_people(scene):
@@ -305,6 +345,28 @@ def test_detect_suggests_feet_that_find_people(scene):
 def test_detect_reports_range_without_sensor(scene):
     (warning,) = lidarpose.detect(scene[0], sensor_origin="unknown", max_range=20).warnings
     assert warning == "the sensor position is unknown, so max_range (--range) is not applied"
+
+
+def test_detect_warns_of_sensor_far_from_most_points(scene):
+    """The origin of a map, say, with people beyond the range: nothing else is suggested."""
+    way = np.stack(np.broadcast_arrays(np.arange(0, 45, 0.1), 0.3, -1.5), 1)
+    moved = np.concatenate([scene[0] + [60, 0, 0], way])
+    (warning,) = lidarpose.detect(moved).warnings
+    assert "of the points are more than 40 m from the sensor, where people are not searched" in warning
+    assert lidarpose.detect(moved, sensor_origin=(60, 0, 0)).warnings == ()
+    # a smaller range is the user's wish
+    assert lidarpose.detect(scene[0], max_range=1.0).warnings == ()
+
+
+def test_detect_takes_sensor_on_ground_for_another_frame(scene, fake):
+    """As of the base of a vehicle, z = 0 on the ground, with a ditch near by."""
+    points, joints = scene
+    ditch = np.random.default_rng(0).uniform((-10, -10, -1.9), (-7, -7, -1.9), (len(points) // 5, 3))
+    moved = np.array([0, 0, 1.45])
+    boxes = lidarpose.detect(np.concatenate([points, ditch]) + moved)
+    assert any("m above the ground, so its position is treated as unknown" in line for line in boxes.warnings)
+    assert fake.calls[-1]["origin"] is None
+    assert sum(found_at([found.center - moved for found in boxes], joints)) >= 4
 
 
 def test_detect_replaces_implausible_sensor_origin_by_unknown(scene, fake):

@@ -20,8 +20,8 @@ _ADVICE = (
     "if there should be: points need meters and z up (--up), a lower --min-score finds more, and predict --crop "
     "treats all points as one person"
 )
-# parts of the warnings that state why no person was detected: wrong axes, units or background
-_CAUSES = ("try --up", "all coordinates by", "the background")
+# parts of the warnings that state why no person was detected: wrong axes, units, sensor position or background
+_CAUSES = ("try --up", "all coordinates by", "the background", "--sensor-origin")
 # maximum characters of an id in a warning
 _LONGEST_ID = 40
 
@@ -31,7 +31,8 @@ _FRAME = """
 --columns N  values per point in a .bin: 4 for KITTI, 5 for nuScenes
 """
 _SEARCH = """
---min-score P  score threshold of detections, 0 to 1 (default: the detector's, about one false positive a scan)
+--min-score P  score threshold of detections, 0 to 1 (default: the detector's, with which most scans have no false
+ positive; 0.5 finds more people, mainly indoors)
 --range M  maximum distance from the sensor, m (default 40)
 --max-people N  only the N people with the highest scores
 --background FILE+  static scene of a fixed sensor, left out of the search: a file of static points, several scans, or

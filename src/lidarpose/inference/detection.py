@@ -43,18 +43,27 @@ _ENOUGH_FOR_UP = 250_000
 _LEAST_STATIC = 0.2
 # one foot, m; a sensor lower than this above the ground, m, is not in feet
 _FOOT, _LOW_SENSOR = 0.3048, 3.0
+# sum of the scores of people who are found with another up axis, from which it is suggested: one person may be false
+_SURE = 1.2
+# a sensor lower than this above the ground around it, m, is the origin of another frame; distances, m, and number of
+# directions at which the ground is looked up
+_LEAST_HEIGHT, _AROUND, _DIRECTIONS = 0.18, (2.0, 4.0, 6.0, 8.0), 16
+# if more than this share of the points lies beyond the range, the sensor may be elsewhere; part of the warning
+_MOST_BEYOND, _FAR_SENSOR = 0.5, "where people are not searched"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Search:
     """Settings of people detection, see `detect`. background (k, 3) m: static points in the scan's frame; detector:
-    None for the bundled one."""
+    None for the bundled one; exact_up: the scan's up direction is exact, so that the sensor is not tilted even if the
+    ground leans."""
 
     max_range: float = MAX_RANGE
     min_score: float | None = None
     max_people: int | None = None
     background: np.ndarray | None = None
     detector: Detector | None = None
+    exact_up: bool = False
 
     def __post_init__(self):
         if not _is_number(self.max_range) or not 0 < self.max_range < np.inf:
@@ -69,7 +78,7 @@ def detect(
     points: "str | os.PathLike | ArrayLike",
     *,
     sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
-    up: str | Sequence[float] | None = "z",
+    up: str | Sequence[float] | None = None,
     columns: int | None = None,
     max_range: float | None = None,
     min_score: float | None = None,
@@ -81,27 +90,29 @@ def detect(
     Args:
         points: path of a point file, or points (n, 3+) m in any frame.
         sensor_origin: (x, y, z) m, the sensor position in the frame of the points, or "unknown". None means 0, 0, 0.
-        up: up axis of the scan, as in `predict`. None means z.
+        up: up axis of the scan, as in `predict`. None means z, or, if the ground leans, the direction in which it does.
         columns: number of values per row of a .bin file.
         max_range: maximum horizontal distance of people from the sensor, m. None means 40. Ignored if the sensor
             position is unknown.
-        min_score: score threshold. None means the detector's default, which gives about one false positive per scan.
+        min_score: score threshold. None means the detector's default, at which most scans have no false positive; 0.5
+            finds more people, mainly indoors.
         max_people: maximum number of people; those with the highest scores are returned.
         background: static background of a stationary sensor, in which no people are searched for: a file or an array
             (k, 3) m of static points, see `learn_background`; or several scans or a folder of scans, from which the
             background is learned.
 
     Returns:
-        `Boxes` in the frame of the points. Each box has `score`, the probability that it contains a person, and
-        `mounted`, whether the person rides or sits in a wheelchair. `Boxes.warnings` lists problems with the scan.
+        `Boxes` in the frame of the points. Each box has `score`, the probability that it contains a person, calibrated
+        on synthesized scenes (in real scans, scores of 0.3 to 0.8 are less often people), and `mounted`, whether the
+        person rides or sits in a wheelchair. `Boxes.warnings` lists problems with the scan.
         `Boxes.up` is the up axis of the scan, or a direction if the sensor was found to be tilted.
 
     Raises:
         InputError: a file that cannot be read, or an invalid option.
     """
+    search = search_options(min_score, max_range, max_people, background, columns, up=up)
     up = "z" if up is None else up
     rotation_from_up(up)
-    search = search_options(min_score, max_range, max_people, background, columns)
     origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)
     scan = Scan(points=np.zeros((0, 3)), origin=origin, up=up_text(up))
     result = search_alone(read_scan(scan, points, columns), search)
@@ -122,15 +133,18 @@ def search_options(
     columns: int | None,
     topic: str | None = None,
     meta: str | os.PathLike | None = None,
+    up: str | Sequence[float] | None = None,
 ) -> Search:
-    """Validates the options of a search and reads its background. max_range: None for the default. Raises
-    InputError."""
+    """Validates the options of a search and reads its background. max_range: None for the default; up: the up axis if
+    the user gives one. Raises InputError."""
     # accept arrays with zero dimensions as numbers
     min_score, max_range, max_people = (
         value.item() if getattr(value, "shape", None) == () else value for value in (min_score, max_range, max_people)
     )
     max_range = MAX_RANGE if max_range is None else max_range
-    search = Search(max_range=max_range, min_score=min_score, max_people=max_people)
+    # a direction, or z, says that the scan is level; the y axis of a camera may still be tilted
+    exact_up = up is not None and (up == "z" or not isinstance(up, str) or up not in UP_AXES)
+    search = Search(max_range=max_range, min_score=min_score, max_people=max_people, exact_up=exact_up)
     if background is None:
         return search
     return replace(search, background=read_background(background, columns=columns, topic=topic, meta=meta))
@@ -149,12 +163,18 @@ def search_alone(scan: Scan, search: Search) -> Scan:
     """`find_people` for a single scan. If no people are found, it adds `why_nobody`."""
     places = detect_places(scan, search)
     result = verify_people(places, search)
-    return result if result.boxes else replace(result, warnings=why_nobody(places, search, result.warnings))
+    if not result.boxes:
+        return replace(result, warnings=why_nobody(places, search, result.warnings))
+    if places.detections is not None and not places.detections.has_ground:
+        # a scan that is upside down may have a few false people
+        hint = _opposite_up(places, search, result.boxes)
+        return replace(result, warnings=(*result.warnings, hint)) if hint else result
+    return result
 
 
 def why_nobody(places: "DetectedScan", search: Search, warnings: tuple[str, ...]) -> tuple[str, ...]:
     """The warnings of a scan without people, with a likely reason: another up axis, feet or the background."""
-    if places.detections is None:
+    if places.detections is None or any(_FAR_SENSOR in warning for warning in warnings):
         return warnings
     other_axis = flat_along_another_axis(places.scan)
     # in wrong units, no people are found with any up axis
@@ -172,16 +192,38 @@ def why_nobody(places: "DetectedScan", search: Search, warnings: tuple[str, ...]
 def _other_up_axis(places: "DetectedScan", search: Search) -> str | None:
     """A warning for the user if people are found with another up axis."""
     input_scan, detections = places.given, places.detections
-    if detections is None or detections.has_ground and flat_axis(places.scan.points) == input_scan.upright_axis:
-        # outdoors: the axis is right
+    if detections is None:
         return None
     other_axes = [up for up in UP_AXES if up != input_scan.up]
+    if detections.has_ground and flat_axis(places.scan.points) == input_scan.upright_axis:
+        # outdoors: the axis is right, but the scan may be upside down
+        other_axes = [_opposite(input_scan)]
     boxes = {up: find_people(replace(input_scan, up=up), search).boxes or [] for up in other_axes}
-    best_axis = max(other_axes, key=lambda up: sum(box.score or 0.0 for box in boxes[up]))
-    if not boxes[best_axis]:
+    best_axis = max(other_axes, key=lambda up: _sum_of_scores(boxes[up]))
+    if _sum_of_scores(boxes[best_axis]) < _SURE:
         return None
     people = counted(len(boxes[best_axis]), "person", "people")
     return f"no people found with up {input_scan.up}, but {people} with up {best_axis}: try --up {best_axis}"
+
+
+def _opposite_up(places: "DetectedScan", search: Search, boxes: Sequence[Box]) -> str | None:
+    """A warning for the user if far more people are found upside down."""
+    up = _opposite(places.given)
+    other_boxes = find_people(replace(places.given, up=up), search).boxes or []
+    if _sum_of_scores(other_boxes) < max(_SURE, 2 * _sum_of_scores(boxes)):
+        return None
+    people = counted(len(other_boxes), "person", "people")
+    return f"{len(boxes)} found with up {places.given.up}, but {people} with up {up}: try --up {up}"
+
+
+def _opposite(scan: Scan) -> str:
+    """The axis that points the other way than the up axis nearest to the scan's."""
+    axis = scan.upright_axis
+    return axis[1:] if axis.startswith("-") else f"-{axis}"
+
+
+def _sum_of_scores(boxes: Sequence[Box]) -> float:
+    return sum(box.score or 0.0 for box in boxes)
 
 
 def _feet(places: "DetectedScan", search: Search) -> str | None:
@@ -238,13 +280,14 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
     if frame_warning := flat_along_another_axis(scan):
         warnings.append(frame_warning)
     origin = scan.level_origin
-    up = estimate_up(_near(level, origin, search), origin)
+    up = None if search.exact_up else estimate_up(_near(level, origin, search), origin)
     if up is not None:
         degrees = np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1, 1)))
         direction = np.round(up @ scan.R_level_input, 3)
         warnings.append(
             f"the ground leans by {degrees:.0f} degrees, so the sensor is assumed to be tilted: confirm it with "
             f"--up {','.join(f'{value:g}' for value in direction)}"
+            + (", or, if the ground slopes, give --up z" if scan.up == "z" else "")
         )
         scan = replace(scan, up=up_text(up @ scan.R_level_input))
         level = _leveled(scan)
@@ -252,10 +295,16 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
     # check units in the level frame: a tilted scan is as tall as one in wrong units
     if not frame_warning and (frame_warning := scan_unit_warning(level, count)):
         warnings.append(frame_warning)
-    if origin is not None and (warning := unlikely_origin(level, origin)):
+
+    def with_unknown_sensor(warning: str) -> DetectedScan:
         # start again: with an unknown sensor, thinning keeps other points, and other points determine the up direction
         scan_warnings = full_scan.warnings if frame_warning else (*full_scan.warnings, warning)
         return replace(detect_places(replace(full_scan, origin=None, warnings=scan_warnings), search), given=input_scan)
+
+    if origin is not None and (warning := unlikely_origin(level, origin)):
+        return with_unknown_sensor(warning)
+    if origin is not None and not frame_warning and (warning := _far_from_most(level, origin, search)):
+        warnings.append(warning)
     if origin is None and search.max_range != MAX_RANGE:
         warnings.append("the sensor position is unknown, so max_range (--range) is not applied")
     is_moving = None
@@ -268,10 +317,39 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
             )
     detector = search.detector or _detector()
     detections = detector.detect(level, origin, max_range=search.max_range, limit=MOST_POSED, moving=is_moving)
+    if origin is not None and (warning := _on_ground(detections, origin)):
+        return with_unknown_sensor(warning)
     if not (detections.has_ground or frame_warning):
         warnings.append("no ground was found, so people are detected without it: is the up axis correct?")
     scan = replace(scan, warnings=tuple(warnings))
     return DetectedScan(given=input_scan, scan=scan, level=level, detections=detections, moving=is_moving)
+
+
+def _far_from_most(points: np.ndarray, origin: np.ndarray, search: Search) -> str | None:
+    """A warning for the user if most points (n, 3) m, level, lie beyond the range of the sensor at origin (3,) m."""
+    share = np.mean((points[:, 0] - origin[0]) ** 2 + (points[:, 1] - origin[1]) ** 2 > search.max_range**2)
+    if share < _MOST_BEYOND or search.max_range < MAX_RANGE:
+        return None
+    return (
+        f"{share:.0%} of the points are more than {search.max_range:g} m from the sensor, {_FAR_SENSOR}: give the "
+        "sensor's position in the points' own frame (--sensor-origin), or unknown, or a larger --range"
+    )
+
+
+def _on_ground(detections: Detections, origin: np.ndarray) -> str | None:
+    """A warning for the user if the sensor at origin (3,) m, level, is at the height of the ground around it."""
+    if not detections.has_ground:
+        return None
+    turns = np.arange(_DIRECTIONS) * (2 * np.pi / _DIRECTIONS)
+    circle = np.stack([np.cos(turns), np.sin(turns)], 1)
+    places = origin[:2] + np.concatenate([radius * circle for radius in _AROUND])
+    height = float(origin[2] - np.median(detections.ground.at(places)))
+    if height > _LEAST_HEIGHT:
+        return None
+    return (
+        f"the sensor is {height:.2f} m above the ground, so its position is treated as unknown: give it in the points' "
+        "own frame (--sensor-origin)"
+    )
 
 
 def verify_people(places: DetectedScan, search: Search, known: KnownPlaces | None = None) -> Scan:
