@@ -354,6 +354,10 @@ def test_detect_warns_of_sensor_far_from_most_points(scene):
     (warning,) = lidarpose.detect(moved).warnings
     assert "of the points are more than 40 m from the sensor, where people are not searched" in warning
     assert lidarpose.detect(moved, sensor_origin=(60, 0, 0)).warnings == ()
+    # in feet most points of a street are beyond 40, too
+    street = np.concatenate([scene[0], *[scene[0][alone(scene[0])] * [s, s, 1] for s in (2.0, 2.5, 3.0)]])
+    (hint,) = lidarpose.detect(street / 0.3048).warnings
+    assert "if the units are feet" in hint
     # a smaller range is the user's wish
     assert lidarpose.detect(scene[0], max_range=1.0).warnings == ()
 

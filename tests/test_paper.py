@@ -614,6 +614,20 @@ def test_markdown_of_cells():
         assert line in page.splitlines()
 
 
+def test_table_leaves_out_seeds_that_were_neither_chosen_nor_run(tmp_path):
+    options = Options(seeds=2)
+    ours = next(c for c in cells(TABLES["table1"], options, ["ours"]) if c.seed == 1 and c.evaluation)
+    path = report._path(ours.evaluation, tmp_path)
+    path.parent.mkdir()
+    path.write_text(json.dumps({k: v for k, v in _entry().items() if k not in ("row", "column", "seed", "commands")}))
+    seeds = {}
+    for entry in write_table(TABLES["table1"], options, tmp_path, chosen=["prn", "lidarcap"])["cells"]:
+        seeds.setdefault((entry["row"], entry["column"]), []).append(entry["seed"])
+    assert seeds["PRN", "people"] == seeds["LiDARCap", "clips"] == [0, 1] and seeds["DAPT", "people"] == [0]
+    assert seeds["ours", ours.column] == [0, 1]
+    assert all(entry["seed"] < 2 for entry in write_table(TABLES["table1"], options, tmp_path)["cells"])
+
+
 # --- figures
 
 

@@ -174,7 +174,11 @@ def up_text(up: str | Sequence[float]) -> str:
 
 def upright_axis(up: str | Sequence[float]) -> str:
     """The axis, a key of `UP_AXES`, that is nearest to the up direction; see `rotation_from_up`."""
-    direction = rotation_from_up(up)[2]
+    return nearest_axis(rotation_from_up(up)[2])
+
+
+def nearest_axis(direction: np.ndarray) -> str:
+    """The axis, a key of `UP_AXES`, that is nearest to a direction (3,)."""
     axis = int(np.abs(direction).argmax())
     return "-" * bool(direction[axis] < 0) + "xyz"[axis]
 

@@ -77,7 +77,7 @@ def _paper(commands, execute: Callable[[list[str]], int], options: argparse.Name
         return
     if options.table_only:
         begin_out(out)
-        write_table(table, paper_options, out)
+        write_table(table, paper_options, out, chosen=row_keys)
     else:
         run_table(table, paper_options, out, row_keys, execute, tell)
     print(out / f"{table.name}.md")

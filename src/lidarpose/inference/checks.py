@@ -250,7 +250,9 @@ def scan_unit_warning(points: np.ndarray, count: int) -> str | None:
         return f"the points extend over {largest:.2g} m: are the units kilometers? multiply all coordinates by 1000"
     is_flat = extent[2] < largest / _WIDEST
     if is_flat and width > _LONGEST_SCAN and count < _SPARSEST * width**2:
-        unit, factor = ("millimeters", 1000) if width > _LONG_IN_MILLIMETERS else ("centimeters", 100)
+        unit, factor = (
+            ("millimeters", 1000) if width > _LONG_IN_MILLIMETERS else ("centimeters", "100 (inches by 39.37)")
+        )
         return f"the points extend over {width:,.0f} m: are the units {unit}? divide all coordinates by {factor}"
     return unit_warning(extent, what="the scan")
 

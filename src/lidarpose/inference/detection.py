@@ -143,7 +143,8 @@ def search_options(
     )
     max_range = MAX_RANGE if max_range is None else max_range
     # a direction, or z, says that the scan is level; the y axis of a camera may still be tilted
-    exact_up = up is not None and (up == "z" or not isinstance(up, str) or up not in UP_AXES)
+    is_other_axis = isinstance(up, str) and up in UP_AXES and up != "z"
+    exact_up = up is not None and not is_other_axis
     search = Search(max_range=max_range, min_score=min_score, max_people=max_people, exact_up=exact_up)
     if background is None:
         return search
@@ -174,8 +175,12 @@ def search_alone(scan: Scan, search: Search) -> Scan:
 
 def why_nobody(places: "DetectedScan", search: Search, warnings: tuple[str, ...]) -> tuple[str, ...]:
     """The warnings of a scan without people, with a likely reason: another up axis, feet or the background."""
-    if places.detections is None or any(_FAR_SENSOR in warning for warning in warnings):
+    if places.detections is None:
         return warnings
+    if any(_FAR_SENSOR in warning for warning in warnings):
+        # in feet most points are beyond the range, too
+        hint = _feet(places, search)
+        return (*(warning for warning in warnings if _FAR_SENSOR not in warning), hint) if hint else warnings
     other_axis = flat_along_another_axis(places.scan)
     # in wrong units, no people are found with any up axis
     is_scaled = scan_unit_warning(places.level, len(places.given.points)) is not None

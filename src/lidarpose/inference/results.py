@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast, overload
 import numpy as np
 
 from lidarpose.errors import counted
-from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
+from lidarpose.geometry import UP_AXES, nearest_axis, rotation_about, rotation_from_up
 from lidarpose.io.atomic import check_suffix, write_atomic
 from lidarpose.io.files import encodable, lined_json, shorten
 from lidarpose.sample import JOINT_COLUMNS, PER_JOINT, Box, Pose, facing, facing_yaw
@@ -410,6 +410,9 @@ class Poses(Sequence[PersonPose]):
         from lidarpose.viz.bird_eye import LONGEST_NAME, ScanPanel
 
         R_level_input = rotation_from_up(self.up)
+        # the axes of a tilted sensor are turned level
+        turned = "" if self.up in UP_AXES else " turned level"
+        across, along = (f"{nearest_axis(direction)}{turned}" for direction in R_level_input[:2])
         posed = [person for person in people if person.has_pose]
         label = counted(len(people), "person", "people") if people else "no people"
         if len(posed) < len(people):
@@ -421,6 +424,7 @@ class Poses(Sequence[PersonPose]):
             names=[shorten(str(person.id), LONGEST_NAME) for person in posed],
             label=label,
             sensor=None if self.origin is None else tuple((R_level_input @ self.origin)[:2].tolist()),
+            axes=(across, along),
         )
 
 

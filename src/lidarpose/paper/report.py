@@ -76,7 +76,7 @@ def run_table(
             except StepFailed as error:
                 failures[k] = str(error)
                 tell(f"{cell.row}, {cell.column}: failed: {error}")
-        content = write_table(table, options, out, failures)
+        content = write_table(table, options, out, failures, chosen=chosen)
     return content
 
 
@@ -99,13 +99,28 @@ def can_be_drawn(name: str, evaluation: Step, out: Path) -> bool:
     return is_done(evaluation, out) if name == "fig5" else stability_study(evaluation, out) is not None
 
 
-def write_table(table: Table, options: Options, out: Path, failed: dict[int, str] | None = None) -> dict[str, Any]:
-    """Writes OUT/TABLE.json and OUT/TABLE.md from the existing results, and the JSON of each finished cell. failed:
-    number of a cell -> its error."""
-    failed, all_cells = failed or {}, cells(table, options)
+def write_table(
+    table: Table,
+    options: Options,
+    out: Path,
+    failed: dict[int, str] | None = None,
+    *,
+    chosen: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Writes OUT/TABLE.json and OUT/TABLE.md from the existing results, and the JSON of each finished cell.
+
+    Args:
+        failed: number of a cell -> its error.
+        chosen: rows that are meant to have all seeds, by default all; others have the first, and what was run.
+    """
+    failed, all_cells, chosen_cells = failed or {}, cells(table, options), cells(table, options, chosen)
     entries = [_entry(cell, out, failed.get(k, "")) for k, cell in enumerate(all_cells)]
     for cell, entry in zip(all_cells, entries, strict=True):
         entry |= _difference(cell, _reference(table, cell, all_cells), out) if entry["state"] == "done" else {}
+    is_meant = [cell in chosen_cells or not cell.seed for cell in all_cells]
+    entries = [
+        entry for entry, is_kept in zip(entries, is_meant, strict=True) if is_kept or entry["state"] != "not run"
+    ]
     content = {
         "schema": SCHEMA,
         "version": __version__,

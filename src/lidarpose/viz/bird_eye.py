@@ -40,6 +40,7 @@ class ScanPanel:
         places: (K, 2) or (K, 3), positions of people without track ids.
         label: printed above.
         sensor: x, y of the sensor; None if unknown.
+        axes: names of the two axes that are drawn.
         names: names of the P people, shown instead of their numbers.
         frames: successive frames of the same scene, each with its people and their points; step: ms between frames.
     """
@@ -52,6 +53,7 @@ class ScanPanel:
     places: np.ndarray | None = None
     label: str = ""
     sensor: tuple[float, float] | None = (0.0, 0.0)
+    axes: tuple[str, str] = ("x", "y")
     names: Sequence[str] = ()
     frames: Sequence["ScanPanel"] = ()
     step: float = 100.0
@@ -110,7 +112,7 @@ def draw_scans(
     )
     tracks = "; dotted: path over the frames" if any(panel.tracks for panel in panels) else ""
     limbs = "; left limbs blue, right ones orange" if any(is_known(panel.poses) for panel in panels) else ""
-    arrows = "arrow: heading of the box" if any(panel.boxes for panel in panels) else ""
+    arrows = "arrow: facing, of given boxes their heading" if any(panel.boxes for panel in panels) else ""
     note = f"{arrows}{tracks}{limbs}".removeprefix("; ")
     figure.text(0.15 / width, 1 - 0.42 / height, note, fontsize=8, color=_FAINT, va="top")
     for number, panel in enumerate(panels):
@@ -129,8 +131,8 @@ def _draw_panel(ax, panel: ScanPanel, size: np.ndarray) -> None:
     center, scale = _window(panel, points, size)
     low, high = center - size * scale / 2, center + size * scale / 2
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
-    ax.set_xlabel("x, m", fontsize=7, color=_FAINT, labelpad=1)
-    ax.set_ylabel("y, m", fontsize=7, color=_FAINT, labelpad=-1)
+    for name, set_label in zip(panel.axes, (ax.set_xlabel, ax.set_ylabel), strict=True):
+        set_label(f"{name}, m", fontsize=7, color=_FAINT, labelpad=1)
     ax.set_title(panel.label, fontsize=10, parse_math=False)
     ax.tick_params(labelsize=7, color=_FAINT, labelcolor=_FAINT)
     ax.spines[:].set_color(_HIGH)
@@ -160,14 +162,14 @@ def _draw_panel(ax, panel: ScanPanel, size: np.ndarray) -> None:
 
 def _window(panel: ScanPanel, points: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, float]:
     """The section that axes of a size (2,) inches show: center (2,) m, and scale in meters per inch. It contains the
-    people, their tracks and the sensor, else most of the points."""
+    people and their tracks, else most of the points, and the sensor."""
     extent_points = [box.center[None, :2] for box in panel.boxes] + [np.asarray(track)[:, :2] for track in panel.tracks]
     if panel.places is not None and len(panel.places):
         extent_points.append(np.asarray(panel.places)[:, :2])
-    if extent_points and panel.sensor is not None:
-        extent_points.append(np.array([panel.sensor]))
     if not extent_points:
         extent_points = [np.percentile(points[:, :2], (2, 98), axis=0) if len(points) else np.zeros((1, 2))]
+    if panel.sensor is not None:
+        extent_points.append(np.array([panel.sensor]))
     low, high = np.concatenate(extent_points).min(0), np.concatenate(extent_points).max(0)
     scale = max(float(((high - low + 2 * _MARGIN) / size).max()), _LEAST_SPAN / float(size.min()))
     return (low + high) / 2, scale
