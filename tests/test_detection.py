@@ -20,6 +20,7 @@ from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.lidar.raycast import scan
 from lidarpose.models.detector.candidates import SceneIndex
 from lidarpose.models.detector.detector import Detector, rows_that_matter
+from lidarpose.recording.predict_recording import FramePredictor
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import draw_bodies
@@ -195,6 +196,10 @@ def test_given_up_axis_is_exact(scene, fake):
     for up, points in ((None, sloped), ("-y", sloped @ UP_AXES["-y"])):
         (warning,) = lidarpose.detect(points, up=up).warnings
         assert "the ground leans by 14 degrees" in warning and ("--up z" in warning) == (up is None)
+    # in recordings alike
+    searches = [FramePredictor(up=up)._search for up in ("z", None, "-y")]
+    assert [search.exact_up for search in searches] == [True, False, False]
+    assert not FramePredictor()._search.exact_up
 
 
 @pytest.mark.long

@@ -27,7 +27,8 @@ _LONGEST_ID = 40
 
 _FRAME = """
 --sensor-origin X,Y,Z  sensor position, or unknown (default: ORIGIN)
---up AXIS  the file's up axis: z (default), y or x, -y where y points down (cameras), or a direction x,y,z
+--up AXIS  the file's up axis: z (default), y or x, -y where y points down (cameras), or a direction x,y,z; z or a
+ direction, if given, is exact: ground that leans is then a slope and not a tilt of the sensor
 --columns N  values per point in a .bin: 4 for KITTI, 5 for nuScenes
 """
 _SEARCH = """

@@ -82,7 +82,8 @@ def predict(
             lacks joints of smpl24.
         up: up axis of the input: "z", "y" or "x", with a minus sign if it points down ("-y" for cameras); or, for a
             tilted sensor, the up direction (x, y, z) or "x,y,z" in the frame of the input. None means the up axis
-            stated by `boxes`, as `detect` and `predict` write it, otherwise z.
+            stated by `boxes`, as `detect` and `predict` write it, otherwise z, or, if the ground leans, the direction
+            in which it does. A given z or direction is exact.
         columns: number of values per row of a .bin file.
         model: a `Predictor`; or the name or path of weights, loaded with the default settings of `load`; or a function
             without arguments that returns a `Predictor`, called when it is needed. Bundled networks are loaded once and

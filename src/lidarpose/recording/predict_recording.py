@@ -223,7 +223,7 @@ class FramePredictor:
         background: "str | os.PathLike | Sequence | np.ndarray | None" = None,
         sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
         skeleton: str | Skeleton | None = None,
-        up: str | Sequence[float] | None = "z",
+        up: str | Sequence[float] | None = None,
         columns: int | None = None,
         topic: str | None = None,
         meta: str | os.PathLike | None = None,
