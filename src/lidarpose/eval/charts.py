@@ -14,13 +14,11 @@ from lidarpose.eval.predictions import Predictions
 from lidarpose.eval.robustness import Curve, End, Stability
 from lidarpose.eval.scores import BASELINE, OURS, Result, Setting
 from lidarpose.sample import CONFIDENCE_RADIUS, Pose
-from lidarpose.viz.draw import Panel, draw_people, png_of
+from lidarpose.viz.draw import BLUE, FAINT, HAIRLINE, INK, ORANGE, Panel, draw_people, png_of
 
-# blue and orange of Okabe and Ito's color-blind-safe palette (2008), with a darker orange for contrast on white
-_BLUE, _ORANGE = "#0072b2", "#e07000"
-# one color per network, from the same palette
-_PALETTE = (_BLUE, _ORANGE, "#009e73", "#cc79a7", "#56b4e9", "#7a828c", "#b59a00")
-_BAR, _GRAY, _INK, _FAINT, _HAIRLINE = "#c9deec", "#9aa3ad", "#1f2328", "#7a828c", "#e3e6ea"
+# one color per network, from the palette of Okabe and Ito
+_PALETTE = (BLUE, ORANGE, "#009e73", "#cc79a7", "#56b4e9", "#7a828c", "#b59a00")
+_BAR, _GRAY = "#c9deec", "#9aa3ad"
 _DPI = 100
 _BINS = 10
 # bin edges of the predicted spread, m, for comparing it with the true error
@@ -42,7 +40,7 @@ def draw_errors(result: Result) -> bytes:
     rows = [row for row in result.lines if row.figure == "mpjpe" and row.arithmetic == OURS and row.value is not None]
     overall_values = {row.method: row.value for row in rows if row.group == "all" and row.value is not None}
     for axes, (group, (title, empty_text)) in zip(figure.subplots(2, 2).ravel(), panels.items(), strict=True):
-        axes.set_title(title, fontsize=10, loc="left", color=_INK)
+        axes.set_title(title, fontsize=10, loc="left", color=INK)
         group_rows = [row for row in rows if row.group == group and row.method == setting.method]
         if not group_rows:
             _empty(axes, empty_text)
@@ -52,10 +50,10 @@ def draw_errors(result: Result) -> bytes:
         _bars(axes, values, low, high, names, [f"{value:.0f}" for value in values])
         for method, value in overall_values.items():
             if method == setting.method:
-                _level(axes, value, f"all {value:.1f}", _INK)
+                _level(axes, value, f"all {value:.1f}", INK)
             elif value < axes.get_ylim()[1] * 1.6:
                 axes.set_ylim(0, max(axes.get_ylim()[1], value * 1.12))
-                _level(axes, value, method.removeprefix(BASELINE), _ORANGE)
+                _level(axes, value, method.removeprefix(BASELINE), ORANGE)
     return png_of(figure, None)
 
 
@@ -144,7 +142,7 @@ def compare_ends(studies: dict[str, dict[str, Any]]) -> bytes:
         positions = np.arange(len(ends)) + (k - (len(studies) - 1) / 2) * width
         axes.bar(positions, [end["mean"] for end in ends], 0.9 * width, color=color, label=network, zorder=2)
         low, _, high = np.array([end["quartiles"] for end in ends]).T
-        axes.vlines(positions, low, high, color=_INK, lw=1, zorder=3)
+        axes.vlines(positions, low, high, color=INK, lw=1, zorder=3)
         axes.set_xticks(np.arange(len(ends)), [f"{end['group']}\nworst {end['worst']:,}" for end in ends])
     _styled(axes, "means; lines from the lower to the upper quartile")
     axes.legend(fontsize=8, frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, -0.32))
@@ -184,8 +182,8 @@ def _bars(axes, values: np.ndarray, low, high, names: list[str], texts: list[str
     """Draws one bar per value with its interval and a text at its end, vertical or `horizontal`."""
     positions = np.arange(len(values))
     (axes.barh if horizontal else axes.bar)(positions, values, 0.7, color=_BAR, zorder=1)
-    (axes.hlines if horizontal else axes.vlines)(positions, low, high, color=_BLUE, lw=1.6, zorder=4)
-    axes.plot(*((values, positions) if horizontal else (positions, values)), "o", ms=4, color=_BLUE, zorder=5)
+    (axes.hlines if horizontal else axes.vlines)(positions, low, high, color=BLUE, lw=1.6, zorder=4)
+    axes.plot(*((values, positions) if horizontal else (positions, values)), "o", ms=4, color=BLUE, zorder=5)
     ends = np.maximum(values, high)
     for k, end, text in zip(positions, ends, texts, strict=True):
         anchor, offset = ((end, k), (4, -3)) if horizontal else ((k, end), (0, 4))
@@ -208,7 +206,7 @@ def _confidence(axes, confidence: np.ndarray, is_hit: np.ndarray, result: Result
     centers = (np.arange(_BINS) + 0.5) / _BINS
     axes.bar(centers, count / count.sum(), 0.092, color=_BAR, label="share of joints", zorder=1)
     axes.plot([0, 1], [0, 1], color=_GRAY, lw=0.9, zorder=2)
-    axes.plot(mean, share, "o-", color=_BLUE, ms=4.5, lw=1.4, label="within 10 cm", zorder=3)
+    axes.plot(mean, share, "o-", color=BLUE, ms=4.5, lw=1.4, label="within 10 cm", zorder=3)
     axes.set(xlim=(0, 1), ylim=(0, 1))
     values = {row.figure: row.value for row in result.lines if row.group == "all"}
     title = f"expected calibration error {values['calibration_error']:.1f} %"
@@ -226,7 +224,7 @@ def _spread(axes, spread: np.ndarray, error: np.ndarray) -> None:
     top = 1.1 * max([*spread_means, *error_means, *quartiles[:, 1], 1.0])
     axes.plot([0, top], [0, top], color=_GRAY, lw=0.9, zorder=2)
     axes.fill_between(spread_means, *quartiles.T, color=_BAR, lw=0, label="middle half", zorder=1)
-    axes.plot(spread_means, error_means, "o-", color=_BLUE, ms=4.5, lw=1.4, label="mean", zorder=3)
+    axes.plot(spread_means, error_means, "o-", color=BLUE, ms=4.5, lw=1.4, label="mean", zorder=3)
     axes.set(xlim=(0, top), ylim=(0, top))
     title = f"spread {spread.mean():.0f} mm predicted, {error.mean():.0f} mm true"
     _styled(axes, title, xlabel="predicted spread, mm", ylabel="true error, mm", legend=True)
@@ -238,7 +236,7 @@ def _curve(axes, curve: Curve, top: float) -> None:
     points = [curve.points[k] for k in positions]
     values, low, high = _intervals(points, "mpjpe")
     axes.fill_between(positions, low, high, color=_BAR, lw=0, zorder=1)
-    axes.plot(positions, values, "o-", color=_BLUE, ms=4.5, lw=1.4, zorder=3)
+    axes.plot(positions, values, "o-", color=BLUE, ms=4.5, lw=1.4, zorder=3)
     axes.axhline(values[0], color=_GRAY, lw=0.8, ls=(0, (4, 3)), zorder=2)
     for x, value in zip(positions, values, strict=True):
         _text(axes, f"{value:.0f}", (x, value), (0, 6))
@@ -272,7 +270,7 @@ def _figure(width: float, height: float, title: str, subtitle: str):
 
     figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white", layout="constrained")
     options = {"parse_math": False, "family": "DejaVu Sans"}
-    figure.suptitle(f"{title}\n{subtitle}", x=0.01, ha="left", fontsize=10.5, color=_INK, **options)
+    figure.suptitle(f"{title}\n{subtitle}", x=0.01, ha="left", fontsize=10.5, color=INK, **options)
     return figure
 
 
@@ -288,12 +286,12 @@ def _styled(
     for name, spine in axes.spines.items():
         spine.set_visible(name in ("left", "bottom"))
         spine.set_color(_GRAY)
-    axes.grid(axis=grid, color=_HAIRLINE, lw=0.8, zorder=0)
+    axes.grid(axis=grid, color=HAIRLINE, lw=0.8, zorder=0)
     axes.set_axisbelow(True)
-    axes.tick_params(labelcolor=_INK, length=2.5, color=_GRAY)
+    axes.tick_params(labelcolor=INK, length=2.5, color=_GRAY)
     axes.tick_params(axis="both" if xlabel else grid, labelsize=8)
     if title:
-        axes.set_title(title, fontsize=9.5, loc="left", color=_INK)
+        axes.set_title(title, fontsize=9.5, loc="left", color=INK)
     axes.set_xlabel(xlabel, fontsize=9)
     axes.set_ylabel(ylabel, fontsize=9)
     if legend:
@@ -301,12 +299,12 @@ def _styled(
 
 
 def _text(axes, text: str, position: tuple[Any, Any], offset: tuple[float, float], *, ha: str = "center", **options):
-    return axes.annotate(text, position, offset, textcoords="offset points", ha=ha, fontsize=8, color=_INK, **options)
+    return axes.annotate(text, position, offset, textcoords="offset points", ha=ha, fontsize=8, color=INK, **options)
 
 
 def _level(axes, y: float, text: str, color: str) -> None:
     """A horizontal line with a text above its right end."""
-    dashes = (4, 3) if color == _INK else (1, 2)
+    dashes = (4, 3) if color == INK else (1, 2)
     axes.axhline(y, color=color, lw=0.8, ls=(0, dashes), zorder=3)
     options = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "ha": "right"}
     axes.annotate(text, (1.0, y), (-2, 2), fontsize=7.5, color=color, zorder=7, **options)
@@ -314,6 +312,6 @@ def _level(axes, y: float, text: str, color: str) -> None:
 
 def _empty(axes, text: str, title: str = "") -> None:
     if title:
-        axes.set_title(title, fontsize=9.5, loc="left", color=_INK)
+        axes.set_title(title, fontsize=9.5, loc="left", color=INK)
     axes.set_axis_off()
-    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=9, color=_FAINT)
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=9, color=FAINT)

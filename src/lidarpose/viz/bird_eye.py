@@ -14,7 +14,7 @@ from lidarpose.io.atomic import check_suffix
 from lidarpose.models.detector.ground import Ground, estimate_ground
 from lidarpose.models.detector.proposals import heights_above
 from lidarpose.sample import Box, Pose
-from lidarpose.viz.draw import SIDE_COLORS, draw_people, png_of, shortened, stack_pictures
+from lidarpose.viz.draw import ALERT, FAINT, INK, SIDE_COLORS, draw_people, png_of, shortened, stack_pictures
 from lidarpose.viz.person_view import Panel, bone_pairs, bone_sides, box_edges, finite, is_known
 
 MAX_SCANS = 12
@@ -25,7 +25,7 @@ _WIDE, _CARDS_IN_ROW = 11.5, 4  # width of a scan, inches, above the cards of at
 _LABEL_RADII, _LABEL_SIZE = (15.0, 26.0, 38.0), 13.0  # pt: distances of a number from its box, size of a number
 _MARGIN, _LEAST_SPAN = 3.0, 16.0  # m: margin around the people, and minimum side of a view
 _BELOW, _ABOVE = 0.25, 2.5  # range of heights that the colors cover, m above the ground
-_GROUND, _HIGH, _INK, _FAINT, _BOX = "#d5d9de", "#eceff2", "#1f2328", "#7a828c", "#b3261e"
+_GROUND, _HIGH = "#d5d9de", "#eceff2"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -114,7 +114,7 @@ def draw_scans(
     limbs = "; left limbs blue, right ones orange" if any(is_known(panel.poses) for panel in panels) else ""
     arrows = "arrow: facing, of given boxes their heading" if any(panel.boxes for panel in panels) else ""
     note = f"{arrows}{tracks}{limbs}".removeprefix("; ")
-    figure.text(0.15 / width, 1 - 0.42 / height, note, fontsize=8, color=_FAINT, va="top")
+    figure.text(0.15 / width, 1 - 0.42 / height, note, fontsize=8, color=FAINT, va="top")
     for number, panel in enumerate(panels):
         row, column = divmod(number, columns)
         place = ((column * panel_width + 0.55) / width, (height - _TITLE - (row + 1) * _PANEL + 0.45) / height)
@@ -132,20 +132,20 @@ def _draw_panel(ax, panel: ScanPanel, size: np.ndarray) -> None:
     low, high = center - size * scale / 2, center + size * scale / 2
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
     for name, set_label in zip(panel.axes, (ax.set_xlabel, ax.set_ylabel), strict=True):
-        set_label(f"{name}, m", fontsize=7, color=_FAINT, labelpad=1)
+        set_label(f"{name}, m", fontsize=7, color=FAINT, labelpad=1)
     ax.set_title(panel.label, fontsize=10, parse_math=False)
-    ax.tick_params(labelsize=7, color=_FAINT, labelcolor=_FAINT)
+    ax.tick_params(labelsize=7, color=FAINT, labelcolor=FAINT)
     ax.spines[:].set_color(_HIGH)
     inside_points = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(1)]
     _draw_points(ax, inside_points[evenly_spaced(len(inside_points), _MAX_POINTS)], estimate_ground(points))
     if panel.sensor is not None:
-        ax.plot(*panel.sensor, ls="", marker="^", ms=8, color=_INK, mec="white", zorder=5)
+        ax.plot(*panel.sensor, ls="", marker="^", ms=8, color=INK, mec="white", zorder=5)
         ax.annotate("sensor", panel.sensor, (7, -3), textcoords="offset points", fontsize=8, zorder=5)
     for track in panel.tracks:
-        ax.plot(track[:, 0], track[:, 1], color=_BOX, lw=1.2, ls=":", zorder=4)
-        ax.plot(*track[-1, :2], ls="", marker="o", ms=2.5, color=_BOX, zorder=4)
+        ax.plot(track[:, 0], track[:, 1], color=ALERT, lw=1.2, ls=":", zorder=4)
+        ax.plot(*track[-1, :2], ls="", marker="o", ms=2.5, color=ALERT, zorder=4)
     if panel.places is not None and len(panel.places):
-        ax.plot(panel.places[:, 0], panel.places[:, 1], ls="", marker="o", ms=2.5, color=_BOX, alpha=0.5, zorder=4)
+        ax.plot(panel.places[:, 0], panel.places[:, 1], ls="", marker="o", ms=2.5, color=ALERT, alpha=0.5, zorder=4)
     centers = np.array([box.center[:2] for box in panel.boxes]).reshape(-1, 2)
     arrow_tips = np.array([_arrow_tip(box) for box in panel.boxes]).reshape(-1, 2)
     offsets = label_offsets(centers * 72 / scale, arrow_tips * 72 / scale)
@@ -220,14 +220,14 @@ def _draw_box(ax, box: Box, offset: tuple[float, float]) -> None:
     """Draws a box's outline, its heading, and its id at `offset` pt from the center."""
     from matplotlib.collections import LineCollection
 
-    ax.add_collection(LineCollection(list(box_edges(box)[..., :2]), colors=_BOX, lw=1.1, zorder=5))
+    ax.add_collection(LineCollection(list(box_edges(box)[..., :2]), colors=ALERT, lw=1.1, zorder=5))
     ax.annotate(
-        "", _arrow_tip(box), box.center[:2], arrowprops={"arrowstyle": "->", "color": _BOX, "lw": 1.1}, zorder=5
+        "", _arrow_tip(box), box.center[:2], arrowprops={"arrowstyle": "->", "color": ALERT, "lw": 1.1}, zorder=5
     )
     if box.id is not None:
         ax.annotate(
             shortened(str(box.id), LONGEST_NAME), box.center[:2], offset, textcoords="offset points", fontsize=9,
-            weight="bold", color=_BOX, zorder=7, parse_math=False,
+            weight="bold", color=ALERT, zorder=7, parse_math=False,
             bbox={"fc": "white", "ec": "none", "alpha": 0.7, "pad": 0.8},
-            ha="center", va="center", arrowprops={"arrowstyle": "-", "color": _BOX, "lw": 0.4, "shrinkB": 6},
+            ha="center", va="center", arrowprops={"arrowstyle": "-", "color": ALERT, "lw": 0.4, "shrinkB": 6},
         )  # fmt: skip

@@ -36,12 +36,14 @@ MAX_PEOPLE = 60  # more would make the sheet too large for a screen
 MAX_POINTS_DRAWN = 3000  # per person; more points would only cover each other at this size
 
 # blue and orange of Okabe and Ito's color-blind-safe palette (2008), the orange darker for contrast on white
-SIDE_COLORS = {"left": "#0072b2", "right": "#e07000", "center": "#2b2f36"}
+BLUE, ORANGE = "#0072b2", "#e07000"
+SIDE_COLORS = {"left": BLUE, "right": ORANGE, "center": "#2b2f36"}
 # two shades per body side, which alternate along a limb so that neighboring parts differ
 _PART_SHADES = {"left": ("#7db8dd", "#3b8fc4"), "right": ("#f5bd86", "#e8954a"), "center": ("#a9b0ba", "#7f8792")}
 _NOT_BODY = "#dcb3cf"
 _NEAR, _FAR = (0.45, 0.51, 0.57), (0.85, 0.87, 0.90)  # colors of points by depth: gray, as colors mark the skeleton
-_TRUTH, _INK, _FAINT, _HAIRLINE, _ALERT = "#4d545d", "#1f2328", "#7a828c", "#e3e6ea", "#b3261e"
+_TRUTH = "#4d545d"
+INK, FAINT, HAIRLINE, ALERT = "#1f2328", "#7a828c", "#e3e6ea", "#b3261e"
 _DASHES = (0, (3, 1.6))
 
 # the sheet, in inches
@@ -96,13 +98,13 @@ def draw_people(
     grid |= {"bottom": _MARGIN / height, "top": 1 - top / height, "hspace": _GAP / card_height}
     for i, ax in enumerate(figure.subplots(rows, columns, squeeze=False, gridspec_kw=grid).flat):
         ax.set(xticks=[], yticks=[], facecolor="white")
-        ax.spines[:].set(color=_HAIRLINE, linewidth=1)
+        ax.spines[:].set(color=HAIRLINE, linewidth=1)
         if i < len(shown_panels):
             _draw_card(ax, shown_panels[i], card_width, card_height)
         else:
             ax.set_axis_off()
     if not shown_panels:
-        _text(figure, 0.5, 0.5, "no people", size=11, color=_FAINT, ha="center")
+        _text(figure, 0.5, 0.5, "no people", size=11, color=FAINT, ha="center")
     return png_of(figure, path)
 
 
@@ -139,7 +141,7 @@ def stack_pictures(pictures: list[bytes], path: str | Path | None = None) -> byt
     return buffer.getvalue()
 
 
-def _text(artist, x: float, y: float, text: str, *, size: float, color: str = _INK, **style) -> None:
+def _text(artist, x: float, y: float, text: str, *, size: float, color: str = INK, **style) -> None:
     artist.text(x, y, text, fontsize=size, color=color, family="DejaVu Sans", parse_math=False, usetex=False, **style)
 
 
@@ -159,7 +161,7 @@ def _draw_header(figure, panels: list[Panel], shown_panels: list[Panel], title: 
     # wide enough for a hash
     room = int((width - 2 * _MARGIN) / 0.127) - len(note)
     _text(figure, left, top, shortened(title, max(room, 12)), size=13, weight="bold", va="top")
-    _text(figure, 1 - left, top - 0.03 / height, note, size=9, color=_FAINT, va="top", ha="right")
+    _text(figure, 1 - left, top - 0.03 / height, note, size=9, color=FAINT, va="top", ha="right")
     if handles := _legend_handles(shown_panels):
         figure.legend(
             handles=handles,
@@ -172,7 +174,7 @@ def _draw_header(figure, panels: list[Panel], shown_panels: list[Panel], title: 
             handlelength=1.3,
             handletextpad=0.5,
             columnspacing=1.3,
-            labelcolor=_INK,
+            labelcolor=INK,
             prop={"family": "DejaVu Sans", "size": 8},
         )
 
@@ -194,7 +196,7 @@ def _legend_handles(panels: list[Panel]) -> list:
     if any(panel.part is None and len(panel.points) for panel in panels):
         entries += [{"label": "near point", "color": _NEAR, **dot}, {"label": "far point", "color": _FAR, **dot}]
     if any(facing_of(panel) is not None for panel in panels):
-        entries.append({"label": "facing", "color": _FAINT, "ls": "", "marker": ">", "ms": 4.5})
+        entries.append({"label": "facing", "color": FAINT, "ls": "", "marker": ">", "ms": 4.5})
     return [Line2D([], [], **entry) for entry in entries]
 
 
@@ -208,13 +210,13 @@ def _draw_card(ax, panel: Panel, width: float, height: float) -> None:
 
     # the narrowest card is wide enough for a UUID
     write(shortened(panel.label, int(width / 0.083)), up=0.25, size=8.5, weight="bold")
-    write(describe(panel), up=0.09, size=7.5, color=_FAINT)
+    write(describe(panel), up=0.09, size=7.5, color=FAINT)
     anchor, note = middle(panel), missing_pose(panel)
     if anchor is None:
-        write(note, up=(height + _CAPTION - 0.1) / 2, size=8, color=_FAINT)
+        write(note, up=(height + _CAPTION - 0.1) / 2, size=8, color=FAINT)
         return
     if note:
-        write(note, up=height - 0.2, size=8, color=_ALERT)
+        write(note, up=height - 0.2, size=8, color=ALERT)
 
     forward = facing_of(panel)
     directions = view_directions(forward)
@@ -231,21 +233,21 @@ def _draw_card(ax, panel: Panel, width: float, height: float) -> None:
     for direction, name, extent, span in zip(directions, names, extents, spans, strict=True):
         right = left + span + margin
         shift = (left + right) / 2 - extent[:, 0].mean()
-        ax.plot([left, right], [low, low], color=_HAIRLINE, lw=1.2, zorder=1)
+        ax.plot([left, right], [low, low], color=HAIRLINE, lw=1.2, zorder=1)
         window = Rectangle(
             (left, low - 0.08 * scale), right - left, (view_height + 0.16) * scale, transform=ax.transData
         )
         _draw_view(ax, panel, seen_from=direction, shift=shift, window=window)
         if not note:
-            write(name, up=height - 0.2, right=(left + right) / 2 / scale, size=7, color=_FAINT)
+            write(name, up=height - 0.2, right=(left + right) / 2 / scale, size=7, color=FAINT)
         if forward is not None:
             x = project(anchor, seen_from=direction)[0] + shift
             _draw_arrow(ax, x, low - 0.045 * scale, 0.12 * scale, towards_viewer=float(forward @ direction) > 0.5)
         left = right + _RULER * scale
     # a bar of one meter between the views
     x = (0.1 + _RULER / 2) * scale + spans[0] + margin
-    ax.plot([x, x], [low, low + 1], color=_FAINT, lw=0.9, marker="_", ms=5)
-    _text(ax, x - 0.06 * scale, low + 0.5, "1 m", size=6.5, color=_FAINT, rotation=90, ha="right", va="center")
+    ax.plot([x, x], [low, low + 1], color=FAINT, lw=0.9, marker="_", ms=5)
+    _text(ax, x - 0.06 * scale, low + 0.5, "1 m", size=6.5, color=FAINT, rotation=90, ha="right", va="center")
 
 
 def _extent(panel: Panel, anchor: np.ndarray, *, seen_from: np.ndarray) -> np.ndarray:
@@ -276,7 +278,7 @@ def _draw_view(ax, panel: Panel, *, seen_from: np.ndarray, shift: float, window)
         ax.add_collection(LineCollection(segments, **style), autolim=False).set_clip_path(window)
 
     if panel.box is not None:
-        add_lines(place(box_edges(panel.box))[0], zorder=1.5, colors=_HAIRLINE, linewidths=1.0)
+        add_lines(place(box_edges(panel.box))[0], zorder=1.5, colors=HAIRLINE, linewidths=1.0)
     rows = np.flatnonzero(np.isfinite(panel.points).all(-1))
     rows = rows[evenly_spaced(len(rows), MAX_POINTS_DRAWN)]
     if len(rows):
@@ -308,12 +310,10 @@ def _draw_view(ax, panel: Panel, *, seen_from: np.ndarray, shift: float, window)
 def _draw_arrow(ax, x: float, y: float, length: float, *, towards_viewer: bool) -> None:
     """Draws the facing: a dot in a ring towards the viewer, else an arrow to the right."""
     if towards_viewer:
-        ax.plot(x, y, ls="", marker="o", ms=5, mfc="white", mec=_FAINT, mew=0.9, zorder=6)
-        ax.plot(x, y, ls="", marker="o", ms=1.6, color=_FAINT, mew=0, zorder=7)
+        ax.plot(x, y, ls="", marker="o", ms=5, mfc="white", mec=FAINT, mew=0.9, zorder=6)
+        ax.plot(x, y, ls="", marker="o", ms=1.6, color=FAINT, mew=0, zorder=7)
     else:
-        ax.plot(
-            [x - length, x + length], [y, y], color=_FAINT, lw=1.1, marker=">", ms=4, mew=0, markevery=[1], zorder=6
-        )
+        ax.plot([x - length, x + length], [y, y], color=FAINT, lw=1.1, marker=">", ms=4, mew=0, markevery=[1], zorder=6)
 
 
 def _bones(pose: Pose, positions: np.ndarray, depth: np.ndarray) -> tuple[list[np.ndarray], dict[str, list]]:

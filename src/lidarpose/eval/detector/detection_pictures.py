@@ -10,12 +10,11 @@ from lidarpose.eval.detector.detection_scores import FALSE, REFERENCE, DetectorR
 from lidarpose.eval.detector.labeled_scans import LabeledScan, ScanSet
 from lidarpose.io.files import shorten
 from lidarpose.sample import Box
-from lidarpose.viz.draw import png_of
+from lidarpose.viz.draw import ALERT, BLUE, FAINT, INK, png_of
 from lidarpose.viz.person_view import box_edges
 
 # crops per sheet and per row; half the edge of a crop's view, m
 MOST, _PER_ROW, _REACH = 30, 6, 2.0
-_BLUE, _ALERT, _INK, _FAINT = "#0072b2", "#b3261e", "#1f2328", "#7a828c"
 _DPI, _MAX_POINTS = 90, 4000
 
 
@@ -81,7 +80,7 @@ def _sheet(crops: Sequence[_Crop], title: str) -> bytes | None:
         return None
     rows = -(-len(crops) // _PER_ROW)
     figure = Figure(figsize=(2.6 * _PER_ROW, 5.5 * rows + 0.4), dpi=_DPI, facecolor="white", layout="constrained")
-    figure.suptitle(title, x=0.01, ha="left", fontsize=11, color=_INK, parse_math=False)
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11, color=INK, parse_math=False)
     axes = figure.subplots(2 * rows, _PER_ROW, squeeze=False)
     for ax in axes.ravel():
         ax.set_axis_off()
@@ -91,7 +90,7 @@ def _sheet(crops: Sequence[_Crop], title: str) -> bytes | None:
         right, away = np.array([-crop.towards[1], crop.towards[0], 0]), np.array([*-crop.towards, 0])
         _draw_crop(axes[2 * row, column], crop, right, away)
         _draw_crop(axes[2 * row + 1, column], crop, right, np.array([0, 0, 1.0]))
-        axes[2 * row, column].set_title(crop.label, fontsize=7, color=_INK, parse_math=False)
+        axes[2 * row, column].set_title(crop.label, fontsize=7, color=INK, parse_math=False)
     return png_of(figure, None)
 
 
@@ -103,10 +102,10 @@ def _draw_crop(ax, crop: _Crop, right: np.ndarray, up: np.ndarray) -> None:
     points = crop.points - crop.box.center
     is_inside = crop.box.contains(crop.points)
     is_near = np.abs(points @ np.cross(right, up)) < (_REACH if up[2] else np.inf)
-    for rows, color, size in ((is_near & ~is_inside, "#b5bcc4", 1.2), (is_inside, _INK, 3.0)):
+    for rows, color, size in ((is_near & ~is_inside, "#b5bcc4", 1.2), (is_inside, INK, 3.0)):
         ax.scatter(*(points[rows] @ axes).T, s=size, c=color, linewidths=0)
-    for box, color in [(crop.box, _ALERT), *((person, _BLUE) for person in crop.people)]:
+    for box, color in [(crop.box, ALERT), *((person, BLUE) for person in crop.people)]:
         edges = (box_edges(box) - crop.box.center) @ axes
         ax.add_collection(LineCollection(list(edges), colors=color, lw=0.9), autolim=False)
-    ax.plot([-_REACH, -_REACH + 1], [-0.97 * _REACH] * 2, color=_FAINT, lw=1.5)
+    ax.plot([-_REACH, -_REACH + 1], [-0.97 * _REACH] * 2, color=FAINT, lw=1.5)
     ax.set(xlim=(-_REACH, _REACH), ylim=(-_REACH, _REACH), aspect="equal")
