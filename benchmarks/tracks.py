@@ -21,7 +21,7 @@ from stored import digest, is_stored, write_note
 
 from lidarpose.eval.detector.detection_scores import LEAST_POINTS, MATCH_RADIUS
 from lidarpose.geometry import rotation_about
-from lidarpose.inference.detection import detect
+from lidarpose.inference.single_scan import detect
 from lidarpose.io.atomic import write_atomic
 from lidarpose.lidar.presets import sensor as named_sensor
 from lidarpose.models import DEFAULT, VERIFIER, weights_file

@@ -15,7 +15,7 @@ from lidarpose.cli import main
 from lidarpose.errors import InputError
 from lidarpose.eval.detector.labeled_scans import heldout_scans
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
-from lidarpose.inference import detection, verification
+from lidarpose.inference import detection, single_scan, verification
 from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.lidar.raycast import scan
 from lidarpose.models.detector.candidates import SceneIndex
@@ -323,10 +323,10 @@ def test_detect_suggests_opposite_up_axis(scene):
     assert number >= 4 and f"but {number} people with up -z: try --up -z" in warning
     places = detection.detect_places(detection.Scan(points=points, origin=np.zeros(3)), detection.Search())
     few = [Box(center=np.zeros(3), size=np.ones(3), score=0.9)]
-    hint = detection._opposite_up(places, detection.Search(), few)
+    hint = single_scan._opposite_up(places, detection.Search(), few)
     assert hint == f"1 found with up z, but {number} people with up -z: try --up -z"
     # not if as many are found as given
-    assert detection._opposite_up(places, detection.Search(), few * 6) is None
+    assert single_scan._opposite_up(places, detection.Search(), few * 6) is None
 
 
 def test_detect_does_not_suggest_axis_for_single_person(scene, monkeypatch):
@@ -335,8 +335,8 @@ def test_detect_does_not_suggest_axis_for_single_person(scene, monkeypatch):
     near = scene[0][alone(scene[0]) & (np.abs(scene[0][:, :2]).max(1) < 6)]
     places = detection.detect_places(detection.Scan(points=near, origin=np.zeros(3)), detection.Search())
     for boxes, is_sure in ((single, False), (single * 2, True)):
-        monkeypatch.setattr(detection, "find_people", lambda scan, search, b=boxes: replace(scan, boxes=b))
-        hint = detection._other_up_axis(places, detection.Search())
+        monkeypatch.setattr(single_scan, "find_people", lambda scan, search, b=boxes: replace(scan, boxes=b))
+        hint = single_scan._other_up_axis(places, detection.Search())
         assert (hint is not None) == is_sure
 
 
@@ -373,7 +373,7 @@ def test_detect_takes_sensor_on_ground_for_another_frame(scene, fake):
     ditch = np.random.default_rng(0).uniform((-10, -10, -1.9), (-7, -7, -1.9), (len(points) // 5, 3))
     moved = np.array([0, 0, 1.45])
     boxes = lidarpose.detect(np.concatenate([points, ditch]) + moved)
-    assert any("m above the ground, so its position is treated as unknown" in line for line in boxes.warnings)
+    assert any("at the height of the ground" in line for line in boxes.warnings)
     assert fake.calls[-1]["origin"] is None
     assert sum(found_at([found.center - moved for found in boxes], joints)) >= 4
 

@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from lidarpose.errors import LidarPoseError as LidarPoseError
     from lidarpose.errors import MissingExtra as MissingExtra
     from lidarpose.inference.background import learn_background as learn_background
-    from lidarpose.inference.detection import detect as detect
     from lidarpose.inference.predict_scan import predict as predict
     from lidarpose.inference.predictor import Predictor as Predictor
     from lidarpose.inference.predictor import load as load
     from lidarpose.inference.read_poses import read_poses as read_poses
     from lidarpose.inference.results import PersonPose as PersonPose
     from lidarpose.inference.results import Poses as Poses
+    from lidarpose.inference.single_scan import detect as detect
     from lidarpose.io.boxes import Boxes as Boxes
     from lidarpose.io.boxes import read_boxes as read_boxes
     from lidarpose.io.point_cloud import read_points as read_points
@@ -56,7 +56,7 @@ _HOMES = {
     "predict": "lidarpose.inference.predict_scan",
     "predict_recording": "lidarpose.recording.predict_recording",
     "FramePoses": "lidarpose.recording.predict_recording",
-    "detect": "lidarpose.inference.detection",
+    "detect": "lidarpose.inference.single_scan",
     "learn_background": "lidarpose.inference.background",
     "export": "lidarpose.models.export",
     "import_dapt": "lidarpose.models.dapt.import_weights",

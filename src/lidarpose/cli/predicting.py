@@ -161,7 +161,7 @@ def prediction_options(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _detect(options: argparse.Namespace) -> None:
-    from lidarpose.inference.detection import detect
+    from lidarpose.inference.single_scan import detect
     from lidarpose.io.atomic import check_writable
     from lidarpose.io.files import check_not_input
 

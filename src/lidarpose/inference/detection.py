@@ -1,4 +1,4 @@
-"""`detect`: finds the people in a whole scan. The detector scores candidate positions, the verifier classifies the best
+"""Finds the people in a whole scan. The detector scores candidate positions, the verifier classifies the best
 of them, and the default pose network poses the verified people to fit their boxes.
 
 Legend: D detections.
@@ -13,21 +13,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lidarpose.errors import InputError, check_int, counted
-from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up, up_text
+from lidarpose.errors import InputError, check_int
+from lidarpose.geometry import UP_AXES, rotation_about, up_text
 from lidarpose.inference.background import is_static, read_background
-from lidarpose.inference.checks import flat_along_another_axis, flat_axis, scan_unit_warning, unlikely_origin
-from lidarpose.inference.inputs import as_origin
+from lidarpose.inference.checks import flat_along_another_axis, scan_unit_warning, unlikely_origin
 from lidarpose.inference.known_places import KnownPlaces
-from lidarpose.inference.scan import Scan, read_scan
+from lidarpose.inference.scan import Scan
 from lidarpose.inference.verification import rounded, verified
-from lidarpose.io.boxes import Boxes
 from lidarpose.models.detector.detector import MAX_RANGE, Detections, Detector
 from lidarpose.models.detector.ground import estimate_up
 from lidarpose.sample import MIN_POINTS, Box
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
+    pass
 
 # maximum number of detections that are verified and posed
 MOST_POSED = 60
@@ -40,16 +38,12 @@ _FEW_COPIES = 0.01
 # number of points used to estimate the up direction
 _ENOUGH_FOR_UP = 250_000
 # minimum fraction of a scan's points on its background; below it, the background belongs to another sensor or frame
-_LEAST_STATIC = 0.2
-# one foot, m; a sensor lower than this above the ground, m, is not in feet
-_FOOT, _LOW_SENSOR = 0.3048, 3.0
-# sum of the scores of people who are found with another up axis, from which it is suggested: one person may be false
-_SURE = 1.2
+LEAST_STATIC = 0.2
 # a sensor lower than this above the ground around it, m, is the origin of another frame; distances, m, and number of
 # directions at which the ground is looked up
 _LEAST_HEIGHT, _AROUND, _DIRECTIONS = 0.18, (2.0, 4.0, 6.0, 8.0), 16
 # if more than this share of the points lies beyond the range, the sensor may be elsewhere; part of the warning
-_MOST_BEYOND, _FAR_SENSOR = 0.5, "where people are not searched"
+_MOST_BEYOND, FAR_SENSOR = 0.5, "where people are not searched"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,57 +66,6 @@ class Search:
             raise InputError(f"min_score: expected a probability from 0 to 1, got {self.min_score!r}")
         if self.max_people is not None:
             check_int("max_people", self.max_people, least=1)
-
-
-def detect(
-    points: "str | os.PathLike | ArrayLike",
-    *,
-    sensor_origin: "np.ndarray | Sequence[float] | str | None" = None,
-    up: str | Sequence[float] | None = None,
-    columns: int | None = None,
-    max_range: float | None = None,
-    min_score: float | None = None,
-    max_people: int | None = None,
-    background: "str | os.PathLike | Sequence | ArrayLike | None" = None,
-) -> Boxes:
-    """Detects the people in a whole scan and returns their boxes, highest score first, ready for `predict`.
-
-    Args:
-        points: path of a point file, or points (n, 3+) m in any frame.
-        sensor_origin: (x, y, z) m, the sensor position in the frame of the points, or "unknown". None means 0, 0, 0.
-        up: up axis of the scan, as in `predict`. None means z, or, if the ground leans, the direction in which it does.
-        columns: number of values per row of a .bin file.
-        max_range: maximum horizontal distance of people from the sensor, m. None means 40. Ignored if the sensor
-            position is unknown.
-        min_score: score threshold. None means the detector's default, at which most scans have no false positive; 0.5
-            finds more people, mainly indoors.
-        max_people: maximum number of people; those with the highest scores are returned.
-        background: static background of a stationary sensor, in which no people are searched for: a file or an array
-            (k, 3) m of static points, see `learn_background`; or several scans or a folder of scans, from which the
-            background is learned.
-
-    Returns:
-        `Boxes` in the frame of the points. Each box has `score`, the probability that it contains a person, calibrated
-        on synthesized scenes (in real scans, scores of 0.3 to 0.8 are less often people), and `mounted`, whether the
-        person rides or sits in a wheelchair. `Boxes.warnings` lists problems with the scan.
-        `Boxes.up` is the up axis of the scan, or a direction if the sensor was found to be tilted.
-
-    Raises:
-        InputError: a file that cannot be read, or an invalid option.
-    """
-    search = search_options(min_score, max_range, max_people, background, columns, up=up)
-    up = "z" if up is None else up
-    rotation_from_up(up)
-    origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)
-    scan = Scan(points=np.zeros((0, 3)), origin=origin, up=up_text(up))
-    result = search_alone(read_scan(scan, points, columns), search)
-    return Boxes(
-        result.boxes or [],
-        source=result.source,
-        warnings=result.warnings,
-        detector=detector_version(),
-        up=result.up,
-    )
 
 
 def search_options(
@@ -158,101 +101,6 @@ def find_people(scan: Scan, search: Search) -> Scan:
     `origin` is None if the given sensor position is impossible, and `up` is corrected if the scan is tilted.
     """
     return verify_people(detect_places(scan, search), search)
-
-
-def search_alone(scan: Scan, search: Search) -> Scan:
-    """`find_people` for a single scan. If no people are found, it adds `why_nobody`."""
-    places = detect_places(scan, search)
-    result = verify_people(places, search)
-    if not result.boxes:
-        return replace(result, warnings=why_nobody(places, search, result.warnings))
-    if places.detections is not None and not places.detections.has_ground:
-        # a scan that is upside down may have a few false people
-        hint = _opposite_up(places, search, result.boxes)
-        return replace(result, warnings=(*result.warnings, hint)) if hint else result
-    return result
-
-
-def why_nobody(places: "DetectedScan", search: Search, warnings: tuple[str, ...]) -> tuple[str, ...]:
-    """The warnings of a scan without people, with a likely reason: another up axis, feet or the background."""
-    if places.detections is None:
-        return warnings
-    if any(_FAR_SENSOR in warning for warning in warnings):
-        # in feet most points are beyond the range, too
-        hint = _feet(places, search)
-        return (*(warning for warning in warnings if _FAR_SENSOR not in warning), hint) if hint else warnings
-    other_axis = flat_along_another_axis(places.scan)
-    # in wrong units, no people are found with any up axis
-    is_scaled = scan_unit_warning(places.level, len(places.given.points)) is not None
-    if (other_axis or not is_scaled) and (hint := _other_up_axis(places, search)):
-        # other warnings of the search would follow from the wrong axis
-        return (*places.given.warnings, hint)
-    if other_axis:
-        return warnings
-    hint = None if is_scaled else _feet(places, search)
-    hint = hint or _much_background(places)
-    return (*warnings, hint) if hint else warnings
-
-
-def _other_up_axis(places: "DetectedScan", search: Search) -> str | None:
-    """A warning for the user if people are found with another up axis."""
-    input_scan, detections = places.given, places.detections
-    if detections is None:
-        return None
-    other_axes = [up for up in UP_AXES if up != input_scan.up]
-    if detections.has_ground and flat_axis(places.scan.points) == input_scan.upright_axis:
-        # outdoors: the axis is right, but the scan may be upside down
-        other_axes = [_opposite(input_scan)]
-    boxes = {up: find_people(replace(input_scan, up=up), search).boxes or [] for up in other_axes}
-    best_axis = max(other_axes, key=lambda up: _sum_of_scores(boxes[up]))
-    if _sum_of_scores(boxes[best_axis]) < _SURE:
-        return None
-    people = counted(len(boxes[best_axis]), "person", "people")
-    return f"no people found with up {input_scan.up}, but {people} with up {best_axis}: try --up {best_axis}"
-
-
-def _opposite_up(places: "DetectedScan", search: Search, boxes: Sequence[Box]) -> str | None:
-    """A warning for the user if far more people are found upside down."""
-    up = _opposite(places.given)
-    other_boxes = find_people(replace(places.given, up=up), search).boxes or []
-    if _sum_of_scores(other_boxes) < max(_SURE, 2 * _sum_of_scores(boxes)):
-        return None
-    people = counted(len(other_boxes), "person", "people")
-    return f"{len(boxes)} found with up {places.given.up}, but {people} with up {up}: try --up {up}"
-
-
-def _opposite(scan: Scan) -> str:
-    """The axis that points the other way than the up axis nearest to the scan's."""
-    axis = scan.upright_axis
-    return axis[1:] if axis.startswith("-") else f"-{axis}"
-
-
-def _sum_of_scores(boxes: Sequence[Box]) -> float:
-    return sum(box.score or 0.0 for box in boxes)
-
-
-def _feet(places: "DetectedScan", search: Search) -> str | None:
-    """A warning for the user if people are found with feet as the unit. Only where the sensor is higher above the
-    ground than most, since a third of a scan in meters may have something of a person's shape."""
-    scan, origin, detections = places.given, places.scan.level_origin, places.detections
-    if detections is None or origin is not None and origin[2] - detections.ground.at(origin[None, :2]) < _LOW_SENSOR:
-        return None
-    feet = replace(scan, points=scan.points * _FOOT, origin=None if scan.origin is None else scan.origin * _FOOT)
-    background = None if search.background is None else search.background * _FOOT
-    boxes = find_people(feet, replace(search, background=background)).boxes
-    if not boxes:
-        return None
-    return f"no people found in meters, but {len(boxes)} if the units are feet: multiply all coordinates by {_FOOT}"
-
-
-def _much_background(places: "DetectedScan") -> str | None:
-    """A warning for the user that people may be part of the background."""
-    if places.moving is None or (static_share := 1 - places.moving.mean()) < _LEAST_STATIC:
-        return None
-    return (
-        f"no people found off the background, on which {static_share:.0%} of the points lie: if people are missing, "
-        "learn the background from ten seconds or more"
-    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -315,7 +163,7 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
     is_moving = None
     if search.background is not None:
         is_moving = ~is_static(scan.points, search.background)
-        if (static_share := 1 - is_moving.mean()) < _LEAST_STATIC:
+        if (static_share := 1 - is_moving.mean()) < LEAST_STATIC:
             warnings.append(
                 f"only {static_share:.0%} of the points lie on the background: is the background "
                 "from this sensor and in this frame?"
@@ -336,7 +184,7 @@ def _far_from_most(points: np.ndarray, origin: np.ndarray, search: Search) -> st
     if share < _MOST_BEYOND or search.max_range < MAX_RANGE:
         return None
     return (
-        f"{share:.0%} of the points are more than {search.max_range:g} m from the sensor, {_FAR_SENSOR}: give the "
+        f"{share:.0%} of the points are more than {search.max_range:g} m from the sensor, {FAR_SENSOR}: give the "
         "sensor's position in the points' own frame (--sensor-origin), or unknown, or a larger --range"
     )
 
@@ -352,8 +200,8 @@ def _on_ground(detections: Detections, origin: np.ndarray) -> str | None:
     if height > _LEAST_HEIGHT:
         return None
     return (
-        f"the sensor is {height:.2f} m above the ground, so its position is treated as unknown: give it in the points' "
-        "own frame (--sensor-origin)"
+        f"the sensor is at the height of the ground ({height:+.2f} m), so its position is treated as unknown: "
+        "give it in the points' own frame (--sensor-origin)"
     )
 
 

@@ -254,7 +254,8 @@ class Predictor(PoseEstimator):
             up = "z" if input_boxes is None else input_boxes.up
             scan = Scan(points=cloud, boxes=input_boxes, origin=origin, up=up, warnings=tuple(notes))
             if find:
-                from lidarpose.inference.detection import Search, search_alone
+                from lidarpose.inference.detection import Search
+                from lidarpose.inference.single_scan import search_alone
 
                 scan = search_alone(scan, Search())
             return pose_scan(scan, self, skeleton=skeleton, progress=progress)

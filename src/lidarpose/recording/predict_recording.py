@@ -13,12 +13,13 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_from_up, up_text
-from lidarpose.inference.detection import DetectedScan, detect_places, least_score, search_options, why_nobody
+from lidarpose.inference.detection import DetectedScan, detect_places, least_score, search_options
 from lidarpose.inference.inputs import as_origin, as_points, only_returns
 from lidarpose.inference.predict_scan import check_choice, check_up, is_whole, predict_scan, predictor_of
 from lidarpose.inference.predictor import Predictor
 from lidarpose.inference.results import Poses
 from lidarpose.inference.scan import Scan
+from lidarpose.inference.single_scan import why_nobody
 from lidarpose.io.sources import DamagedFrame, Frame, FrameSource, open_source
 from lidarpose.io.sources.frame import DEFAULT_RATE
 from lidarpose.models import DEFAULT
