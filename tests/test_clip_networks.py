@@ -307,7 +307,7 @@ def test_setup_rejects_settings_that_clip_networks_lack(folder, tmp_path):
 
 def test_setup_rejects_shards_without_clips(tmp_path):
     people = [[Generator(scene="paper", measure=False).person(0, k).sample] for k in range(3)]
-    with refused("needs 16 consecutive frames of a person with rotations, got none: 3 frames without rotations"):
+    with refused("needs frames of people with rotations, got 3 without"):
         make_setup(recipe(Pretrain, "lidarcap", shards=(str(write_clips(tmp_path / "p", people)),)))
 
 
@@ -351,7 +351,7 @@ def test_clip_networks_overfit_two_clips(size, monkeypatch):
     for module in network.modules():
         if isinstance(module, torch.nn.MultiheadAttention):
             module.dropout = 0.0
-    arrays, steps = objective.collate(examples), 1300
+    arrays, steps = objective.collate(examples), 1300 if size == "lidarcap-small" else 1700
     made_by = optimizers(network, rates)
     for step in range(steps):
         set_rates(made_by, rates, step / steps)

@@ -325,6 +325,9 @@ def test_detect_suggests_opposite_up_axis(scene):
     few = [Box(center=np.zeros(3), size=np.ones(3), score=0.9)]
     hint = single_scan._opposite_up(places, detection.Search(), few)
     assert hint == f"1 found with up z, but {number} people with up -z: try --up -z"
+    # a maximum number of people limits the result, not the trial
+    (*_, warning) = lidarpose.detect(points, max_people=1).warnings
+    assert f"{number} people with up -z: try --up -z" in warning
     # not if as many are found as given
     assert single_scan._opposite_up(places, detection.Search(), few * 6) is None
 
@@ -352,13 +355,17 @@ def test_detect_reports_range_without_sensor(scene):
     assert warning == "the sensor position is unknown, so max_range (--range) is not applied"
 
 
-def test_detect_warns_of_sensor_far_from_most_points(scene):
+def test_detect_warns_of_sensor_far_from_most_points(scene, monkeypatch):
     """The origin of a map, say, with people beyond the range: nothing else is suggested."""
     way = np.stack(np.broadcast_arrays(np.arange(0, 45, 0.1), 0.3, -1.5), 1)
     moved = np.concatenate([scene[0] + [60, 0, 0], way])
     (warning,) = lidarpose.detect(moved).warnings
     assert "of the points are more than 40 m from the sensor, where people are not searched" in warning
     assert lidarpose.detect(moved, sensor_origin=(60, 0, 0)).warnings == ()
+    # also where the points beyond the range are dropped before the search
+    monkeypatch.setattr(detection, "_MOST_AROUND", len(moved) // 2)
+    assert any(line.startswith(warning[:30]) for line in lidarpose.detect(moved).warnings)
+    monkeypatch.undo()
     # in feet most points of a street are beyond 40, too
     street = np.concatenate([scene[0], *[scene[0][alone(scene[0])] * [s, s, 1] for s in (2.0, 2.5, 3.0)]])
     (hint,) = lidarpose.detect(street / 0.3048).warnings
@@ -373,7 +380,7 @@ def test_detect_takes_sensor_on_ground_for_another_frame(scene, fake):
     ditch = np.random.default_rng(0).uniform((-10, -10, -1.9), (-7, -7, -1.9), (len(points) // 5, 3))
     moved = np.array([0, 0, 1.45])
     boxes = lidarpose.detect(np.concatenate([points, ditch]) + moved)
-    assert any("at the height of the ground" in line for line in boxes.warnings)
+    assert any("not above the ground" in line for line in boxes.warnings)
     assert fake.calls[-1]["origin"] is None
     assert sum(found_at([found.center - moved for found in boxes], joints)) >= 4
 

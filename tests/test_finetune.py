@@ -331,6 +331,19 @@ def test_stored_source_epochs_are_different_permutations(datasets):
     np.testing.assert_array_equal(again.example(2 * count + 1).points, source.example(2 * count + 1).points)
 
 
+def test_changes_of_scene_reach_people_that_are_mixed_in(datasets):
+    changed, plain = (
+        make_setup(Finetune(data=(str(datasets["humanm3"]),), hold_out=0.34, set=changes)).source.other
+        for changes in (("keep=0.3", "mask=1"), ())
+    )
+    assert changed.set == ("keep=0.3", "mask=1") and plain.set == ()
+    counts = [sum(len(source.example(k).points) for k in range(12)) for source in (changed, plain)]
+    assert counts[0] < 0.8 * counts[1]
+    # the configuration of a run from before this setting
+    old = {key: value for key, value in Finetune(data=("a",)).to_dict().items() if key != "set"}
+    assert Finetune(**old) == Finetune(data=("a",))
+
+
 def test_mixed_source_mixes_by_share(datasets):
     main, other = stored(datasets), SyntheticSource(scene="paper", seed=1)
     mixed = MixedSource(main=main, other=other, share=0.3)

@@ -437,6 +437,8 @@ def test_recipe_rejects_invalid_settings(change, message):
         (Pretrain, {"heatmap_rate": 10}, "heatmap_rate is for .*, tiny has none: omit it"),
         (Pretrain, {"size": "paper-small", "muon_rate": 0.01}, "muon_rate is for the package's own networks, .*: omit"),
         (Finetune, {"data": "a", "neck": "prn"}, "a checkpoint has its own neck: omit --neck"),
+        (Finetune, {"data": "a", "set": "keep=0.5", "mix": 0}, "change the people that are mixed in: give --mix X"),
+        (Finetune, {"data": "a", "set": "recorded=1"}, "recorded needs captured motion"),
     ],
 )
 def test_setup_checks_options_of_paper_network(kind, change, message):

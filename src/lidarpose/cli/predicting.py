@@ -21,7 +21,7 @@ _ADVICE = (
     "treats all points as one person"
 )
 # parts of the warnings that state why no person was detected: wrong axes, units, sensor position or background
-_CAUSES = ("try --up", "all coordinates by", "the background", "--sensor-origin")
+_CAUSES = ("try --up", "all coordinates by", "the background", "where people are not searched")
 # maximum characters of an id in a warning
 _LONGEST_ID = 40
 

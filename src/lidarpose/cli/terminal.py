@@ -44,7 +44,7 @@ def folder(text: str) -> str:
 _TYPES: dict[str, Callable] = {"N": int, "K": int, "DIR": folder, "RUN": folder}
 _TYPES |= dict.fromkeys(("P", "M", "S", "HZ", "H", "SHARE"), float)
 # --keep is short for a change of the scene
-KEEP = "--keep R  laser mask: share R of patches that each sample keeps, the paper's r_keep; same as --set keep=R"
+KEEP = "--keep R  laser mask: share R of patches that each synthesized sample keeps (r_keep); same as --set keep=R"
 
 
 def add_command(commands, name: str, run: Callable[[argparse.Namespace], None], text: str) -> argparse.ArgumentParser:

@@ -403,7 +403,7 @@ def eval_setup(
 
 def _centering(model: Model, kind: str) -> str:
     """How people are centered in the protocol clean."""
-    if kind not in _CLEAN_CROPS or not getattr(model, "uses_box_centers", False):
+    if kind not in _CLEAN_CROPS or not getattr(model, "uses_box_centers", hasattr(model, "predict_in")):
         return "points alone"
     boxed = "where uncertain the center of the displaced box"
     return f"points; top view: and {boxed}" if kind == "itop" else f"points, and {boxed}"

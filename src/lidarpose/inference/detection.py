@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from numbers import Real
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -23,9 +23,6 @@ from lidarpose.inference.verification import rounded, verified
 from lidarpose.models.detector.detector import MAX_RANGE, Detections, Detector
 from lidarpose.models.detector.ground import estimate_up
 from lidarpose.sample import MIN_POINTS, Box
-
-if TYPE_CHECKING:
-    pass
 
 # maximum number of detections that are verified and posed
 MOST_POSED = 60
@@ -156,7 +153,7 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
 
     if origin is not None and (warning := unlikely_origin(level, origin)):
         return with_unknown_sensor(warning)
-    if origin is not None and not frame_warning and (warning := _far_from_most(level, origin, search)):
+    if origin is not None and not frame_warning and (warning := _far_from_most(full_scan, scan, search)):
         warnings.append(warning)
     if origin is None and search.max_range != MAX_RANGE:
         warnings.append("the sensor position is unknown, so max_range (--range) is not applied")
@@ -178,9 +175,12 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
     return DetectedScan(given=input_scan, scan=scan, level=level, detections=detections, moving=is_moving)
 
 
-def _far_from_most(points: np.ndarray, origin: np.ndarray, search: Search) -> str | None:
-    """A warning for the user if most points (n, 3) m, level, lie beyond the range of the sensor at origin (3,) m."""
-    share = np.mean((points[:, 0] - origin[0]) ** 2 + (points[:, 1] - origin[1]) ** 2 > search.max_range**2)
+def _far_from_most(full_scan: Scan, scan: Scan, search: Search) -> str | None:
+    """A warning for the user if most points of the scan before it was thinned lie beyond the range of the sensor. scan:
+    the same, with the up axis and the sensor's position as they are assumed."""
+    points = full_scan.points[:: 1 + len(full_scan.points) // _ENOUGH_FOR_UP]
+    offset = (points - scan.origin) @ scan.R_level_input[:2].T
+    share = np.mean((offset**2).sum(1) > search.max_range**2)
     if share < _MOST_BEYOND or search.max_range < MAX_RANGE:
         return None
     return (
@@ -200,7 +200,7 @@ def _on_ground(detections: Detections, origin: np.ndarray) -> str | None:
     if height > _LEAST_HEIGHT:
         return None
     return (
-        f"the sensor is at the height of the ground ({height:+.2f} m), so its position is treated as unknown: "
+        f"the sensor is not above the ground ({height:+.2f} m), so its position is treated as unknown: "
         "give it in the points' own frame (--sensor-origin)"
     )
 

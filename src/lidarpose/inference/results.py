@@ -413,6 +413,9 @@ class Poses(Sequence[PersonPose]):
         # the axes of a tilted sensor are turned level
         turned = "" if self.up in UP_AXES else " turned level"
         across, along = (f"{nearest_axis(direction)}{turned}" for direction in R_level_input[:2])
+        if across[-len(turned) - 1 :] == along[-len(turned) - 1 :]:
+            # turned so far that no axis names them
+            across, along = "across", "along"
         posed = [person for person in people if person.has_pose]
         label = counted(len(people), "person", "people") if people else "no people"
         if len(posed) < len(people):

@@ -102,7 +102,8 @@ def search_alone(scan: Scan, search: Search) -> Scan:
 
 
 def why_nobody(places: DetectedScan, search: Search, warnings: tuple[str, ...]) -> tuple[str, ...]:
-    """The warnings of a scan without people, with a likely reason: another up axis, feet or the background."""
+    """The warnings of a scan without people, with a likely reason: another up axis, feet, a sensor far
+    from its points, or the background."""
     if places.detections is None:
         return warnings
     if any(FAR_SENSOR in warning for warning in warnings):
@@ -131,7 +132,8 @@ def _other_up_axis(places: DetectedScan, search: Search) -> str | None:
     if detections.has_ground and flat_axis(places.scan.points) == input_scan.upright_axis:
         # outdoors: the axis is right, but the scan may be upside down
         other_axes = [_opposite(input_scan)]
-    boxes = {up: find_people(replace(input_scan, up=up), search).boxes or [] for up in other_axes}
+    everyone = replace(search, max_people=None)
+    boxes = {up: find_people(replace(input_scan, up=up), everyone).boxes or [] for up in other_axes}
     best_axis = max(other_axes, key=lambda up: _sum_of_scores(boxes[up]))
     if _sum_of_scores(boxes[best_axis]) < _SURE:
         return None
@@ -141,8 +143,10 @@ def _other_up_axis(places: DetectedScan, search: Search) -> str | None:
 
 def _opposite_up(places: DetectedScan, search: Search, boxes: Sequence[Box]) -> str | None:
     """A warning for the user if far more people are found upside down."""
-    up = _opposite(places.given)
-    other_boxes = find_people(replace(places.given, up=up), search).boxes or []
+    up, everyone = _opposite(places.given), replace(search, max_people=None)
+    if search.max_people is not None:
+        boxes = find_people(places.given, everyone).boxes or []
+    other_boxes = find_people(replace(places.given, up=up), everyone).boxes or []
     if _sum_of_scores(other_boxes) < max(_SURE, 2 * _sum_of_scores(boxes)):
         return None
     people = counted(len(other_boxes), "person", "people")

@@ -265,6 +265,7 @@ class _Run:
                         save_time = time.monotonic()
                 if is_stopping and is_last:
                     # whoever runs several commands in turn must learn that the next one is not wanted
+                    self.accelerator.wait_for_everyone()
                     raise Interrupted(f"stopped after all {self.seen:,} samples: the run is complete", stop.number)
                 if is_stopping:
                     # all processes take this branch: the request was reduced together with the losses

@@ -35,7 +35,6 @@ FREE = ("workers", "validate", "pictures", "precision")
 _BELOW_ONE = ("ema", "mix", "hold_out", "objects", "whole_scans")
 _MODEL = "ours, dapt, prn, lpformer, lidarcap or ne"
 _OPTIONS = "options of a baseline or the paper's network: grid=32, stale_convolution=true, ... (docs/train.md)"
-_SET = "overrides of the scene's fields; keep=R (laser mask), recorded=1 (positions as captured)"
 _LEAST = {"batch": 1, "people": 1, "scenes": 1, "uses": 1}
 
 
@@ -167,7 +166,9 @@ class Pretrain(PoseRecipe):
     )
     init: str = _setting("", "initial weights, of this size or smaller: bundled, or a checkpoint", "NAME|FILE")
     scene: str = _setting("wild", "wild, wide, paper or reference")
-    set: tuple[str, ...] = _setting((), _SET, "A=X,B=Y")
+    set: tuple[str, ...] = _setting(
+        (), "overrides of the scene's fields; keep=R (laser mask), recorded=1 (positions as captured)", "A=X,B=Y"
+    )
     people: int = _setting(300_000, "number of training people")
     easy: float = _setting(
         0.05, "share of the run in which the maximum difficulty rises to 1; not for stored people", "SHARE"
@@ -220,7 +221,8 @@ class Finetune(PoseRecipe):
     augment: str = _setting("default", "data augmentation: default, paper, lidarhmr, turn or none")
     mix: float = _setting(0.25, "share of synthesized people in training, below 1", "SHARE")
     scene: str = _setting("wild", "scene of the synthesized people: wild, wide, paper or reference")
-    set: tuple[str, ...] = _setting((), _SET, "A=X,B=Y")
+    scene: str = _setting("wild", "scene of the synthesized people: wild, wide, paper or reference")
+    set: tuple[str, ...] = _setting((), "overrides of the fields of that scene; keep=R: laser mask", "A=X,B=Y")
     hold_out: float = _setting(
         0.1, "share of sequences held out for validation if the dataset has no split val", "SHARE"
     )
@@ -237,6 +239,10 @@ class Finetune(PoseRecipe):
             object.__setattr__(self, "size", _size_of(self.model, self.size))
         elif self.model:
             check_name("model", self.model, MODELS)
+        if self.set and not self.mix:
+            raise InputError("--set and --keep change the people that are mixed in: give --mix X, or omit them")
+        if any(change.startswith("recorded=") for change in self.set):
+            raise InputError("recorded needs captured motion, and fine-tuning mixes in people without it: omit it")
         if not self.data:
             raise InputError("fine-tuning needs a dataset: give a folder that lidarpose prepare wrote")
         if not self.epochs > 0 or self.interval < 1:

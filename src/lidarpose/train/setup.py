@@ -340,9 +340,8 @@ def _clips(dataset: InMemoryDataset, config: LidarcapConfig, recipe: Pretrain | 
     shift = isinstance(recipe, Finetune) and recipe.shift_windows
     clips, skipped = dataset.clips(following=CLIP_FRAMES - 1 if shift else 0)
     if not len(clips):
-        reasons = "; ".join(f"{count:,} {reason}" for reason, count in skipped.items())
         raise InputError(
-            f"{config.name} needs {config.frames} consecutive frames of a person with rotations, got none: {reasons}; "
+            f"{config.name} needs frames of people with rotations, got {skipped.total():,} without: "
             "use lidarpose synth --clips, or lidarpose prepare of LiDARHuman26M or SLOPER4D"
         )
     return ClipSource(
