@@ -221,7 +221,6 @@ class Finetune(PoseRecipe):
     augment: str = _setting("default", "data augmentation: default, paper, lidarhmr, turn or none")
     mix: float = _setting(0.25, "share of synthesized people in training, below 1", "SHARE")
     scene: str = _setting("wild", "scene of the synthesized people: wild, wide, paper or reference")
-    scene: str = _setting("wild", "scene of the synthesized people: wild, wide, paper or reference")
     set: tuple[str, ...] = _setting((), "overrides of the fields of that scene; keep=R: laser mask", "A=X,B=Y")
     hold_out: float = _setting(
         0.1, "share of sequences held out for validation if the dataset has no split val", "SHARE"
