@@ -88,7 +88,7 @@ def _add(parser, kind: type[Recipe]) -> None:
     # first the settings of this kind of training, then the common ones
     kind_group = parser.add_argument_group(kind.kind)
     common_group = parser.add_argument_group("optimizer and run")
-    if kind in (Pretrain, Finetune):
+    if issubclass(kind, PoseRecipe):
         add_options(kind_group, KEEP)
     common_names = {field.name for base in (Recipe, PoseRecipe) for field in fields(base)}
     for field in fields(kind):
@@ -128,7 +128,7 @@ def _train(options: argparse.Namespace) -> None:
         raise InputError(
             "--scans is for --calibrate: expected both, got only --scans: add --calibrate N or omit --scans"
         )
-    if kind in (Pretrain, Finetune) and (settings := scene_changes(options)):
+    if issubclass(kind, PoseRecipe) and (settings := scene_changes(options)):
         changes["set"] = settings
     if kind is Finetune and options.data:
         changes["data"] = tuple(options.data)

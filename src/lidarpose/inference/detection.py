@@ -39,8 +39,8 @@ LEAST_STATIC = 0.2
 # a sensor lower than this above the ground around it, m, is the origin of another frame; distances, m, and number of
 # directions at which the ground is looked up
 _LEAST_HEIGHT, _AROUND, _DIRECTIONS = 0.18, (2.0, 4.0, 6.0, 8.0), 16
-# if more than this share of the points lies beyond the range, the sensor may be elsewhere; part of the warning
-_MOST_BEYOND, FAR_SENSOR = 0.5, "where people are not searched"
+# if more than this share of the points lies beyond the range, the sensor may be elsewhere; number of points for it
+_MOST_BEYOND, _ENOUGH_FOR_SHARE = 0.5, 20_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,7 +106,7 @@ class DetectedScan:
 
     given: the scan as given, thinned; scan: the scan as it was searched; level (n, 3) m: its points in the level frame;
     detections: in the level frame, None for a scan without points; moving (n,) bool: points off the background, None
-    without a background.
+    without a background; far_warning: that of `_far_from_most`, one of the scan's warnings.
     """
 
     given: Scan
@@ -114,6 +114,7 @@ class DetectedScan:
     level: np.ndarray
     detections: Detections | None
     moving: np.ndarray | None = None
+    far_warning: str | None = None
 
 
 def detect_places(scan: Scan, search: Search) -> DetectedScan:
@@ -153,8 +154,9 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
 
     if origin is not None and (warning := unlikely_origin(level, origin)):
         return with_unknown_sensor(warning)
-    if origin is not None and not frame_warning and (warning := _far_from_most(full_scan, scan, search)):
-        warnings.append(warning)
+    far_warning = None if origin is None or frame_warning else _far_from_most(full_scan, scan, search)
+    if far_warning is not None:
+        warnings.append(far_warning)
     if origin is None and search.max_range != MAX_RANGE:
         warnings.append("the sensor position is unknown, so max_range (--range) is not applied")
     is_moving = None
@@ -172,20 +174,24 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
     if not (detections.has_ground or frame_warning):
         warnings.append("no ground was found, so people are detected without it: is the up axis correct?")
     scan = replace(scan, warnings=tuple(warnings))
-    return DetectedScan(given=input_scan, scan=scan, level=level, detections=detections, moving=is_moving)
+    return DetectedScan(
+        given=input_scan, scan=scan, level=level, detections=detections, moving=is_moving, far_warning=far_warning
+    )
 
 
 def _far_from_most(full_scan: Scan, scan: Scan, search: Search) -> str | None:
     """A warning for the user if most points of the scan before it was thinned lie beyond the range of the sensor. scan:
     the same, with the up axis and the sensor's position as they are assumed."""
-    points = full_scan.points[:: 1 + len(full_scan.points) // _ENOUGH_FOR_UP]
+    if search.max_range < MAX_RANGE:
+        return None
+    points = full_scan.points[:: 1 + len(full_scan.points) // _ENOUGH_FOR_SHARE]
     offset = (points - scan.origin) @ scan.R_level_input[:2].T
     share = np.mean((offset**2).sum(1) > search.max_range**2)
-    if share < _MOST_BEYOND or search.max_range < MAX_RANGE:
+    if share < _MOST_BEYOND:
         return None
     return (
-        f"{share:.0%} of the points are more than {search.max_range:g} m from the sensor, {FAR_SENSOR}: give the "
-        "sensor's position in the points' own frame (--sensor-origin), or unknown, or a larger --range"
+        f"{share:.0%} of the points are more than {search.max_range:g} m from the sensor, where people are not searched: "
+        "give the sensor's position in the points' own frame (--sensor-origin), or unknown, or a larger --range"
     )
 
 

@@ -105,7 +105,7 @@ def predict(
         raise InputError(f"{_SEARCH_OPTIONS} are options of the detection: omit them with find=False")
     start = time.perf_counter()
     input_boxes = None if boxes is None else read_boxes(boxes, calib=calib)
-    search = search_options(*options, columns, up=up)
+    given_up = up
     if up is None:
         up = "z" if input_boxes is None else input_boxes.up
     rotation_from_up(up)
@@ -119,6 +119,7 @@ def predict(
     if sensor_origin is None and (find or boxes is not None):
         scan = replace(scan, origin=np.zeros(3))
     read_end = time.perf_counter()
+    search = search_options(*options, columns, up=given_up)
     # the network is loaded only after the input has been read
     _, poses = predict_scan(
         scan, lambda: predictor_of(model), search=search if find else None, skeleton=skeleton, progress=progress

@@ -410,12 +410,11 @@ class Poses(Sequence[PersonPose]):
         from lidarpose.viz.bird_eye import LONGEST_NAME, ScanPanel
 
         R_level_input = rotation_from_up(self.up)
-        # the axes of a tilted sensor are turned level
-        turned = "" if self.up in UP_AXES else " turned level"
-        across, along = (f"{nearest_axis(direction)}{turned}" for direction in R_level_input[:2])
-        if across[-len(turned) - 1 :] == along[-len(turned) - 1 :]:
-            # turned so far that no axis names them
-            across, along = "across", "along"
+        across, along = map(nearest_axis, R_level_input[:2])
+        if self.up not in UP_AXES:
+            # turned far, both are nearest to one axis, which then names neither
+            is_named = across[-1] != along[-1]
+            across, along = (f"{axis} turned level" for axis in (across, along)) if is_named else ("across", "along")
         posed = [person for person in people if person.has_pose]
         label = counted(len(people), "person", "people") if people else "no people"
         if len(posed) < len(people):

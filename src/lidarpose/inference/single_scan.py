@@ -13,7 +13,6 @@ from lidarpose.errors import counted
 from lidarpose.geometry import UP_AXES, rotation_from_up, up_text
 from lidarpose.inference.checks import flat_along_another_axis, flat_axis, scan_unit_warning
 from lidarpose.inference.detection import (
-    FAR_SENSOR,
     LEAST_STATIC,
     DetectedScan,
     Search,
@@ -73,11 +72,11 @@ def detect(
     Raises:
         InputError: a file that cannot be read, or an invalid option.
     """
+    up_direction = "z" if up is None else up
+    rotation_from_up(up_direction)
     search = search_options(min_score, max_range, max_people, background, columns, up=up)
-    up = "z" if up is None else up
-    rotation_from_up(up)
     origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)
-    scan = Scan(points=np.zeros((0, 3)), origin=origin, up=up_text(up))
+    scan = Scan(points=np.zeros((0, 3)), origin=origin, up=up_text(up_direction))
     result = search_alone(read_scan(scan, points, columns), search)
     return Boxes(
         result.boxes or [],
@@ -106,10 +105,10 @@ def why_nobody(places: DetectedScan, search: Search, warnings: tuple[str, ...]) 
     from its points, or the background."""
     if places.detections is None:
         return warnings
-    if any(FAR_SENSOR in warning for warning in warnings):
+    if places.far_warning is not None:
         # in feet most points are beyond the range, too
         hint = _feet(places, search)
-        return (*(warning for warning in warnings if FAR_SENSOR not in warning), hint) if hint else warnings
+        return (*(warning for warning in warnings if warning != places.far_warning), hint) if hint else warnings
     other_axis = flat_along_another_axis(places.scan)
     # in wrong units, no people are found with any up axis
     is_scaled = scan_unit_warning(places.level, len(places.given.points)) is not None

@@ -50,8 +50,11 @@ def _picture(name: str, cells: dict[str, Cell], out: Path) -> bytes:
         return _side_by_side(cells, out)
     target = next(iter(cells.values())).target
     title = "the stand-in" if isinstance(target.test, Step) else target.title
-    found_studies = {row: stability_study(cell.evaluation, out) for row, cell in cells.items() if cell.evaluation}
-    studies = {row: _titled(study, title) for row, study in found_studies.items() if study}
+    studies = {
+        row: _titled(study, title)
+        for row, cell in cells.items()
+        if cell.evaluation and (study := stability_study(cell.evaluation, out))
+    }
     return (compare_stability if name == "fig7" else compare_ends)(studies)
 
 

@@ -236,16 +236,16 @@ class FramePredictor:
         search_arguments = (min_score, max_range, max_people, background)
         is_searched = find or any(option is not None for option in search_arguments)
         check_choice(boxes, crop, is_searched, calib)
-        self._search = search_options(*search_arguments, columns, topic, meta, up=up)
-        up = "z" if up is None else up
-        rotation_from_up(up)
-        self.up, self.name, self.skeleton = up_text(up), name, skeleton
+        up_direction = "z" if up is None else up
+        rotation_from_up(up_direction)
+        self.up, self.name, self.skeleton = up_text(up_direction), name, skeleton
         self.boxes = None if boxes is None else FrameBoxes(boxes, calib=calib)
         self._origin = sensor_origin if sensor_origin is None else (as_origin(sensor_origin),)
         # whether the frames are crops; None until the first frame with points decides
         self._is_crop = True if crop else False if is_searched or boxes is not None else None
         # whether any frame was searched
         self._was_searched = False
+        self._search = search_options(*search_arguments, columns, topic, meta, up=up)
         self._model = model
         self._loaded: Predictor | None = None
         self.live, self.people = live, None
