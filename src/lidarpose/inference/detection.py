@@ -190,8 +190,9 @@ def _far_from_most(full_scan: Scan, scan: Scan, search: Search) -> str | None:
     if share < _MOST_BEYOND:
         return None
     return (
-        f"{share:.0%} of the points are more than {search.max_range:g} m from the sensor, where people are not searched: "
-        "give the sensor's position in the points' own frame (--sensor-origin), or unknown, or a larger --range"
+        f"{share:.0%} of the points are more than {search.max_range:g} m from the sensor, where people are not "
+        "searched: give the sensor's position in the points' own frame (--sensor-origin), or unknown, or a larger "
+        "--range"
     )
 
 
