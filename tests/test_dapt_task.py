@@ -109,6 +109,9 @@ def made(seed=0, people=3, voxels=7):
     return outputs, DaptTargets(joints=joints, weight=weight, part=torch.tensor([0, 24, -1, 3, 3, -1, 0]))
 
 
+MENDED = finetuning_config("humanm3")
+
+
 def numbers(value):
     return np.asarray(value, float)
 
@@ -150,24 +153,58 @@ def slow_heatmap(outputs, targets):
 @pytest.mark.parametrize("seed", range(3))
 def test_losses_equal_equations_9_and_10(seed):
     outputs, targets = made(seed)
-    terms = pretraining(outputs, targets)
+    terms = pretraining(outputs, targets, MENDED)
     regression = slow_regression(numbers(outputs.coordinates), targets)
     assert terms["regression"].item() == pytest.approx(0.5 * regression, rel=1e-5)
     assert terms["segmentation"].item() == pytest.approx(slow_segmentation(outputs.parts, targets.part), rel=1e-5)
     assert total(terms).item() == pytest.approx(terms["regression"].item() + terms["segmentation"].item(), rel=1e-6)
-    assert finetuning(outputs, targets).keys() == {"heatmap", "mpjpe"}
-    terms = finetuning(outputs, targets)
+    assert finetuning(outputs, targets, MENDED).keys() == {"heatmap", "mpjpe"}
+    terms = finetuning(outputs, targets, MENDED)
     assert terms["heatmap"].item() == pytest.approx(slow_heatmap(outputs, targets), rel=1e-5)
     # without heatmaps, fine-tuning uses Eq. 7, too
     bare = replace(outputs, logits_x=None, voted=outputs.coordinates * 2)
-    assert finetuning(bare, targets)["regression"].item() == pytest.approx(regression, rel=1e-5)
-    terms = prn(bare, targets)
+    assert finetuning(bare, targets, MENDED)["regression"].item() == pytest.approx(regression, rel=1e-5)
+    terms = prn(bare, targets, MENDED)
     assert terms["regression"].item() == pytest.approx(regression, rel=1e-5)
     assert terms["vote"].item() == pytest.approx(slow_regression(numbers(bare.voted), targets), rel=1e-5)
     assert terms["segmentation"].item() == pytest.approx(slow_segmentation(outputs.parts, targets.part), rel=1e-5)
-    terms = finetuning(outputs, targets)
+    terms = finetuning(outputs, targets, MENDED)
     error = (numbers(outputs.joints()) - numbers(targets.joints))[targets.weight.bool().numpy()]
     assert terms["mpjpe"].item() == pytest.approx(np.linalg.norm(error, axis=-1).mean(), rel=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_losses_of_the_released_code(seed):
+    outputs, targets = made(seed)
+    joints, weight = numbers(targets.joints), numbers(targets.weight)
+
+    def squared(predicted):
+        distances = ((numbers(predicted) - joints) ** 2).sum(-1) * weight
+        return np.mean([row.sum() / w.sum() for row, w in zip(distances, weight, strict=True) if w.any()])
+
+    terms = pretraining(outputs, targets, replace(MENDED, squared_distance=True, ignore_background=True))
+    assert terms["regression"].item() == pytest.approx(0.5 * squared(outputs.coordinates), rel=1e-5)
+    on_body = torch.where(targets.part == 0, -1, targets.part)
+    assert terms["segmentation"].item() == pytest.approx(slow_segmentation(outputs.parts, on_body), rel=1e-5)
+    faults = dict(squared_distance=True, unnormalized_heatmaps=True, auxiliary_loss=True)
+    terms = finetuning(outputs, targets, replace(MENDED, **faults))
+    assert terms["auxiliary"].item() == pytest.approx(0.2 * squared(outputs.inter), rel=1e-5)
+    expected = 0.0
+    for axis, low, step in zip("xyz", outputs.low, outputs.step, strict=True):
+        logits = numbers(getattr(outputs, f"logits_{axis}"))
+        index, place = np.arange(logits.shape[-1]), (joints[..., "xyz".index(axis)] - low) / step
+        truth = np.exp(-((index - place[..., None]) ** 2) / (2 * 2.0**2))
+        predicted = np.exp(logits) / np.exp(logits).sum(-1, keepdims=True)
+        expected += ((truth * np.log(truth / predicted)).mean(-1) * weight).sum() / weight.sum()
+    assert terms["heatmap"].item() == pytest.approx(expected, rel=1e-4)
+    # coordinates instead of heatmaps, and the neck prn
+    bare = replace(outputs, logits_x=None, voted=outputs.coordinates * 2)
+    assert finetuning(bare, targets, replace(MENDED, squared_distance=True))["regression"].item() == pytest.approx(
+        squared(outputs.coordinates), rel=1e-5
+    )
+    assert prn(bare, targets, replace(MENDED, squared_distance=True))["vote"].item() == pytest.approx(
+        squared(bare.voted), rel=1e-5
+    )
 
 
 @settings(max_examples=60, deadline=None)
@@ -183,9 +220,9 @@ def test_losses_use_background_and_ignore_unlabeled_joints():
     outputs, targets = made()
     parts, logits = (value.clone().requires_grad_() for value in (outputs.parts, outputs.logits_x))
     outputs = replace(outputs, parts=parts, logits_x=logits)
-    pretraining(outputs, targets)["segmentation"].backward()
+    pretraining(outputs, targets, MENDED)["segmentation"].backward()
     assert (parts.grad.abs().amax(1) > 0).tolist() == (targets.part >= 0).tolist()
-    finetuning(outputs, targets)["heatmap"].backward()
+    finetuning(outputs, targets, MENDED)["heatmap"].backward()
     assert ((logits.grad.abs().amax(-1) > 0) == targets.weight.bool()).all()
 
 
@@ -566,6 +603,15 @@ def test_released_faults_are_options_of_training():
     recipe = Finetune(data=("a",), init="random", size="paper-tiny", options=options[:1])
     tuned, build = finetuned_network(recipe, None, HUMAN15, "humanm3")
     assert tuned.stale_convolution and not tuned.grid_from_minimum and build().config == tuned
+    # the head of the auxiliary loss comes with fine-tuning, from random weights or pre-trained ones
+    recipe = Finetune(data=("a",), size="paper-tiny", options=("auxiliary_loss",), init="random")
+    tuned, build = finetuned_network(recipe, None, HUMAN15, "humanm3")
+    assert tuned.auxiliary and build().config == tuned and DaptObjective(config=tuned, stage="finetune")
+    pretrained, _ = pretraining_network(Pretrain(size="paper-tiny", options=("auxiliary_loss",)))
+    assert not pretrained.auxiliary
+    recipe = Finetune(data=("a",), keep_anchors=False, init="a")
+    assert finetuned_network(recipe, trained(pretrained), HUMAN15, "humanm3")[0].auxiliary
+    recipe = Finetune(data=("a",), init="random", size="paper-tiny", options=options[:1])
     with pytest.raises(InputError, match="trained without these options"):
         finetuned_network(recipe, trained(mended), HUMAN15, "humanm3")
     with pytest.raises(InputError, match="unknown option of .* 'grid': "):

@@ -177,7 +177,7 @@ def _finetuned_network(
     if trained is not None and recipe.keep_anchors and is_same and not (coordinates and base_config.parts):
         # the network already fits this dataset, as released ones do
         return base_config, lambda: trained
-    heads: dict[str, Any] = {"parts": 0, "coordinates": coordinates, "auxiliary": False}
+    heads: dict[str, Any] = {"parts": 0, "coordinates": coordinates, "auxiliary": base_config.auxiliary_loss}
     config = replace(base_config, name=template.name, joints=template.joints, bins=bins, ranges=ranges, **heads)
     if trained is None:
         return config, partial(build, config)

@@ -28,8 +28,10 @@ CELL_BITS = 16
 
 Range = tuple[float, float]
 
-# settings that each reproduce a fault of the released code, and those that its weights were trained with
-FAULTS = ("stale_convolution", "grid_from_minimum", "zero_anchors")
+# settings that each reproduce a difference of the released code: of the network, of its losses in training; and those
+# that inference with its weights needs
+LOSS_FAULTS = ("squared_distance", "ignore_background", "unnormalized_heatmaps", "auxiliary_loss")
+FAULTS = ("stale_convolution", "grid_from_minimum", "zero_anchors", *LOSS_FAULTS)
 RELEASED_FAULTS: dict[str, Any] = {"stale_convolution": True, "grid_from_minimum": True}
 
 
@@ -50,7 +52,10 @@ class DaptConfig(Config):
     from the bottleneck (the released fine-tuning). `FAULTS` of the released code, each False for the corrected
     behavior; its weights need the first two: stale_convolution: the convolutions of later blocks read rows from before
     the last sum (see `dapt_net`); grid_from_minimum: cells count from the cloud's own minimum, so that one outlier
-    moves them all; zero_anchors: new anchors are initialized to zero, all equal.
+    moves them all; zero_anchors: new anchors are initialized to zero, all equal. Four concern training alone (see
+    `dapt_losses`): squared_distance: distances are squared; ignore_background: background points have no loss of parts;
+    unnormalized_heatmaps: targets do not sum to 1, and the divergence is averaged over bins; auxiliary_loss: fine-tuned
+    networks have the head `auxiliary`, with a loss.
     """
 
     kind: ClassVar[str] = "dapt"
@@ -81,6 +86,10 @@ class DaptConfig(Config):
     stale_convolution: bool = False
     grid_from_minimum: bool = False
     zero_anchors: bool = False
+    squared_distance: bool = False
+    ignore_background: bool = False
+    unnormalized_heatmaps: bool = False
+    auxiliary_loss: bool = False
 
     def __post_init__(self):
         super().__post_init__()

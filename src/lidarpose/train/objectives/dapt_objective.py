@@ -108,7 +108,7 @@ class DaptObjective:
         in the released code."""
         outputs, targets = network(to_tensors(arrays.tables, device)), arrays.targets(device)
         losses = prn if self.config.neck == "prn" else pretraining if self.stage == "pretrain" else finetuning
-        terms = losses(outputs, targets, share=share)
+        terms = losses(outputs, targets, self.config, share=share)
         # adds zero times every head's output: gradient averaging across processes waits for all heads, used or not
         first_term = next(iter(terms))
         heads = [value for name in _HEADS if (value := getattr(outputs, name)) is not None]
