@@ -17,7 +17,7 @@ from lidarpose.eval.metric_rows import METRICS, SUMMARIES
 from lidarpose.geometry import axis_angle_to_matrix, similarity_align
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.sample import Pose
-from lidarpose.skeleton import SKELETONS
+from lidarpose.skeleton import SKELETONS, as_skeleton
 
 REFERENCE = Path(__file__).parent / "parity" / "metrics.npz"
 DISTANCES = (metrics.mpjpe, metrics.pa_mpjpe, metrics.pck)
@@ -40,6 +40,29 @@ def blanked(true, visible):
 
 
 # ---- properties
+
+
+@quick
+@given(seeds, st.integers(1, 5), st.sampled_from(["human15", "waymo14"]))
+def test_root_mpjpe_ignores_translations_alone(seed, n, name):
+    skeleton = as_skeleton(name)
+    pred, true, visible = drawn(seed, n, len(skeleton))
+    root = [skeleton.index(joint) for joint in (("pelvis",) if name == "human15" else ("left_hip", "right_hip"))]
+    visible[:, root] = True
+    score = metrics.root_mpjpe(pred, true, visible, skeleton=name)
+    moved = pred + np.random.default_rng(seed).normal(size=(n, 1, 3))
+    assert metrics.root_mpjpe(moved, true, visible, skeleton=skeleton) == pytest.approx(score, abs=1e-6)
+    # the slow twin: one joint at a time
+    errors = np.full(visible.shape, np.nan)
+    for i, j in zip(*np.nonzero(visible), strict=True):
+        offsets = [joints[i, j] - sum(joints[i, k] for k in root) / len(root) for joints in (pred, true)]
+        errors[i, j] = 1e3 * np.sqrt(((offsets[0] - offsets[1]) ** 2).sum())
+    assert score == pytest.approx(np.nanmean(np.nanmean(errors, 1)))
+    # people without the root are skipped
+    visible[0, root[-1]] = False
+    assert metrics.root_mpjpe(pred, true, visible, skeleton=name).skipped == 1
+    with pytest.raises(InputError, match="human15 has 15 joints, got 3"):
+        metrics.root_mpjpe(pred[:, :3], true[:, :3], skeleton="human15")
 
 
 @quick

@@ -39,6 +39,8 @@ from lidarpose.eval.metrics.joint_errors import (
     mpjpe,
     pa_mpjpe,
     pck,
+    root_aligned_errors,
+    root_mpjpe,
 )
 from lidarpose.eval.metrics.keypoints import (
     OKS_THRESHOLDS,
@@ -60,4 +62,5 @@ __all__ = [
     "acceleration_errors", "aligned_errors", "auroc", "box_hits", "by_group", "by_span", "calibration_error",
     "interval", "joint_errors", "joint_groups", "joint_hits", "mean", "mpjpe", "oks", "oks_ap", "oks_hits",
     "oks_sigmas", "pa_mpjpe", "paired_interval", "pck", "pck_box", "pem",
+    "root_aligned_errors", "root_mpjpe",
 ]  # fmt: skip

@@ -68,6 +68,7 @@ _SHOWN = ("condition", "family", "sensor", "plain", "joints", "body", "joint", "
 _GROUP_METRICS = ("mpjpe", "turned_round", "pck_10cm")
 _TITLES = {
     **{"mpjpe": "MPJPE", "pa_mpjpe": "PA-MPJPE", "pck3": "PCK-3", "pck5": "PCK-5"},
+    "root_mpjpe": "MPJPE relative to the root",
     **{"turned_round": "facing flipped (> 90 deg)", "pem": "PEM", "oks_ap": "OKS-AP", "auroc": "AUROC"},
     **{"pck_10cm": "within 10 cm", "mpjpe_p95": "95th percentile of people's errors"},
     **{"person_auroc": "AUROC of person", "second_person_auroc": "AUROC of a second person"},

@@ -15,7 +15,15 @@ import numpy as np
 from lidarpose.errors import InputError
 from lidarpose.eval.metrics import aggregate, keypoints
 from lidarpose.eval.metrics.aggregate import Score, joint_groups, mean
-from lidarpose.eval.metrics.joint_errors import PCK3, PCK5, TORSO, acceleration_errors, aligned_errors, joint_hits
+from lidarpose.eval.metrics.joint_errors import (
+    PCK3,
+    PCK5,
+    TORSO,
+    acceleration_errors,
+    aligned_errors,
+    joint_hits,
+    root_aligned_errors,
+)
 from lidarpose.eval.predictions import Predictions
 from lidarpose.eval.scores import RELEASED, MetricRow, Setting, number
 from lidarpose.sample import CONFIDENCE_RADIUS, FEWEST_OF_SECOND, HIDDEN, SEEN, UNLABELED
@@ -54,6 +62,13 @@ def facing_flipped(predictions: Predictions) -> np.ndarray:
     return np.where(is_labeled, 100.0 * ((predicted_left * true_left).sum(1) < 0), np.nan)
 
 
+def _root_errors(p: Predictions) -> np.ndarray:
+    names = set(p.skeleton.joints)
+    if "pelvis" not in names and not names >= {"left_hip", "right_hip"}:
+        return np.full(p.true.shape[:2], np.nan)
+    return root_aligned_errors(p.filled, p.true, p.labeled, skeleton=p.skeleton)
+
+
 def _pck(p: Predictions, threshold: float, torso: float = TORSO) -> np.ndarray:
     return joint_hits(p.filled, p.true, p.labeled, threshold=threshold, torso=torso)
 
@@ -86,6 +101,7 @@ class Metric:
 _EVERYWHERE = ("all", "joints", "conditions", "spans")
 METRICS = {
     "mpjpe": Metric(Predictions.errors, "mm", _EVERYWHERE),
+    "root_mpjpe": Metric(_root_errors, "mm", ("all",)),
     "pa_mpjpe": Metric(lambda p: aligned_errors(p.filled, p.true, p.labeled), "mm", _EVERYWHERE),
     "pck3": Metric(partial(_pck, threshold=PCK3), "%", ("all", "joints")),
     "pck5": Metric(partial(_pck, threshold=PCK5), "%", ("all", "joints")),

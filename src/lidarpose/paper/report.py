@@ -44,9 +44,11 @@ _LEGEND = (
 )
 # appended if the paper's printed values are shown
 _PRINTED = (
-    " In parentheses the paper's values, not run here: those of LiDARCap and NE are for poses relative to the root, "
+    " In parentheses the paper's values, not run here: those of LiDARCap and NE are relative to the root, "
     "without shapes; those of LPFormer are for detected boxes."
 )
+# a metric of newer cells, which the paper's rows of clips are printed in
+ROOT = "root_mpjpe"
 # maximum number of people that the mean pose is computed from
 _MEAN_POSE = 5_000
 # the file of an evaluation's studies of perturbed points
@@ -217,7 +219,7 @@ def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
     row, study = result.line("mpjpe"), stability_study(evaluation, out)
     mean_pose = mean_pose_error(cell.target, result, out)
     return {
-        **{name: _value(result, name) for name in COLUMNS},
+        **{name: _value(result, name) for name in (*COLUMNS, ROOT)},
         "low": row.low,
         "high": row.high,
         "people_scored": row.people,
@@ -324,11 +326,15 @@ def _note_lines(entries: list[dict[str, Any]]) -> list[str]:
 
 
 def cost_lines(content: dict[str, Any], *, finished: bool = False) -> list[str]:
-    """Result and cost of each cell, or of each finished one; with a column for the difference to the reference row if
-    any cell has one."""
+    """Result and cost of each cell, or of each finished one; with columns for the error relative to the root, and for
+    the difference to the reference row, if any cell has one."""
     entries = [entry for entry in content["cells"] if not finished or entry["state"] == "done"]
     heads = "row, column, seed, MPJPE, PA, PCK-3, PCK-5, mean pose, people seen, hours, people/s in training, size"
     columns, lines = [*heads.split(", "), "parameters", "state"], [_cost(entry) for entry in entries]
+    if any(entry.get(ROOT) is not None for entry in entries):
+        columns.insert(4, "relative to the root")
+        for entry, line in zip(entries, lines, strict=True):
+            line.insert(4, "-" if entry.get(ROOT) is None else f"{entry[ROOT]:.1f}")
     if any("difference" in entry for entry in entries):
         columns.insert(4, f"against {content['reference']}")
         for entry, line in zip(entries, lines, strict=True):

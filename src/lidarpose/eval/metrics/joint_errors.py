@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from lidarpose.errors import InputError, check_name
 from lidarpose.eval.metrics.aggregate import AVERAGES, Score, as_flags, as_numbers, check_positive, mean
 from lidarpose.geometry import similarity_align
+from lidarpose.skeleton import Skeleton, as_skeleton
 
 # the released code's length of the torso, m, one value for all people; it comes from LiDARCap
 TORSO = 0.5127067
@@ -44,6 +45,28 @@ def mpjpe(
         average: "person" or "joint", see `mean`.
     """
     return _mean(joint_errors(pred, true, visible), average, dapt_compat or legacy, empty=0.0)
+
+
+def root_mpjpe(
+    pred: ArrayLike,
+    true: ArrayLike,
+    visible: ArrayLike | None = None,
+    *,
+    skeleton: Skeleton | str,
+    average: str = "person",
+) -> Score:
+    """`mpjpe` relative to the root: the pelvis, or the middle of the hips in skeletons without one.
+
+    People without a label of the root are skipped. LiDARCap's and NE's published figures are of this kind.
+
+    Args:
+        pred: (n, J, 3) m.
+        true: (n, J, 3) m.
+        visible: as in `mpjpe`.
+        skeleton: of the joints, or its name.
+        average: as in `mpjpe`.
+    """
+    return mean(root_aligned_errors(pred, true, visible, skeleton=skeleton), average)
 
 
 def pa_mpjpe(
@@ -115,6 +138,21 @@ def acceleration_error(
 def joint_errors(pred: ArrayLike, true: ArrayLike, visible: ArrayLike | None = None) -> np.ndarray:
     """(n, J) mm: each joint's distance from the truth, NaN where it has no label."""
     return _distances(*checked_poses(pred, true, visible))
+
+
+def root_aligned_errors(
+    pred: ArrayLike, true: ArrayLike, visible: ArrayLike | None = None, *, skeleton: Skeleton | str
+) -> np.ndarray:
+    """`joint_errors` after each person's root is moved to the true one, see `root_mpjpe`; all NaN for people without a
+    label of it."""
+    pred, true, is_labeled = checked_poses(pred, true, visible)
+    skeleton = as_skeleton(skeleton)
+    if pred.shape[1] != len(skeleton):
+        raise InputError(f"{skeleton.name} has {len(skeleton)} joints, got {pred.shape[1]}")
+    root = list(skeleton.middle)
+    has_root = is_labeled[:, root].all(1, keepdims=True)
+    offset = (pred - true)[:, root].mean(1, keepdims=True)
+    return _distances(pred - offset, true, is_labeled & has_root)
 
 
 def aligned_errors(
