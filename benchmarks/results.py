@@ -36,7 +36,7 @@ from lidarpose.io.atomic import write_atomic
 from lidarpose.io.files import content_digest, lined_json
 from lidarpose.models import BUNDLED, DEFAULT, VERIFIER, bundled_path, weights_file
 from lidarpose.models.checkpoint import load_checkpoint, parameter_count, read_header, runs_of
-from lidarpose.paper import report
+from lidarpose.paper.markdown import cost_lines, result_lines
 from lidarpose.train.run_dir import read_log
 
 ROOT = Path(__file__).parents[1]
@@ -502,7 +502,7 @@ def tracks() -> str:
 def paper(name: str) -> str:
     """A table of the paper on synthesized people, and the cost of its finished cells; see `lidarpose paper`."""
     content = _read(f"paper/{name}")
-    return "\n".join([*report.result_lines(content), "", *report.cost_lines(content, finished=True), ""])
+    return "\n".join([*result_lines(content), "", *cost_lines(content, finished=True), ""])
 
 
 def tables() -> dict[str, Callable[[], str]]:

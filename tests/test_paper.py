@@ -29,9 +29,11 @@ from lidarpose.eval.scores import read_scores
 from lidarpose.eval.table import published
 from lidarpose.models.checkpoint import read_header
 from lidarpose.paper import figures, report, steps
-from lidarpose.paper.report import markdown, mean_pose_error, run_table, write_table
+from lidarpose.paper.cells import REAL, Options, _targets, cells, row_key
+from lidarpose.paper.markdown import _difference_text, markdown
+from lidarpose.paper.report import mean_pose_error, run_table, write_table
 from lidarpose.paper.steps import Step, StepFailed, run_steps
-from lidarpose.paper.tables import REAL, TABLES, Options, _targets, cells, row_key
+from lidarpose.paper.tables import TABLES
 from lidarpose.sample import center_of, facing
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24
 from lidarpose.synth.bodies import PoseBank
@@ -142,7 +144,7 @@ def test_differences_of_few_sequences_have_no_interval(finished, monkeypatch):
     monkeypatch.setattr(report.aggregate, "LEAST_UNITS", 1000)
     few = report._difference(scratch, reference, out)
     assert few == {"difference": whole["difference"], "difference_low": None, "difference_high": None}
-    assert report._difference_text(few) == f"{whole['difference']:+.1f}"
+    assert _difference_text(few) == f"{whole['difference']:+.1f}"
 
 
 def test_unreadable_scores_fail_their_cell_only(finished, tmp_path):

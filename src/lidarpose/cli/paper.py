@@ -49,9 +49,11 @@ def add(commands, execute: Callable[[list[str]], int]) -> None:
 
 def _paper(commands, execute: Callable[[list[str]], int], options: argparse.Namespace) -> None:
     from lidarpose.paper import figures
-    from lidarpose.paper.report import check_targets, plan, run_table, write_table
+    from lidarpose.paper.cells import Options, cells
+    from lidarpose.paper.markdown import plan
+    from lidarpose.paper.report import check_targets, run_table, write_table
     from lidarpose.paper.steps import begin_out, check_out
-    from lidarpose.paper.tables import TABLES, Options, cells
+    from lidarpose.paper.tables import TABLES
 
     check_name("table or figure", options.name, _NAMES)
     if options.name == "fig6" and (options.rows or options.data):

@@ -11,9 +11,9 @@ from lidarpose.eval.charts import compare_ends, compare_stability
 from lidarpose.eval.dataset import open_eval_dataset
 from lidarpose.eval.predictions import read_poses
 from lidarpose.io.atomic import write_atomic
+from lidarpose.paper.cells import Cell
 from lidarpose.paper.report import can_be_drawn, stability_study
 from lidarpose.paper.steps import POSES, Step
-from lidarpose.paper.tables import Cell
 from lidarpose.sample import Pose, facing
 from lidarpose.skeleton import SMPL24
 from lidarpose.synth.bodies import PoseBank
