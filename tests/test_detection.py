@@ -17,6 +17,7 @@ from lidarpose.eval.detector.labeled_scans import heldout_scans
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
 from lidarpose.inference import detection, single_scan, verification
 from lidarpose.inference.known_places import KnownPlaces
+from lidarpose.inference.result_panels import panels_of
 from lidarpose.lidar.raycast import scan
 from lidarpose.models.detector.candidates import SceneIndex
 from lidarpose.models.detector.detector import Detector, rows_that_matter
@@ -231,7 +232,7 @@ def test_boxes_of_tilted_scan_store_up_axis(model, scene, tmp_path, axis):
 def test_picture_of_tilted_scan_shows_facing(model, scene):
     tilt = rotation_about("y", np.radians(20.0)) @ rotation_about("z", 2.5)
     poses = model.predict(scene[0] @ tilt.T, find=True)
-    _, above = poses._panels()
+    _, above = panels_of(poses)
     assert len(above.boxes) == len(poses) >= 4
     for drawn, person in zip(above.boxes, poses, strict=True):
         # the left hip is left of the arrow

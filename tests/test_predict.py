@@ -23,7 +23,8 @@ from lidarpose.inference.crop_search import candidates, select_pose
 from lidarpose.inference.inputs import MAX_POINTS, as_origin, clean
 from lidarpose.inference.predict_scan import predictor_of
 from lidarpose.inference.predictor import Predictor
-from lidarpose.inference.results import PersonPose, person_label
+from lidarpose.inference.result_panels import panels_of, person_label
+from lidarpose.inference.results import PersonPose
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.point_cloud import Cloud
 from lidarpose.models import bundled_path
@@ -900,7 +901,7 @@ def test_notebooks_show_table_of_poses_and_picture_of_person(poses):
     rider = replace(poses[0], id=3, box=Box(center=np.zeros(3), size=np.ones(3), score=0.876, mounted=True))
     table = replace(poses, people=(rider, poses[1]))._repr_html_()
     assert "<th>score</th><th>mounted</th>" in table and "<td>0.88</td><td>yes</td>" in table
-    assert [panel.label for panel in rider.alone()._panels()[0]] == ["3 · score 0.88 · rides"]
+    assert [panel.label for panel in panels_of(rider.alone())[0]] == ["3 · score 0.88 · rides"]
 
 
 def test_poses_indexed_by_id_and_slice(poses):

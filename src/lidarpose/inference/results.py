@@ -10,17 +10,14 @@ from typing import TYPE_CHECKING, cast, overload
 import numpy as np
 
 from lidarpose.errors import counted
-from lidarpose.geometry import UP_AXES, nearest_axis, rotation_about, rotation_from_up
+from lidarpose.geometry import rotation_from_up
 from lidarpose.io.atomic import check_suffix, write_atomic
-from lidarpose.io.files import encodable, lined_json, shorten
-from lidarpose.sample import JOINT_COLUMNS, PER_JOINT, Box, Pose, facing, facing_yaw
+from lidarpose.io.files import encodable, lined_json
+from lidarpose.sample import JOINT_COLUMNS, PER_JOINT, Box, Pose, facing
 from lidarpose.skeleton import Skeleton
 
 if TYPE_CHECKING:
     import pandas
-
-    from lidarpose.viz.bird_eye import ScanPanel
-    from lidarpose.viz.person_view import Panel
 
 SCHEMA = "lidarpose.poses/1"
 # decimals of the values in files, by column of tables
@@ -359,11 +356,12 @@ class Poses(Sequence[PersonPose]):
 
         For a scan with boxes or detected people, a bird's-eye view of the scan is placed above them.
         """
+        from lidarpose.inference.result_panels import panels_of
         from lidarpose.viz.bird_eye import draw_scan_and_people
         from lidarpose.viz.draw import draw_people
 
         title = title or (self.source or "")
-        panels, scan = self._panels()
+        panels, scan = panels_of(self)
         if scan is None:
             return Picture(draw_people(panels, path, title=title))
         return Picture(draw_scan_and_people(scan, panels, path, title=title))
@@ -373,92 +371,15 @@ class Poses(Sequence[PersonPose]):
 
         For a scan with boxes or detected people, a view of the scan is placed above them.
         """
+        from lidarpose.inference.result_panels import panels_of
         from lidarpose.viz.html import render_report, write_report
 
         title = title or (self.source or "lidarpose")
-        panels, scan = self._panels()
+        panels, scan = panels_of(self)
         scans = [] if scan is None else [scan]
         if path is not None:
             return write_report(path, panels, title=title, summary=[], scans=scans)
         return render_report(panels, title=title, summary=[], scans=scans)
-
-    def _panels(self) -> "tuple[list[Panel], ScanPanel | None]":
-        """The panels to draw: one per person, and the scan around them if there is one."""
-        from lidarpose.viz.person_view import Panel
-
-        upright_people = [_upright(person, self.up) for person in self.people]
-        panels = [
-            Panel(
-                points=p.points,
-                pose=p.pose,
-                label=person_label(person.id, person.score, person.mounted),
-                box=p.box,
-                distance=self._distance(person),
-            )
-            for p, person in zip(upright_people, self.people, strict=True)
-        ]
-        return panels, None if self.scan is None else self._from_above(self.scan, upright_people)
-
-    def _distance(self, person: PersonPose) -> float | None:
-        """Distance of the person from the sensor, m; NaN if the sensor position is unknown, None without points."""
-        if not len(person.points):
-            return None
-        return np.nan if self.origin is None else float(np.linalg.norm(np.median(person.points, 0) - self.origin))
-
-    def _from_above(self, points: np.ndarray, people: list[PersonPose]) -> "ScanPanel":
-        """The scan, points (n, 3) m in the input frame, with `people` in the level frame (z up)."""
-        from lidarpose.viz.bird_eye import LONGEST_NAME, ScanPanel
-
-        R_level_input = rotation_from_up(self.up)
-        across, along = map(nearest_axis, R_level_input[:2])
-        if self.up not in UP_AXES:
-            # turned far, both are nearest to one axis, which then names neither
-            is_named = across[-1] != along[-1]
-            across, along = (f"{axis} turned level" for axis in (across, along)) if is_named else ("across", "along")
-        posed = [person for person in people if person.has_pose]
-        label = counted(len(people), "person", "people") if people else "no people"
-        if len(posed) < len(people):
-            label += f", {len(posed)} with a pose"
-        return ScanPanel(
-            points=points @ R_level_input.T,
-            boxes=[box for person in people if (box := person.box or _box_around(person))],
-            poses=Pose(joints=np.stack([person.joints for person in posed]), skeleton=self.skeleton) if posed else None,
-            names=[shorten(str(person.id), LONGEST_NAME) for person in posed],
-            label=label,
-            sensor=None if self.origin is None else tuple((R_level_input @ self.origin)[:2].tolist()),
-            axes=(across, along),
-        )
-
-
-def _upright(person: PersonPose, up: str) -> PersonPose:
-    """The person rotated to z up for drawing. The box is dropped if `up` is a direction, since it would be drawn
-    tilted."""
-    R_level_input = rotation_from_up(up)
-    pose, box = person.pose, person.box if up in UP_AXES else None
-    return replace(
-        person,
-        points=person.points @ R_level_input.T,
-        pose=pose and replace(pose, joints=pose.joints @ R_level_input.T),
-        box=box and replace(box, center=R_level_input @ box.center),
-    )
-
-
-def _box_around(person: PersonPose) -> Box | None:
-    """A box around the points of a person (z up), aligned with the heading of the pose; None without points."""
-    if not len(person.points):
-        return None
-    yaw = facing_yaw(person.pose)
-    R_level_local = rotation_about("z", yaw)
-    local_points = person.points @ R_level_local
-    low, high = local_points.min(0), local_points.max(0)
-    return Box(center=R_level_local @ ((low + high) / 2), size=high - low + 0.1, yaw=yaw, id=person.id)
-
-
-def person_label(id: str | int | None, score: float | None, mounted: bool | None) -> str:
-    """The label of a person in pictures: the id, the score if there is one, and whether the person rides."""
-    words = [] if id is None else [str(id)]
-    words += [] if score is None else [f"score {score:.2f}"]
-    return " · ".join([*words, "rides"] if mounted else words)
 
 
 def _rounded(values: np.ndarray | None, digits: int) -> list:

@@ -9,7 +9,7 @@ import numpy as np
 from lidarpose.arrays import evenly_spaced
 from lidarpose.errors import counted
 from lidarpose.geometry import transform_points
-from lidarpose.inference.results import person_label
+from lidarpose.inference.result_panels import person_label
 from lidarpose.io.sources import Frame, FrameSource
 from lidarpose.recording.coordinates import FixedFrame, moved_yaw
 from lidarpose.sample import Box, Pose

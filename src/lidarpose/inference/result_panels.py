@@ -1,0 +1,94 @@
+"""What the pictures of a result show: a panel for each person, level, and the scan seen from above."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lidarpose.errors import counted
+from lidarpose.geometry import UP_AXES, nearest_axis, rotation_about, rotation_from_up
+from lidarpose.io.files import shorten
+from lidarpose.sample import Box, Pose, facing_yaw
+from lidarpose.viz.bird_eye import LONGEST_NAME, ScanPanel
+from lidarpose.viz.person_view import Panel
+
+if TYPE_CHECKING:
+    from lidarpose.inference.results import PersonPose, Poses
+
+
+def panels_of(poses: "Poses") -> tuple[list[Panel], ScanPanel | None]:
+    """The panels to draw: one per person, and the scan around them if there is one."""
+    upright_people = [_upright(person, poses.up) for person in poses.people]
+    panels = [
+        Panel(
+            points=p.points,
+            pose=p.pose,
+            label=person_label(person.id, person.score, person.mounted),
+            box=p.box,
+            distance=_distance(person, poses.origin),
+        )
+        for p, person in zip(upright_people, poses.people, strict=True)
+    ]
+    return panels, None if poses.scan is None else _from_above(poses, upright_people)
+
+
+def _distance(person: "PersonPose", origin: np.ndarray | None) -> float | None:
+    """Distance of the person from the sensor, m; NaN if the sensor position is unknown, None without points."""
+    if not len(person.points):
+        return None
+    return np.nan if origin is None else float(np.linalg.norm(np.median(person.points, 0) - origin))
+
+
+def _from_above(poses: "Poses", people: "list[PersonPose]") -> ScanPanel:
+    """The scan with `people`, which are in the level frame (z up)."""
+    assert poses.scan is not None
+    R_level_input = rotation_from_up(poses.up)
+    across, along = map(nearest_axis, R_level_input[:2])
+    if poses.up not in UP_AXES:
+        # turned far, both are nearest to one axis, which then names neither
+        is_named = across[-1] != along[-1]
+        across, along = (f"{axis} turned level" for axis in (across, along)) if is_named else ("across", "along")
+    posed = [person for person in people if person.has_pose]
+    label = counted(len(people), "person", "people") if people else "no people"
+    if len(posed) < len(people):
+        label += f", {len(posed)} with a pose"
+    return ScanPanel(
+        points=poses.scan @ R_level_input.T,
+        boxes=[box for person in people if (box := person.box or _box_around(person))],
+        poses=Pose(joints=np.stack([person.joints for person in posed]), skeleton=poses.skeleton) if posed else None,
+        names=[shorten(str(person.id), LONGEST_NAME) for person in posed],
+        label=label,
+        sensor=None if poses.origin is None else tuple((R_level_input @ poses.origin)[:2].tolist()),
+        axes=(across, along),
+    )
+
+
+def _upright(person: "PersonPose", up: str) -> "PersonPose":
+    """The person rotated to z up for drawing. The box is dropped if `up` is a direction, since it would be drawn
+    tilted."""
+    R_level_input = rotation_from_up(up)
+    pose, box = person.pose, person.box if up in UP_AXES else None
+    return replace(
+        person,
+        points=person.points @ R_level_input.T,
+        pose=pose and replace(pose, joints=pose.joints @ R_level_input.T),
+        box=box and replace(box, center=R_level_input @ box.center),
+    )
+
+
+def _box_around(person: "PersonPose") -> Box | None:
+    """A box around the points of a person (z up), aligned with the heading of the pose; None without points."""
+    if not len(person.points):
+        return None
+    yaw = facing_yaw(person.pose)
+    R_level_local = rotation_about("z", yaw)
+    local_points = person.points @ R_level_local
+    low, high = local_points.min(0), local_points.max(0)
+    return Box(center=R_level_local @ ((low + high) / 2), size=high - low + 0.1, yaw=yaw, id=person.id)
+
+
+def person_label(id: str | int | None, score: float | None, mounted: bool | None) -> str:
+    """The label of a person in pictures: the id, the score if there is one, and whether the person rides."""
+    words = [] if id is None else [str(id)]
+    words += [] if score is None else [f"score {score:.2f}"]
+    return " · ".join([*words, "rides"] if mounted else words)
