@@ -94,6 +94,12 @@ VARIANTS = {
     "no clutter": Variant("people", "no clutter, occluders, second person or stray returns", scene=_CALM),
     "strays often": Variant("people", "stray points around three people in five", recipe={"strays": 0.6}),
     "nothing disturbed": Variant("people", "no added stray points or blur", recipe={"strays": 0.0, "noise": 0.0}),
+    "objects": Variant(
+        "person",
+        "one crop in twelve shows an object, and a head predicts `person`",
+        config={"person": True},
+        recipe={"objects": 1 / 12},
+    ),
     "grid 4 cm": Variant("grid", "voxels of 4, 8 and 16 cm", config={"grid": 0.04, "max_voxels": 512}),
     "grid 8 cm": Variant("grid", "voxels of 8, 16 and 32 cm", config={"grid": 0.08}),
     "grid 10 cm": Variant("grid", "voxels of 10, 20 and 40 cm", config={"grid": 0.1}),

@@ -13,6 +13,7 @@ import time
 
 import numpy as np
 
+from lidarpose.errors import InputError
 from lidarpose.eval.dataset import facing
 from lidarpose.geometry import rotation_about
 from lidarpose.inference.predictor import load
@@ -107,7 +108,10 @@ def main() -> None:
     parser.add_argument("--json", help="also write the figures to this file")
     options = parser.parse_args()
 
-    bank = PoseBank.from_clips(options.motion, tuple(options.subjects.split(",")))
+    try:
+        bank = PoseBank.from_clips(options.motion, tuple(options.subjects.split(",")))
+    except InputError as error:
+        parser.error(str(error))
     persons = people(bank, options.people, options.least, options.seed)
     model = load(options.weights, tta=1)
     clouds = [p.sample.points for p in persons]

@@ -10,6 +10,7 @@ as in `wide`.
 """
 
 import argparse
+from pathlib import Path
 
 import numpy as np
 
@@ -76,6 +77,9 @@ def main() -> None:
     parser.add_argument("--people", nargs="+", help="of the motion, by default all")
     parser.add_argument("--frames", type=int, default=60, help="most frames of a row, drawn at random")
     options = parser.parse_args()
+    for path in options.motion:
+        if not Path(path).is_file():
+            parser.error(f"expected a file of captured motion, got {path}")
     banks = [drawn_poses(options.poses, share) for share in options.unusual]
     print(f"{'':40s}  frames" + "".join(f"{share:8.2f}" for share in options.unusual))
     for path in options.motion:

@@ -248,7 +248,7 @@ def test_dapt_protocol_notes_leveled_frames(sets):
         ("humanm3", {"seed": -1}, "seed must be a whole number of at least 0, got -1"),
         ("humanm3", {"tta": 4}, "are for weights by name or path: give them to load instead"),
         ("lidarhuman26m", {}, "two datasets are called lidarhuman26m"),
-        ("nowhere", {}, "is not a dataset"),
+        ("nowhere", {}, "or bench or bench-2, got .*nowhere: there is no such folder"),
         ("a", {}, "is not a dataset"),
     ],
 )

@@ -165,6 +165,12 @@ BAD = {
     "short motion": (["-n", "2", "--clips", "--motion", "../short.npz"], "no clip lasts 1.6 s"),
     "nobody seen": (["-n", "3", "--sensor", "../near.json"], "sensors such as near"),
     "scene of streets": (["-n", "1", "--scenes", "--scene", "paper"], "their own scene"),
+    "tempo": (["-n", "1", "--set", "tempo=0.5"], "tempo changes nothing without captured motion"),
+    "double rate": (["-n", "1", "--set", "double_rate=0.5"], "double_rate changes nothing without merged clouds"),
+    "integration": (
+        ["-n", "1", "--scene", "wide", "--sensor", "os1-64", "--set", "integration=1"],
+        "integration changes nothing without rosettes: name one by --sensor, or omit it",
+    ),
     "sparse": (["-n", "1", "--sensor", "os1-64", "--set", "sparse=1"], "sparse scans with sensors of its own: omit it"),
     "clips": (
         ["-n", "1", "--clips", "--set", "merged=1,crowded=1"],

@@ -148,6 +148,9 @@ def open_eval_dataset(dataset: str | PathLike, *, split: str | None = None, limi
         raise InputError(f"expected a dataset to evaluate on, {BENCH} or the path of a folder, got {dataset!r}")
     if str(dataset) in BENCHES:
         return _open_bench(str(dataset), split, limit)
+    if not Path(dataset).exists():
+        expected = f"expected the folder of a dataset, or {' or '.join(BENCHES)}, got {dataset}"
+        raise InputError(f"{expected}: there is no such folder; write one with lidarpose synth or prepare")
     return _open_folder(Path(dataset), split, limit)
 
 

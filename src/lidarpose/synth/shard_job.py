@@ -16,6 +16,7 @@ from lidarpose.data.writer import Counts, make_shards, open_folder
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.io.files import content_digest, file_error
 from lidarpose.lidar.presets import SENSORS, sensor
+from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.sample import CLIP_FRAMES
 from lidarpose.synth.scene import ACQUISITIONS, RandomStream, scene_config
 
@@ -91,6 +92,16 @@ class SynthesisJob:
             raise InputError("sparse scans with sensors of its own: omit it or --sensor")
         for name in self.sensors or ():
             sensor(name)
+        devices = map(sensor, scene.sensors if self.sensors is None else self.sensors)
+        has_rosette = any(isinstance(device, RayPattern) and device.duration for device in devices)
+        without_effect = {
+            "tempo": (self.motion is None, "captured motion: give its file with --motion too"),
+            "double_rate": (not scene.merged, "merged clouds: set merged, too"),
+            "integration": (not has_rosette, "rosettes: name one by --sensor"),
+        }
+        for name, (is_unused, needed) in without_effect.items():
+            if name in set_names and getattr(scene, name) and is_unused:
+                raise InputError(f"{name} changes nothing without {needed}, or omit it")
         if self.sensors is not None and not self.sensors:
             raise InputError("expected the names of sensors, got none; lidarpose sensors lists them")
 
