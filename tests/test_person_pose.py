@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 import lidarpose.viz.bird_eye as bird_eye
 import lidarpose.viz.draw as picture
 from lidarpose.geometry import UP_AXES, rotation_from_up
+from lidarpose.inference.result_panels import panels_of
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import SMPL24
@@ -95,7 +96,8 @@ def test_picture_of_scan_has_view_from_above(monkeypatch, tmp_path):
     assert panels.pop().label == "2 people, 1 with a pose"
     assert "7" in written and max(map(len, written)) == bird_eye.LONGEST_NAME
     # without a known sensor position no distance is shown
-    assert np.isnan(replace(poses, scan=None, origin=None)._distance(person))
+    unplaced = replace(poses, people=(person,), origin=None)
+    assert np.isnan(panels_of(unplaced)[0][0].distance)
     alone = Poses(people=(), skeleton=SMPL24, scan=scan, source="a.pcd").picture()
     assert len(alone) < len(sheet) and panels[-1].sensor is None and panels[-1].label == "no people"
 
