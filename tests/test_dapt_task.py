@@ -598,7 +598,8 @@ def test_released_faults_are_options_of_training():
         config, _ = pretraining_network(Pretrain(size="paper-tiny", head=head, options=options))
         assert all(getattr(config, fault) for fault in FAULTS) and bool(config.bins) == (head == "heatmaps")
         mended, _ = pretraining_network(Pretrain(size="paper-tiny", head=head))
-        assert replace(config, **dict.fromkeys(FAULTS, False)) == mended
+        assert config.auxiliary == (head == "heatmaps")
+        assert replace(config, **dict.fromkeys(FAULTS, False), auxiliary=False) == mended
     assert not DaptNet(config).backbone.keypoint_embedding.any() and DaptNet(mended).backbone.keypoint_embedding.all()
     recipe = Finetune(data=("a",), init="random", size="paper-tiny", options=options[:1])
     tuned, build = finetuned_network(recipe, None, HUMAN15, "humanm3")

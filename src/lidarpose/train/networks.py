@@ -211,7 +211,10 @@ def _with_options(config: Any, options: tuple[str, ...]) -> Any:
         changes[name] = value or True
         with suppress(ValueError):
             changes[name] = json.loads(value)
-    return replace(config, **changes)
+    config = replace(config, **changes)
+    # where heatmaps are learned in one stage, so is the auxiliary head
+    is_one_stage = isinstance(config, DaptConfig) and bool(config.bins) and config.auxiliary_loss
+    return replace(config, auxiliary=True) if is_one_stage else config
 
 
 def _with_neck_and_head(recipe: Pretrain, config: NetworkConfig | DaptConfig) -> DaptConfig:
