@@ -140,7 +140,7 @@ def test_cli_evaluate_then_table(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     "arguments, words",
     [
-        (("evaluate", "tiny", "nowhere"), "is not a dataset"),
+        (("evaluate", "tiny", "nowhere"), "got nowhere: there is no such folder"),
         (("evaluate", "nix", "bench"), "known are tiny"),
         (("evaluate", "nix.safetensors", "bench"), "nix.safetensors"),
         (("evaluate", "tiny", "bench", "--skeleton", "human51"), "did you mean human15"),
