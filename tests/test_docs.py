@@ -69,6 +69,14 @@ def test_links_in_pages_exist(page):
             assert anchor[1:] in anchors(path), f"{target}{anchor}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_tables_in_pages_have_a_head(page):
+    lines = ["", *page.read_text("utf-8").splitlines(), ""]
+    starts = [i for i, line in enumerate(lines) if line.startswith("|") and not lines[i - 1].startswith("|")]
+    for i in starts:
+        assert re.fullmatch(r"\|[\s:|-]+\|", lines[i + 1]), lines[i]
+
+
 @pytest.mark.parametrize("page", [p for p in PAGES if p.stem != "log"], ids=named)
 def test_files_and_modules_in_pages_exist(page):
     text = page.read_text("utf-8")
