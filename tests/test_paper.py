@@ -30,7 +30,7 @@ from lidarpose.eval.table import published
 from lidarpose.models.checkpoint import read_header
 from lidarpose.paper import figures, report, steps
 from lidarpose.paper.cells import REAL, Options, _targets, cells, row_key
-from lidarpose.paper.markdown import _difference_text, markdown
+from lidarpose.paper.markdown import _difference_text, cost_lines, markdown
 from lidarpose.paper.report import mean_pose_error, run_table, write_table
 from lidarpose.paper.steps import Step, StepFailed, run_steps
 from lidarpose.paper.tables import TABLES
@@ -588,6 +588,16 @@ def _entry(**changes):
         "size": "tiny",
     }
     return entry | {"undertrained": False} | changes
+
+
+def test_markdown_has_columns_of_root_and_difference_where_cells_have_them():
+    compared = {"difference": -1.25, "difference_low": None, "difference_high": None}
+    entries = [_entry(), _entry(row="b", root_mpjpe=70.04, **compared)]
+    content = {"cells": entries, "reference": "a"}
+    head, _, first, second = cost_lines(content)
+    assert " | MPJPE | against a | relative to the root | PA | " in head
+    assert " | 100.0 | - | - | 60.0 | " in first and " | 100.0 | -1.2 | 70.0 | 60.0 | " in second
+    assert "relative" not in cost_lines(content | {"cells": entries[:1]})[0]
 
 
 def test_markdown_of_cells():

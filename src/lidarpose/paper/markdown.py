@@ -63,15 +63,19 @@ def cost_lines(content: dict[str, Any], *, finished: bool = False) -> list[str]:
     entries = [entry for entry in content["cells"] if not finished or entry["state"] == "done"]
     heads = "row, column, seed, MPJPE, PA, PCK-3, PCK-5, mean pose, people seen, hours, people/s in training, size"
     columns, lines = [*heads.split(", "), "parameters", "state"], [_cost(entry) for entry in entries]
-    if any(entry.get(ROOT) is not None for entry in entries):
-        columns.insert(4, "relative to the root")
-        for entry, line in zip(entries, lines, strict=True):
-            line.insert(4, "-" if entry.get(ROOT) is None else f"{entry[ROOT]:.1f}")
-    if any("difference" in entry for entry in entries):
-        columns.insert(4, f"against {content['reference']}")
-        for entry, line in zip(entries, lines, strict=True):
-            line.insert(4, _difference_text(entry))
+    optional = [(ROOT, "relative to the root", _root_text)]
+    # tables written by older versions have no reference, and then no differences
+    optional.append(("difference", f"against {content.get('reference')}", _difference_text))
+    for name, head, text in optional:
+        if any(entry.get(name) is not None for entry in entries):
+            columns.insert(4, head)
+            for entry, line in zip(entries, lines, strict=True):
+                line.insert(4, text(entry))
     return [*_grid(columns), *map(_line, lines)]
+
+
+def _root_text(entry: dict[str, Any]) -> str:
+    return "-" if entry.get(ROOT) is None else f"{entry[ROOT]:.1f}"
 
 
 def _difference_text(entry: dict[str, Any]) -> str:
