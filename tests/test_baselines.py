@@ -20,7 +20,7 @@ from lidarpose.models.baselines.ne import CloudExchange, Ne
 from lidarpose.models.baselines.point_ops import ball_query, farthest_points, nearest_neighbors
 from lidarpose.models.baselines.point_transformer_v2 import Rows
 from lidarpose.models.baselines.prn import OffsetHead, Prn, PrnNeck
-from lidarpose.models.checkpoint import build
+from lidarpose.models.checkpoint import build, parameter_count, save_checkpoint
 from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import SMPL24, WAYMO14
 from lidarpose.train.networks import PRETRAINED
@@ -202,7 +202,8 @@ def _run(network: torch.nn.Module, points: torch.Tensor, valid: torch.Tensor) ->
 @pytest.mark.long
 @torch.no_grad()
 @pytest.mark.parametrize(
-    "name", ["prn", "prn-small", "lpformer", "lpformer-small", "pointnet++", "lidarcap-small", "ne-small"]
+    "name",
+    ["prn", "prn-small", "lpformer", "lpformer-small", "pointnet++", "lidarcap", "lidarcap-small", "ne", "ne-small"],
 )
 def test_networks_ignore_point_order_and_padding(name):
     network = _network(name)
@@ -221,6 +222,13 @@ def test_networks_ignore_point_order_and_padding(name):
     assert torch.allclose(_run(network, more, wide), expected, atol=near)
     # the other people of the batch have no effect
     assert torch.allclose(_run(network, points[2:, :8], valid[2:, :8]), expected[2:], atol=near)
+
+
+@pytest.mark.parametrize("name", ["prn-small", "lpformer-tiny", "lidarcap-tiny", "ne-tiny", "paper-tiny"])
+def test_parameters_of_a_checkpoint_are_those_of_its_network(name, tmp_path):
+    network = build(PRETRAINED[name][0])
+    save_checkpoint(tmp_path / "a.safetensors", network, card={})
+    assert parameter_count(tmp_path / "a.safetensors") == sum(value.numel() for value in network.parameters())
 
 
 @torch.no_grad()

@@ -207,6 +207,11 @@ def test_info_sums_people_of_all_runs(monkeypatch, capsys):
     assert "  500 people, 0.50 hours; all its runs 1,500 people, 1.75 hours" in capsys.readouterr().out
 
 
+def test_random_initial_weights_are_no_run():
+    card = {"command": "lidarpose finetune", "init_card": {}}
+    assert runs_of(card) == [card] and runs_of(card | {"init_card": card}) == [card | {"init_card": card}, card]
+
+
 def test_info_of_checkpoint_prints_network_and_runs(capsys):
     path = bundled_path("tiny")
     card = read_header(path).card

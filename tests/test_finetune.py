@@ -374,7 +374,7 @@ def test_finetune_holds_out_sequences_without_val_split(datasets, name, settings
     assert setup.card["held_out_sequences"] == held_out and not {*held_out} & {*setup.source.dataset.sequences}
     assert len(setup.validation()) == watched
     reason = "there is no split val, and there are too few sequences to hold one out"
-    reason = "--hold-out is 0" if settings.get("hold_out") == 0 else reason
+    reason = "none are held out from training (--hold-out)" if settings.get("hold_out") == 0 else reason
     assert setup.warnings == (() if watched else (f"no validation people: {reason}",))
 
 

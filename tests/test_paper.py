@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import signal
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -303,6 +304,15 @@ def test_table_commands_follow_paper_protocol(data):
     assert reasons["LIPD"] == "" and "--data freemotion=DIR" in reasons["FreeMotion"]
 
 
+def test_the_papers_network_learns_faster_from_few_synthesized_people_at_any_width():
+    for size, rate in (("paper", "--rate 1e-3 --batch 32"), ("paper-tiny", "--rate 2e-3")):
+        selected = cells(TABLES["table3"], Options(size=size), ["anchors", "anchors-mde-heatmaps"])
+        for cell in selected:
+            pretrained, tuned = (" ".join(step.command(Path("o"))) for step in cell.training)
+            assert f"--recipe paper {rate} " in pretrained and f"--recipe paper {rate} " in tuned
+            assert ("--heatmap-rate 10" in tuned) == (cell.row != "anchors") and "--heatmap-rate" not in pretrained
+
+
 def test_tables_do_not_train_on_lidarhuman26m_test_poses(tmp_path, data, smpl):
     raw = tmp_path / "lidarhuman26m-raw"
     # 9 is in no split
@@ -380,6 +390,15 @@ def test_run_table_rejects_unsuitable_dataset_before_training(tmp_path, smpl, mo
     assert main(["paper", "table1", "--dry-run", *words]) == 2 and "--split-by dapt" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("level", [True, False])
+def test_paper_warns_of_leveled_frames_before_training(tmp_path, smpl, capsys, level):
+    write_lidarhuman26m(tmp_path / "raw", smpl)
+    prepare("lidarhuman26m", tmp_path / "raw", tmp_path / "set", smpl=smpl, level=level)
+    words = ["--data", f"lidarhuman26m={tmp_path / 'set'}", "--out", str(tmp_path / "out")]
+    assert main(["paper", "table1", "--dry-run", *words]) == 0
+    assert ("prepare with --no-level" in capsys.readouterr().err) == level
+
+
 @pytest.mark.parametrize("size, suffix", [("paper", ""), ("paper-small", "-small"), ("paper-tiny", "-tiny")])
 def test_table1_rows_have_requested_size(size, suffix):
     sizes = {cell.row: cell.size for cell in cells(TABLES["table1"], Options(size=size)) if cell.evaluation}
@@ -392,6 +411,14 @@ def test_table1_rows_have_requested_size(size, suffix):
 def test_step_name_does_not_depend_on_workers():
     one, two = (cells(TABLES["table1"], Options(workers=n), ["dapt"])[0].evaluation.name for n in (1, 2))
     assert one == two != cells(TABLES["table1"], Options(hours=1.0), ["dapt"])[0].evaluation.name
+
+
+def test_rows_are_named_as_in_the_table_or_by_their_keys():
+    by_key = cells(TABLES["table2"], Options(), ["w-o"])
+    assert by_key and by_key == cells(TABLES["table2"], Options(), ["w/o"])
+    assert cells(TABLES["table1"], Options(), ["lidarcap", "PRN as published"]) == cells(
+        TABLES["table1"], Options(), ["LiDARCap", "prn-as-published"]
+    )
 
 
 def test_paper_dry_run_runs_nothing(tmp_path, monkeypatch, capsys):
@@ -560,6 +587,30 @@ def test_run_steps_repeats_killed_evaluation(tmp_path):
     assert len(asked) == 1 and steps.is_done(step, tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("lines", "fit"),
+    [
+        # 100 s for the first line, 8 people a second after it
+        ([(64, 100.0), (224, 120.0)], 224 + 8 * 880),
+        # a first line that took a third of the hours is all that can be waited for
+        ([(64, 400.0)], 160),
+        # fits
+        ([(64, 1.0), (9_000, 130.0)], None),
+    ],
+)
+def test_the_first_line_of_a_log_does_not_count_for_a_trainings_speed(tmp_path, monkeypatch, lines, fit):
+    signals = []
+    monkeypatch.setattr(steps, "_POLL", 0.001)
+    monkeypatch.setattr(steps, "_people", lambda folder: 20_000)
+    monkeypatch.setattr(steps.os, "kill", lambda process, number: signals.append(number))
+    log = [json.dumps({"people": people, "seconds": seconds}) for people, seconds in lines]
+    (tmp_path / "log.jsonl").write_text("\n".join(log) + "\n")
+    with steps._Watch(tmp_path, 1000 / 3600) as watch:
+        watch._thread.join(timeout=10)
+    assert watch.fit == pytest.approx(fit) if fit else watch.fit is None
+    assert signals == [signal.SIGINT] * bool(fit)
+
+
 @pytest.mark.long
 def test_run_steps_shortens_training_to_its_hours(tmp_path):
     words = ("pretrain", "--size", "tiny", "--people", "200000", "--batch", "4", "--workers", "0", "--pictures", "0")
@@ -598,6 +649,13 @@ def test_markdown_has_columns_of_root_and_difference_where_cells_have_them():
     assert " | MPJPE | against a | relative to the root | PA | " in head
     assert " | 100.0 | - | - | 60.0 | " in first and " | 100.0 | -1.2 | 70.0 | 60.0 | " in second
     assert "relative" not in cost_lines(content | {"cells": entries[:1]})[0]
+
+
+def test_markdown_has_clips_in_the_metric_of_their_printed_values():
+    entries = [_entry(row="NE", published=72.2, root_mpjpe=70.04), _entry(published=51.6, root_mpjpe=70.04)]
+    page = markdown({"title": "T", "target": "real sets", "people": 2000, "hours": None, "cells": entries})
+    assert "| NE | 100.0 [95.0, 105.0]; 70.0 relative to the root (paper 72.2) |" in page
+    assert "| a | 100.0 [95.0, 105.0] (paper 51.6) |" in page
 
 
 def test_markdown_of_cells():

@@ -21,12 +21,12 @@ $ lidarpose paper table1 --people 200000 --workers 2
 $ lidarpose paper table3 --data waymo=prepared/waymo --size paper
 <name> NAME  table1 to table4, or fig5 to fig8
 --out DIR = paper  folder of all tables (default paper)
---rows A,B  only these rows, named as in --dry-run
+--rows A,B  only these rows, named as in --dry-run or as in the table
 --dry-run  print the commands of every cell, run nothing
 --table-only  write the table of finished cells, run nothing
 [budget]
 --people N = 200000  number of people per stage: pre-training, and fine-tuning on the synthesized target
- (default 200000)
+ (default 200000); on a real dataset, fine-tuning takes the recipe's epochs, unless --hours ends it earlier
 --hours H  training time per row, all stages: longer trainings are shortened with their schedule
 --seeds K = 1  seeds 0 ... K-1 of each cell (default 1)
 --workers N = 1  worker processes of each command (default 1)
@@ -74,7 +74,8 @@ def _paper(commands, execute: Callable[[list[str]], int], options: argparse.Name
     table, row_keys = TABLES[options.name], names(options.rows or "")
     selected_cells = cells(table, paper_options, row_keys)
     if options.dry_run:
-        check_targets(selected_cells)
+        for warning in check_targets(selected_cells):
+            tell(warning)
         print(plan(table, selected_cells, out, partial(_problem, commands)), end="")
         return
     if options.table_only:

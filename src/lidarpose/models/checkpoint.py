@@ -36,6 +36,8 @@ ENTRY, DIGEST = "lidarpose", "lidarpose.sha256"
 SCHEMA = "lidarpose.checkpoint/2"
 _FAMILY = SCHEMA.rpartition("/")[0]
 _EXPECTED = "a checkpoint (.safetensors)"
+# last part of the names of tensors that are no parameters: of batch norms and of the authors' heatmap head
+_BUFFERS = ("running_mean", "running_var", "num_batches_tracked", "coord_range", "joint_wise_weight")
 # largest header that safetensors allows, bytes
 _MOST_HEADER = 100_000_000
 _AGAIN = "get the file again"
@@ -75,7 +77,8 @@ class Header:
 def runs_of(card: dict) -> list[dict]:
     """The cards of all training runs behind the weights: the last run first, then the run that it started from, etc."""
     init_card = card.get("init_card")
-    return [card, *(runs_of(init_card) if isinstance(init_card, dict) else [])]
+    # random initial weights have no card
+    return [card, *(runs_of(init_card) if isinstance(init_card, dict) and init_card else [])]
 
 
 # ---- reading and writing
@@ -87,8 +90,10 @@ def read_header(path: str | os.PathLike) -> Header:
 
 
 def parameter_count(path: str | os.PathLike) -> int:
-    """Number of values in a checkpoint's tensors. Raises InputError as `read_header` does."""
-    return sum(map(math.prod, SafetensorsFile.open(path).shapes.values()))
+    """Number of parameters in a checkpoint, as of the network's `parameters()`: without buffers. Raises InputError as
+    `read_header` does."""
+    shapes = SafetensorsFile.open(path).shapes
+    return sum(math.prod(shape) for name, shape in shapes.items() if name.rpartition(".")[2] not in _BUFFERS)
 
 
 def save_checkpoint(path: str | os.PathLike, network: nn.Module, *, card: dict, half: bool = False) -> None:

@@ -159,7 +159,7 @@ def row_key(name: str) -> str:
 
 def cells(table: Table, options: Options, chosen: Sequence[str] = ()) -> list[Cell]:
     """The cells of a table in the chosen rows, by default in all. Raises InputError for an unknown row."""
-    rows = table.rows(options)
+    rows, chosen = table.rows(options), [row_key(name) for name in chosen]
     for key in chosen:
         check_name(f"row of {table.name}", key, [row_key(row.name) for row in rows])
     rows = [row for row in rows if not chosen or row_key(row.name) in chosen]

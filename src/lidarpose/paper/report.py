@@ -56,7 +56,8 @@ def run_table(
     """
     begin_out(out)
     all_cells, chosen_cells = cells(table, options), cells(table, options, chosen)
-    check_targets(chosen_cells)
+    for warning in check_targets(chosen_cells):
+        tell(warning)
     failures: dict[int, str] = {}
     content: dict[str, Any] = {}
     for k, cell in enumerate(all_cells):
@@ -72,11 +73,17 @@ def run_table(
     return content
 
 
-def check_targets(selected: Sequence[Cell]) -> None:
-    """Raises InputError, one line, if a real set cannot be scored under the protocol: before hours of training."""
-    for test in {cell.target.test for cell in selected if cell.evaluation is not None}:
+def check_targets(selected: Sequence[Cell]) -> list[str]:
+    """Warnings, a line each, about real sets; before hours of training. Raises InputError, one line, if one cannot be
+    scored under the protocol."""
+    warnings = []
+    for test in dict.fromkeys(cell.target.test for cell in selected if cell.evaluation is not None):
         if isinstance(test, str):
-            check_protocol(PROTOCOL, open_eval_dataset(test))
+            dataset = open_eval_dataset(test)
+            check_protocol(PROTOCOL, dataset)
+            if dataset.settings.get("level"):
+                warnings.append(f"{test}: sequences out of level were turned; as in the paper: prepare with --no-level")
+    return warnings
 
 
 def _is_there(table: Table, evaluation: Step, out: Path) -> bool:

@@ -35,6 +35,8 @@ POSES = "poses.parquet"
 KINDS: dict[str, type[Pretrain] | type[Finetune]] = {"pretrain": Pretrain, "finetune": Finetune}
 # a training's speed is measured over this many seconds, or over this share of its hours if that is less
 _WATCH, _WATCH_SHARE = 120.0, 0.05
+# from the second line of its log on; from the first one, if that took this share of its hours
+_FIRST_SHARE = 0.25
 _POLL = 0.5
 # a shortened run sees at least this many times as many people as it has seen so far
 _MORE = 1.1
@@ -223,10 +225,17 @@ class _Watch:
 
     def _watch(self) -> None:
         while not self._over.wait(_POLL):
-            entry = last_entry(self._folder)
-            if entry is None or entry["seconds"] < min(_WATCH, _WATCH_SHARE * self._seconds):
+            entries = read_log(self._folder)
+            if not entries or entries[-1]["seconds"] < min(_WATCH, _WATCH_SHARE * self._seconds):
                 continue
-            fit = entry["people"] * self._seconds / entry["seconds"]
+            entry, first = entries[-1], {"people": 0, "seconds": 0.0}
+            if len(entries) > 1:
+                # in the first lines' time, processes start and memory is touched for the first time
+                first = entries[0]
+            elif entry["seconds"] < _FIRST_SHARE * self._seconds:
+                continue
+            speed = (entry["people"] - first["people"]) / max(entry["seconds"] - first["seconds"], 1e-3)
+            fit = entry["people"] + (self._seconds - entry["seconds"]) * speed
             if max(fit, _MORE * entry["people"]) < _people(self._folder) and not self._over.is_set():
                 self.fit = fit
                 os.kill(os.getpid(), signal.SIGINT)

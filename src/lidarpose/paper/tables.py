@@ -15,8 +15,9 @@ _POSES_OF_PAPER = "lidarhuman26m-poses=DIR"
 _RELEASED, _RELEASED_CLIPS = ("--augment", "paper"), ("--options", "trans_center=true")
 # the stand-in has few clips, so they are rotated, as the people of other rows are there
 _TURNED = ("--augment", "turn")
-# the published rates and schedules are meant for the full sizes and for many more steps
-_FASTER = ("--rate", "2e-3")
+# the published rates and schedules are meant for the full sizes and for many more steps: others on synthesized people,
+# and at full width smaller batches, since it sees few people there
+_FASTER, _FASTER_WIDE = ("--rate", "2e-3"), ("--rate", "1e-3", "--batch", "32")
 _ONE_CYCLE = (*_FASTER, "--schedule", "cosine", "--warmup", "0.04")
 # an Adam step moves a weight by about the learning rate, and logits of narrow heatmaps are large (docs/log.md)
 _HEATMAP_RATE = ("--heatmap-rate", "10")
@@ -28,7 +29,8 @@ _RECIPE_KEEP = "0.6"
 def _paper(options: Options, *words: str) -> tuple[str, ...]:
     """Options of a training of the paper's network. On synthesized people, fine-tuning centers on the points, as all
     methods do there; the paper's own fine-tuning centers on labels."""
-    return ("--recipe", "paper", *(() if options.size == PAPER else _FASTER), *words)
+    wide = () if options.real else _FASTER_WIDE
+    return ("--recipe", "paper", *(wide if options.size == PAPER else _FASTER), *words)
 
 
 def _pretrained(
@@ -90,7 +92,8 @@ def _learned(raw: str) -> str:
 
 def _tuned(options: Options, *words: str) -> tuple[str, ...]:
     """Options of the paper's fine-tuning, with heatmaps unless `words` names a neck or head without them."""
-    heatmap_rate = () if options.size == PAPER or NO_HEATMAPS & set(words) else _HEATMAP_RATE
+    is_published = options.size == PAPER and options.real
+    heatmap_rate = () if is_published or NO_HEATMAPS & set(words) else _HEATMAP_RATE
     return _paper(options, *heatmap_rate, *(() if options.real else ("--augment", "default")), *words)
 
 

@@ -48,7 +48,7 @@ from lidarpose.train.validation import validate
 VALIDATION = 256
 _VALIDATION_SEED = 2**31 - 7
 _NO_VALIDATION = "no validation people: there is no split val, and there are too few sequences to hold one out"
-_NOT_VALIDATED = "no validation people: --hold-out is 0"
+_NOT_VALIDATED = "no validation people: none are held out from training (--hold-out)"
 # no sequence is held out from fewer sequences than this
 _LEAST_SEQUENCES = 3
 # chunks between two uses of a scan: divisible by the usual numbers of workers
