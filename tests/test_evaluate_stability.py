@@ -329,3 +329,10 @@ def test_sensor_curve_casts_same_people_at_same_places(synthetic, monkeypatch):
     assert all(person.crop_box is person.sample.box is not None for people in asked for person in people)
     assert min(len(person.points) for person in asked[1]) < LEAST_POINTS
     assert [point.people for point in curve.points] == [12, 12, 12]
+
+
+def test_sensor_curve_respects_limit(synthetic, monkeypatch):
+    monkeypatch.setattr(module, "SENSORS", ("os1-128",))
+    setup = set_up(synthetic)
+    curve = module._sensor_curve(replace(setup, setting=replace(setup.setting, limit=3)), lambda count: None)
+    assert [point.people for point in curve.points] == [3] and curve.says.startswith("3 people")

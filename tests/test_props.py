@@ -11,7 +11,8 @@ from lidarpose.body.rig import load_rig, sample_people
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.bodies import draw_bodies
-from lidarpose.synth.props.attachments import _CARRIED, _carried_prop, _free_hands, draw_props
+from lidarpose.synth.props import draw_props
+from lidarpose.synth.props.carried import CARRIED, carried_prop, free_hands
 from lidarpose.synth.props.garments import girth, skirt
 
 J = {name: i for i, name in enumerate(BODY26.joints)}
@@ -273,8 +274,8 @@ def test_bag_and_suitcase_are_carried_by_either_hand(name):
         for joint, place in (("elbow", (0, 0.22, 0.15)), ("wrist", (0, 0.24, -0.1)), ("hand", (0, 0.24, -0.18))):
             joints[J[f"{side}_{joint}"]] = np.multiply(place, [1, sign, 1])
     joints = joints + [0, 0, -joints[:, 2].min()]
-    hands = _free_hands(joints.tolist())[_CARRIED[name].hands]
+    hands = free_hands(joints.tolist())[CARRIED[name].hands]
     assert hands == HANDS
     for share, sign in ((0.2, 1), (0.8, -1)):
-        prop = _carried_prop(name, joints.tolist(), hands, [0.5, 0.5, share, *[0.5] * 9])
+        prop = carried_prop(name, joints.tolist(), hands, [0.5, 0.5, share, *[0.5] * 9])
         assert sign * prop.place(joints).vertices[:, 1].mean() > 0.15

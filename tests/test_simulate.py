@@ -16,7 +16,7 @@ from lidarpose.synth import simulate as simulate_module
 from lidarpose.synth.environment.mesh import Mesh, box, quad
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.place import Place
-from lidarpose.synth.props.attachments import rigid_prop
+from lidarpose.synth.props.prop import rigid_prop
 from lidarpose.synth.scene import SCENES, scene_config
 from lidarpose.synth.simulate import (
     ScanConditions,

@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from lidarpose.synth.environment.mesh import Mesh, box, boxes, union
-from lidarpose.synth.props.attachments import CRANK, FRONT_AXLE, NECK, REAR_AXLE, rod_rows
+from lidarpose.synth.props.mounts import CRANK, FRONT_AXLE, NECK, REAR_AXLE
+from lidarpose.synth.props.prop import rod_rows
 
 OUT = Path(__file__).parents[1] / "src/lidarpose/synth/assets/meshes.npz"
 

@@ -379,23 +379,22 @@ def _sensor_curve(setup: EvalSetup, advance: Callable[[int], None]) -> Curve:
     from lidarpose.synth.scene import scene_config
 
     scene, points = scene_config("wild"), []
+    num_people = min(CAST, setup.setting.limit or CAST)
     noise, crop = replace(scene.noise, mask=0.0, clutter=0.0, missing_part=0.0), replace(scene.crop, loose=0.0, cut=0.0)
     # uniform distances: `median_points` would place people nearer to coarser sensors
     scene = replace(scene, distance=_DISTANCE, median_points=0, clutter=0.0, occluder=0.0, company=0.0)
     scene = replace(scene, noise=noise, crop=replace(crop, jitter=0.03))
     for k, name in enumerate(SENSORS):
         generator = Generator(scene=replace(scene, sensors=(name,)), measure=False, redraw=False)
-        samples = [generator.person(_SEED, index).sample for index in range(CAST)]
+        samples = [generator.person(_SEED, index).sample for index in range(num_people)]
         predictions = setup.predict([_simulated(sample, setup, k, row) for row, sample in enumerate(samples)])
         # each person is a sequence of their own
         setting = replace(setup.setting, clusters=False)
         point = _point(predictions, predictions.errors(), float(k), name, setting)
         points.append(replace(point, increase=None, increase_low=None, increase_high=None))
         advance(len(samples))
-    says = (
-        f"{CAST} people of the procedural prior, {_DISTANCE[0]:g} to {_DISTANCE[1]:g} m away, with a new ray cast for "
-    )
-    says += "each sensor: the same bodies, poses and distances, nothing around them"
+    says = f"{num_people} people of the procedural prior, {_DISTANCE[0]:g} to {_DISTANCE[1]:g} m away, with a new ray "
+    says += "cast for each sensor: the same bodies, poses and distances, nothing around them"
     return Curve(name="sensors", title="other sensors", says=says, points=tuple(points))
 
 

@@ -10,7 +10,8 @@ from lidarpose.synth.environment.mesh import Mesh, shape
 from lidarpose.synth.environment.site import HALF_WIDTH, Site, pick
 from lidarpose.synth.place import Place
 from lidarpose.synth.props import Prop, draw_props
-from lidarpose.synth.props.attachments import MOUNTS, PELVIS, rigid_prop, upright
+from lidarpose.synth.props.mounts import MOUNTS
+from lidarpose.synth.props.prop import PELVIS, rigid_prop, upright
 
 # share of people by activity, outdoors and indoors
 _MIX_OUTDOORS = {"idle": 0.31, "walk": 0.34, "captured": 0.07, "run": 0.03, "step": 0.02, "bend": 0.035}

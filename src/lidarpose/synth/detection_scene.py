@@ -30,6 +30,7 @@ from lidarpose.synth.detection_scan import (
 )
 from lidarpose.synth.environment.layouts import LAYOUTS
 from lidarpose.synth.environment.mesh import Mesh, union
+from lidarpose.synth.environment.plants import LEAVES
 from lidarpose.synth.environment.site import (
     Relief,
     Site,
@@ -39,7 +40,7 @@ from lidarpose.synth.environment.site import (
     pick,
     scatter,
 )  # fmt: skip
-from lidarpose.synth.environment.things import KINDS, LEAVES
+from lidarpose.synth.environment.things import KINDS
 from lidarpose.synth.environment.traffic import add_surroundings, with_windows
 from lidarpose.synth.scene import RandomStream
 from lidarpose.synth.simulate import label_box

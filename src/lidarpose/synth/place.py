@@ -13,7 +13,7 @@ import numpy as np
 from lidarpose.geometry import rotation_about
 from lidarpose.lidar.ray_pattern import RayPattern
 from lidarpose.lidar.sensor import Sensor
-from lidarpose.synth.props.attachments import Prop
+from lidarpose.synth.props import Prop
 from lidarpose.synth.scene import SceneConfig
 
 # approximate area of a standing adult's silhouette, m2: its solid angle from a distance of one meter

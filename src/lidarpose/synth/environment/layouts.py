@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from lidarpose.synth.environment import mesh as shapes
+from lidarpose.synth.environment.facades import facade
 from lidarpose.synth.environment.mesh import Mesh, grid, shape
-from lidarpose.synth.environment.things import car, draw_thing, facade
+from lidarpose.synth.environment.things import car, draw_thing
 
 Item = tuple[str, Mesh]
 # half the length of rows of buildings, cars and plants outdoors, m

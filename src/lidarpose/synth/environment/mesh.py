@@ -67,6 +67,16 @@ def union(meshes: list[Mesh]) -> Mesh:
     return Mesh(vertices, np.concatenate(faces).astype(np.int32, copy=False), part, later)
 
 
+def union_of(*parts: Mesh | bool) -> Mesh:
+    """The union of the parts that are meshes; others are False."""
+    return union([part for part in parts if isinstance(part, Mesh)])
+
+
+def at(mesh: Mesh, x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> Mesh:
+    """The mesh rotated by `yaw` rad about z, then moved to x, y, z, m."""
+    return mesh.moved((x, y, z), yaw)
+
+
 QUAD_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
 _BOX_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (0.0, 1.0)], np.float32)
 _BOX_FACES = np.array(
@@ -96,6 +106,11 @@ def grid(xs: np.ndarray, ys: np.ndarray, z: np.ndarray | float = 0.0) -> Mesh:
 def box(size: Vector) -> Mesh:
     """A box of size (3,) m standing on the origin."""
     return Mesh(_BOX_CORNERS * np.asarray(size, np.float32), _BOX_FACES)
+
+
+def box_at(size: Vector, *position: float) -> Mesh:
+    """A box of size (3,) m standing on x, y, z, m; omitted ones are 0."""
+    return at(box(size), *position)
 
 
 def boxes(middle: np.ndarray, size: np.ndarray) -> Mesh:
@@ -141,6 +156,11 @@ def shipped_meshes() -> dict[str, Mesh]:
 
 
 # --- meshes built from a few sizes each
+
+
+def post(radius: float, height: float, *position: float) -> Mesh:
+    """A round post standing on x, y, z, m; omitted ones are 0."""
+    return at(shape("pole", radius, radius, height), *position)
 
 
 def wall(length: float, height: float, *, thick: float = 0.2, opening: tuple | None = None) -> Mesh:

@@ -5,15 +5,17 @@ their weights outdoors and indoors, and which of them are held out from training
 a random generator.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
-from math import cos, pi, sin
+from math import pi
 
 import numpy as np
 
 from lidarpose.synth.environment import mesh as shapes
-from lidarpose.synth.environment.mesh import Mesh, shape, union
+from lidarpose.synth.environment import plants
+from lidarpose.synth.environment.facades import window_bars
+from lidarpose.synth.environment.mesh import Mesh, at, box_at, post, shape, union, union_of
 
 Uniforms = np.ndarray
 Builder = Callable[[Uniforms, np.random.Generator], Mesh]
@@ -29,240 +31,40 @@ class Thing:
     left_out: bool = False
 
 
-def _at(mesh: Mesh, x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: float = 0.0) -> Mesh:
-    return mesh.moved((x, y, z), yaw)
-
-
-def _box(size: Sequence[float] | np.ndarray, *position: float) -> Mesh:
-    return _at(shapes.box(size), *position)
-
-
-def _post(radius: float, height: float, *position: float) -> Mesh:
-    return _at(shape("pole", radius, radius, height), *position)
-
-
-def _union(*parts: Mesh | bool) -> Mesh:
-    """The union of the parts that are meshes; others are False."""
-    return union([part for part in parts if isinstance(part, Mesh)])
-
-
-# --- buildings
-
-
-def facade(
-    length: float, height: float, rng: np.random.Generator, *, bars: float = 0.2, niches: float = 0.25
-) -> list[tuple[str, Mesh]]:
-    """A house front along y with its face at x = 0 and relief: recessed windows, some with bars, niches and doorways,
-    pilasters, drainpipes, ledges; open windows show a room behind."""
-    centers, sizes, rods = [], [], []
-
-    def block(y: float, width: float, low: float, high: float, front_x: float, depth: float) -> None:
-        """A box that extends backward from x = front_x."""
-        centers.append((front_x - depth / 2, y, low))
-        sizes.append((depth, width, high - low))
-
-    thickness, y = rng.uniform(0.15, 0.5), -length / 2
-    sill, top = rng.uniform(0.5, 1.1), rng.uniform(1.9, 2.6)
-    while y < length / 2 - 0.3:
-        bay_width = min(rng.uniform(0.8, 2.6), length / 2 - y)
-        kind, opening_draw, depth_draw, u, v = rng.random(5)
-        center, opening = y + bay_width / 2, bay_width * (0.45 + 0.35 * opening_draw)
-        if kind < 0.3 or height < 2.8:
-            block(center, bay_width, 0, height, 0, thickness)
-            if u < 0.25:
-                rods.append(_post(0.04 + 0.03 * v, height, 0.07, center))
-        elif kind < 0.3 + niches:
-            # a doorway or a niche
-            niche_depth = 0.15 + 1.0 * depth_draw * depth_draw
-            for side in (-1, 1):
-                block(center + side * (bay_width + opening) / 4, (bay_width - opening) / 2, 0, height, 0, niche_depth)
-            block(center, opening, 2.0 + 0.5 * u, height, 0, niche_depth)
-            block(center, opening, 0, 2.6, -niche_depth, 0.05)
-            if v < 0.4:
-                block(center, opening, 0, 0.1 + 0.3 * u, -0.1, niche_depth)
-        elif kind < 0.88:
-            block(center, bay_width, 0, sill, 0, thickness)
-            block(center, bay_width, top, height, 0, thickness)
-            for side in (-1, 1):
-                block(center + side * (bay_width + opening) / 4, (bay_width - opening) / 2, sill, top, 0, thickness)
-            if u < 0.7:
-                block(center, opening, sill, top, -thickness * (0.3 + 0.6 * depth_draw), 0.03)
-            block(center, opening + 0.1, sill - 0.06, sill, 0.08, 0.1)
-            if v < bars:
-                rods.append(_at(_window_bars(opening, top - sill, rng), 0.03, center, sill))
-        else:
-            # a pilaster or a corner of a projection
-            projection = 0.08 + 0.5 * depth_draw * depth_draw
-            block(center, bay_width, 0, height, 0, thickness)
-            block(center, 0.25 + 0.5 * u, 0, height, projection, projection + 0.05)
-        y += bay_width
-    if rng.random() < 0.4:
-        block(0, length, height * 0.6, height * 0.6 + 0.2, 0.15, 0.2)
-    # the back wall of the rooms
-    block(0, length, 0, height, -1.5 - 3 * rng.random(), 0.1)
-    front = shapes.boxes(np.array(centers), np.array(sizes))
-    return [("facade", front)] + [("window bars" if len(rod.faces) > 30 else "pole", rod) for rod in rods]
-
-
-def _window_bars(width: float, height: float, rng: np.random.Generator) -> Mesh:
-    count = max(3, int(width / rng.uniform(0.09, 0.16)))
-    middle, size = np.zeros((count + 2, 3)), np.empty((count + 2, 3))
-    middle[:count, 1] = (np.arange(count) + 0.5) * (width / count) - width / 2
-    size[:count] = (0.02, 0.02, height)
-    middle[count:, 2], size[count:] = (0.1 * height, 0.85 * height), (0.02, width, 0.03)
-    return shapes.boxes(middle, size)
-
-
 def _bars(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A barred opening in a piece of wall."""
     width, sill = 0.8 + u[0], 0.3 + 0.7 * u[1]
     wall = shapes.wall(width + 0.8, 2.4 + u[2], thick=0.25, opening=(-width / 2, width / 2, sill, sill + 1.3))
-    return union([wall, _at(_window_bars(width, 1.3, rng), 0.1, 0, sill)])
+    return union([wall, at(window_bars(width, 1.3, rng), 0.1, 0, sill)])
 
 
 def _wall_end(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A short wall seen from its end, or a corner of two walls."""
     height, length = 1.2 + 1.8 * u[0], 0.5 + 2.5 * u[1]
-    wall = _box((length, 0.15 + 0.3 * u[2], height), -length / 2)
+    wall = box_at((length, 0.15 + 0.3 * u[2], height), -length / 2)
     if u[3] < 0.4:
         side = 1 if u[4] < 0.5 else -1
-        return union([wall, _box((0.2, 0.4 + u[5], height), 0, side * (0.2 + u[5] / 2))])
+        return union([wall, box_at((0.2, 0.4 + u[5], height), 0, side * (0.2 + u[5] / 2))])
     # a post at the end, with a cap
-    return _union(wall, u[3] < 0.7 and _box((0.3, 0.3, height + 0.1)))
+    return union_of(wall, u[3] < 0.7 and box_at((0.3, 0.3, height + 0.1)))
 
 
 def _cabinet(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A street cabinet for power or telephone: a plinth, a body, a roof."""
     depth, width, height = 0.25 + 0.3 * u[0], 0.4 + 0.9 * u[1] ** 2, 0.9 + 0.9 * u[2]
-    return _union(
-        _box((depth, width, 0.15)),
-        _box((0.94 * depth, 0.96 * width, height - 0.15), 0, 0, 0.15),
-        u[3] < 0.6 and _box((depth + 0.06, width + 0.06, 0.05), 0, 0, height),
-        u[4] < 0.3 and _box((depth, 0.5 * width + 0.2, 0.7 * height), 0, 0.75 * width + 0.15),
+    return union_of(
+        box_at((depth, width, 0.15)),
+        box_at((0.94 * depth, 0.96 * width, height - 0.15), 0, 0, 0.15),
+        u[3] < 0.6 and box_at((depth + 0.06, width + 0.06, 0.05), 0, 0, height),
+        u[4] < 0.3 and box_at((depth, 0.5 * width + 0.2, 0.7 * height), 0, 0.75 * width + 0.15),
     )
 
 
 def _pillar(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A round or rectangular pillar, some with a base."""
     half, height = 0.1 + 0.22 * u[0], 1.6 + 2.4 * u[1]
-    mesh = _post(half, height) if u[2] < 0.5 else _box((2 * half, 2 * half * (0.6 + 0.8 * u[5]), height))
-    return _union(mesh, u[3] < 0.4 and _box((2.6 * half, 2.6 * half, 0.15 + 0.6 * u[4] ** 2)))
-
-
-# --- plants
-
-# `Mesh.part` of leaves, which beams penetrate a little
-LEAVES = 1
-
-
-def _leaves(mesh: Mesh) -> Mesh:
-    return replace(mesh, part=np.full(len(mesh.faces), LEAVES, np.uint8))
-
-
-def crown(size: tuple[float, float, float], rng: np.random.Generator, *, dense: float = 1.0) -> Mesh:
-    """An irregular crown of leaves that stands on the origin: one or several balls."""
-    count = 1 + int(2.5 * rng.random() + (max(size) > 2))
-    balls = []
-    for _ in range(count):
-        share = rng.uniform(0.55, 1.0, 3) if count > 1 else np.ones(3)
-        offset = (1 - share) * (rng.random(3) - [0.5, 0.5, 0])
-        leaf = max(0.05, 0.09 * max(size)) * rng.uniform(0.7, 1.3)
-        ball = shapes.foliage(share * size, int(min(120, 70 + 50 * dense)), leaf, rng)
-        balls.append(_leaves(ball).moved(offset * size))
-        if rng.random() < 0.6 * dense:
-            # a dense core that no beam passes
-            half = 0.3 * share * size
-            balls.append(shape("ball", *half).moved(offset * size + [0, 0, share[2] * size[2] / 2]))
-    return union(balls)
-
-
-def _clipped(size: tuple[float, float, float], rng: np.random.Generator) -> Mesh:
-    """A clipped hedge: a box with sides of leaves and a dense core."""
-    depth, length, height = size
-    leaf = 0.1
-    count = int(min(260, 22 * (2 * length * height + 2 * depth * height + depth * length)))
-    positions = rng.random((count, 3)) * [depth, length, height] - [depth / 2, length / 2, 0]
-    # projected onto a side, which is drawn with probability proportional to its area
-    area = np.array([length * height, length * height, depth * height, depth * height, depth * length])
-    side = rng.choice(5, count, p=area / area.sum())
-    for number, (axis, value) in enumerate(
-        ((0, depth / 2), (0, -depth / 2), (1, length / 2), (1, -length / 2), (2, height))
-    ):
-        positions[side == number, axis] = value
-    positions += rng.normal(0, 0.04, positions.shape)
-    leaves = positions[:, None] + rng.normal(0, leaf, (count, 3, 3))
-    leaves[..., 2] = np.maximum(leaves[..., 2], 0)
-    core = _box((max(depth - 0.25, 0.05), max(length - 0.2, 0.05), max(height - 0.15, 0.1)))
-    shell = Mesh(leaves.reshape(-1, 3).astype(np.float32), shapes.repeated(count, 3, "triangle"))
-    return union([_leaves(shell), core])
-
-
-def _hedge(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    size = (0.35 + 0.6 * u[0], 0.5 + 4.5 * u[1] ** 2, 0.6 + 1.5 * u[2])
-    if u[3] < 0.8:
-        return _clipped(size, rng)
-    plants = []
-    for k in range(max(1, int(size[1] / 0.8))):
-        plant = shapes.foliage((size[0] + 0.3, 1.2, size[2] * rng.uniform(0.7, 1.1)), 110, 0.1, rng)
-        plants.append(_at(_leaves(plant), 0, 0.8 * k))
-    return union(plants)
-
-
-def _hedge_at_wall(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """A hedge, a climber or a pot plant close to a wall."""
-    length = 1.0 + 3.5 * u[4]
-    plant = _hedge(u, rng) if u[5] < 0.6 else crown((0.4 + 0.3 * u[0], 0.4 + 0.5 * u[1], 1.0 + 0.9 * u[2]), rng)
-    low, high = plant.vertices.min(0), plant.vertices.max(0)
-    wall = _box((0.2, length, 0.8 + 2.2 * u[6]))
-    return union([_at(plant, y=-(low[1] + high[1]) / 2), _at(wall, low[0] - 0.12)])
-
-
-def _bush(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    width = 0.4 + 1.2 * u[0]
-    return crown((width, width * (0.7 + 0.6 * u[1]), 0.5 + 1.4 * u[2]), rng)
-
-
-def _tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """A trunk and a crown above head height."""
-    trunk_height, width = 2.0 + 1.2 * u[0], 2.0 + 3.0 * u[1]
-    radius = 0.08 + 0.25 * u[2] ** 2
-    top = _at(crown((width, width, 2 + 2.5 * u[3]), rng), z=trunk_height)
-    # suckers at the foot
-    suckers = u[4] < 0.3 and shapes.foliage((0.6, 0.6, 0.3 + 0.7 * u[5]), 70, 0.06, rng)
-    return _union(_post(radius, trunk_height + 0.8), top, suckers)
-
-
-def _young_tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """A thin trunk and a small crown that starts low."""
-    trunk_height, width, height = 0.7 + 1.3 * u[0], 0.4 + 1.0 * u[1], 1.0 + 1.8 * u[3]
-    top = _at(crown((width, width, height), rng, dense=0.3), z=trunk_height)
-    return union([_post(0.012 + 0.035 * u[2], trunk_height + height * 0.6), top])
-
-
-def _low_crown(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """A trunk with a crown down to knee or hip height: thuja, spruce, an old shrub."""
-    trunk_height, width, height = 0.1 + 1.0 * u[0], 0.6 + 2.2 * u[1], 1.6 + 3.0 * u[2]
-    return union(
-        [
-            _post(0.05 + 0.15 * u[3], trunk_height + 0.6 * height),
-            _at(crown((width, width, height), rng), z=trunk_height),
-        ]
-    )
-
-
-def _staked_tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """A young tree tied to one to three stakes."""
-    parts, count, stake_height = [_young_tree(u, rng)], 1 + int(3 * u[4]), 0.9 + 0.9 * u[5]
-    distance = 0.12 + 0.25 * u[6]
-    for k in range(count):
-        angle = 2 * pi * (k / count + u[7])
-        parts.append(_post(0.025 + 0.02 * u[6], stake_height, distance * cos(angle), distance * sin(angle)))
-        if count > 1:
-            bar = _box(
-                (0.04, 1.6 * distance, 0.07), distance * cos(angle) / 2, distance * sin(angle) / 2, 0.92 * stake_height
-            )
-            parts.append(bar)
-    return _union(*parts, u[0] < 0.3 and _post(0.08 + 0.06 * u[1], 0.9 + 0.5 * u[2]))
+    mesh = post(half, height) if u[2] < 0.5 else box_at((2 * half, 2 * half * (0.6 + 0.8 * u[5]), height))
+    return union_of(mesh, u[3] < 0.4 and box_at((2.6 * half, 2.6 * half, 0.15 + 0.6 * u[4] ** 2)))
 
 
 # --- street furniture and other objects
@@ -270,17 +72,17 @@ def _staked_tree(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 def _bollard(u: Uniforms, rng: np.random.Generator) -> Mesh:
     half, height = 0.05 + 0.12 * u[0], 0.5 + 0.8 * u[1]
-    mesh = _post(half, height) if u[2] < 0.7 else _box((2 * half, 2 * half, height))
-    return _union(mesh, u[3] < 0.4 and _at(shape("ball", 1.15 * half, 1.15 * half, 1.1 * half), z=height))
+    mesh = post(half, height) if u[2] < 0.7 else box_at((2 * half, 2 * half, height))
+    return union_of(mesh, u[3] < 0.4 and at(shape("ball", 1.15 * half, 1.15 * half, 1.1 * half), z=height))
 
 
 def _pole(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A lamp post, a flagpole, a post with a box on it."""
     radius, height = 0.025 + 0.1 * u[0] ** 2, 1.5 + 6 * u[1]
-    foot = u[2] < 0.3 and _post(1.7 * radius, 0.8 + 0.5 * u[3])
+    foot = u[2] < 0.3 and post(1.7 * radius, 0.8 + 0.5 * u[3])
     # a box, a bin or a parking meter at chest height
-    box = u[4] < 0.35 and _box((0.2 + 0.2 * u[5], 0.25 + 0.2 * u[6], 0.3 + 0.5 * u[7]), 0.1, 0, 0.6 + 0.7 * u[3])
-    return _union(_post(radius, height), foot, box)
+    box = u[4] < 0.35 and box_at((0.2 + 0.2 * u[5], 0.25 + 0.2 * u[6], 0.3 + 0.5 * u[7]), 0.1, 0, 0.6 + 0.7 * u[3])
+    return union_of(post(radius, height), foot, box)
 
 
 def _sign(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -289,18 +91,18 @@ def _sign(u: Uniforms, rng: np.random.Generator) -> Mesh:
     if u[0] < 0.8:
         # a board on two feet
         width, height = 0.5 + 0.8 * u[1], 1.0 + 1.0 * u[2]
-        board = _box((0.04, width, 0.75 * height), 0, 0, 0.25 * height)
-        return union([board, _post(0.03, height, 0, width / 2), _post(0.03, height, 0, -width / 2)])
+        board = box_at((0.04, width, 0.75 * height), 0, 0, 0.25 * height)
+        return union([board, post(0.03, height, 0, width / 2), post(0.03, height, 0, -width / 2)])
     # an advertising column or a stele
-    return _box((0.12 + 0.3 * u[1] ** 2, 0.5 + 0.6 * u[2], 1.3 + 1.1 * u[3]))
+    return box_at((0.12 + 0.3 * u[1] ** 2, 0.5 + 0.6 * u[2], 1.3 + 1.1 * u[3]))
 
 
 def _bin(u: Uniforms, rng: np.random.Generator) -> Mesh:
     if u[0] < 0.6:
         return shape("wheeled bin", 0.5 + 0.3 * u[1], 0.45 + 0.35 * u[2], 0.9 + 0.4 * u[3])
     if u[0] < 0.85:
-        return _post(0.18 + 0.12 * u[1], 0.7 + 0.4 * u[2])
-    return _box((0.8 + 0.5 * u[1], 1.2 + 0.8 * u[2], 1.1 + 0.4 * u[3]))
+        return post(0.18 + 0.12 * u[1], 0.7 + 0.4 * u[2])
+    return box_at((0.8 + 0.5 * u[1], 1.2 + 0.8 * u[2], 1.1 + 0.4 * u[3]))
 
 
 def _bench(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -311,59 +113,60 @@ def _chair(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A single chair, a stack, or an office chair with a high back."""
     chair = shape("chair", 0.9 + 0.3 * u[0], 0.42 + 0.15 * u[1], 0.43 + 0.06 * u[2])
     if u[3] < 0.15:
-        return union([_at(chair, z=0.09 * k) for k in range(2 + int(4 * u[4]))])
-    return _union(chair, u[3] < 0.35 and _box((0.08, 0.45, 0.4), -0.2, 0, 0.8))
+        return union([at(chair, z=0.09 * k) for k in range(2 + int(4 * u[4]))])
+    return union_of(chair, u[3] < 0.35 and box_at((0.08, 0.45, 0.4), -0.2, 0, 0.8))
 
 
 def _table(u: Uniforms, rng: np.random.Generator) -> Mesh:
     length, depth, height = 0.6 + 1.4 * u[0], 0.5 + 0.5 * u[1], 0.7 + 0.4 * u[2] ** 3
     # a screen, a case or a pile on it
     size = (0.05 + 0.3 * u[4], 0.3 + 0.3 * u[5], 0.2 + 0.4 * u[6])
-    return _union(
-        shape("table", depth, length, height), u[3] < 0.4 and _box(size, 0, length * (u[7] - 0.5) / 2, height)
+    return union_of(
+        shape("table", depth, length, height), u[3] < 0.4 and box_at(size, 0, length * (u[7] - 0.5) / 2, height)
     )
 
 
 def _cart(u: Uniforms, rng: np.random.Generator) -> Mesh:
     if u[0] < 0.4:
-        return _at(shape("trolley"), -0.45)
+        return at(shape("trolley"), -0.45)
     if u[0] < 0.65:
-        return _at(shape("pram"), -0.5)
+        return at(shape("pram"), -0.5)
     # a cage or a luggage cart
     depth, width, height = 0.6 + 0.3 * u[1], 0.5 + 0.3 * u[2], 0.9 + 0.8 * u[3]
-    sides = [_at(shapes.lattice_fence(width, height, 0.12, 0.02), side * depth / 2) for side in (-1, 1)]
-    return union([_box((depth, width, 0.06), 0, 0, 0.15), _box((depth, width, 0.5 * height * u[4]), 0, 0, 0.2), *sides])
+    sides = [at(shapes.lattice_fence(width, height, 0.12, 0.02), side * depth / 2) for side in (-1, 1)]
+    load = box_at((depth, width, 0.5 * height * u[4]), 0, 0, 0.2)
+    return union([box_at((depth, width, 0.06), 0, 0, 0.15), load, *sides])
 
 
 def _bicycle(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """One parked bicycle, or a few side by side."""
     size = 0.9 + 0.2 * u[0]
-    bicycle = union([shape("bicycle"), _box((0.04, 0.56, 0.035), 0.52, 0, 1.02)]).scaled((size,) * 3)
-    bicycle = _union(bicycle, u[1] < 0.3 and _box((0.3, 0.35, 0.25), -0.4 if u[2] < 0.5 else 0.7, 0, 0.75))
+    bicycle = union([shape("bicycle"), box_at((0.04, 0.56, 0.035), 0.52, 0, 1.02)]).scaled((size,) * 3)
+    bicycle = union_of(bicycle, u[1] < 0.3 and box_at((0.3, 0.35, 0.25), -0.4 if u[2] < 0.5 else 0.7, 0, 0.75))
     count = 1 + int(4 * max(0.0, u[3] - 0.5))
-    return union([_at(bicycle, 0.05 * k, 0.45 * k + 0.05 * u[4], yaw=0.1 * (u[5] - 0.5)) for k in range(count)])
+    return union([at(bicycle, 0.05 * k, 0.45 * k + 0.05 * u[4], yaw=0.1 * (u[5] - 0.5)) for k in range(count)])
 
 
 def moped() -> Mesh:
     """A scooter facing +x, with the middle of its seat 0.75 m above the origin and its foot board at 0.28 m."""
-    return _union(
-        _at(shape("ball", 0.23, 0.06, 0.23), 0.85, 0, 0.23),
-        _at(shape("ball", 0.23, 0.07, 0.23), -0.35, 0, 0.23),
-        _box((0.5, 0.3, 0.08), 0.42, 0, 0.2),
-        _box((0.75, 0.3, 0.38), -0.15, 0, 0.3),
-        _box((0.7, 0.26, 0.07), -0.1, 0, 0.68),
-        _box((0.08, 0.42, 0.55)).placed([[1, 0, 0], [0, 1, 0], [-0.2, 0, 1]], (0.76, 0, 0.3)),
-        _box((0.14, 0.16, 0.2), 0.64, 0, 0.85),
-        _box((0.04, 0.62, 0.04), 0.58, 0, 1.0),
-        _box((0.16, 0.1, 0.5), 0.85, 0, 0.15),
+    return union_of(
+        at(shape("ball", 0.23, 0.06, 0.23), 0.85, 0, 0.23),
+        at(shape("ball", 0.23, 0.07, 0.23), -0.35, 0, 0.23),
+        box_at((0.5, 0.3, 0.08), 0.42, 0, 0.2),
+        box_at((0.75, 0.3, 0.38), -0.15, 0, 0.3),
+        box_at((0.7, 0.26, 0.07), -0.1, 0, 0.68),
+        box_at((0.08, 0.42, 0.55)).placed([[1, 0, 0], [0, 1, 0], [-0.2, 0, 1]], (0.76, 0, 0.3)),
+        box_at((0.14, 0.16, 0.2), 0.64, 0, 0.85),
+        box_at((0.04, 0.62, 0.04), 0.58, 0, 1.0),
+        box_at((0.16, 0.1, 0.5), 0.85, 0, 0.15),
     )
 
 
 def _moped(u: Uniforms, rng: np.random.Generator) -> Mesh:
     mesh = moped().scaled((0.9 + 0.2 * u[0], 1.0, 0.9 + 0.2 * u[1]))
     # a top box or a wind screen
-    extra = _box((0.35, 0.38, 0.35), -0.6, 0, 0.75) if u[3] < 0.6 else _box((0.04, 0.45, 0.5), 0.66, 0, 0.95)
-    return _union(mesh, u[2] < 0.35 and extra)
+    extra = box_at((0.35, 0.38, 0.35), -0.6, 0, 0.75) if u[3] < 0.6 else box_at((0.04, 0.45, 0.5), 0.66, 0, 0.95)
+    return union_of(mesh, u[2] < 0.35 and extra)
 
 
 def _cone(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -380,8 +183,8 @@ def _sacks(u: Uniforms, rng: np.random.Generator) -> Mesh:
         bottom = top if u[1] < 0.5 else 0.0
         placement = {"x": 0.4 * (d - 0.5), "y": (0.3 if u[1] < 0.5 else 1.0) * (e - 0.5), "z": bottom, "yaw": pi * d}
         half = np.array(size) / 2
-        part = _box(size) if u[2] < 0.5 else _at(shape("ball", *half), z=half[2] * 0.9)
-        parts.append(_at(part, **placement))
+        part = box_at(size) if u[2] < 0.5 else at(shape("ball", *half), z=half[2] * 0.9)
+        parts.append(at(part, **placement))
         top = min(top + 0.85 * size[2], 1.5)
     return union(parts)
 
@@ -393,7 +196,7 @@ def _fence(u: Uniforms, rng: np.random.Generator) -> Mesh:
     if u[2] < 0.8:
         return shapes.lattice_fence(length, height, 0.08 + 0.14 * u[3], 0.015 + 0.06 * u[4])
     # boards between posts
-    return union([_box((0.04, length, height - 0.1), 0, 0, 0.1), shapes.rail_fence(length, height + 0.05, 1)])
+    return union([box_at((0.04, length, height - 0.1), 0, 0, 0.1), shapes.rail_fence(length, height + 0.05, 1)])
 
 
 def car(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -402,17 +205,17 @@ def car(u: Uniforms, rng: np.random.Generator) -> Mesh:
         return shape("car", 3.6 + 1.3 * u[1], 1.65 + 0.25 * u[2], 1.38 + 0.35 * u[3])
     if u[0] < 0.95:
         return shape("van", 4.4 + 1.6 * u[1], 1.85 + 0.25 * u[2], 1.8 + 0.9 * u[3])
-    return union([_box((6 + 3 * u[1], 2.4, 2.2 + u[2]), 0, 0, 0.8), _box((5, 2.2, 0.5), 0, 0, 0.3)])
+    return union([box_at((6 + 3 * u[1], 2.4, 2.2 + u[2]), 0, 0, 0.8), box_at((5, 2.2, 0.5), 0, 0, 0.3)])
 
 
 def _car_corner(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """The corner of a car or a van between occluders that hide the rest, so that only a strip is visible."""
-    vehicle, occluder = car(0.9 * u, rng), _box((0.15, 2.0 + 2 * u[4], 1.6 + 0.8 * u[5]))
+    vehicle, occluder = car(0.9 * u, rng), box_at((0.15, 2.0 + 2 * u[4], 1.6 + 0.8 * u[5]))
     gap = 0.25 + 0.5 * u[6]
     low, high = vehicle.vertices.min(0), vehicle.vertices.max(0)
     lateral_offset = (2.0 + 2 * u[4]) / 2
-    vehicle = _at(vehicle, -(high[0] if u[7] < 0.5 else -low[0]), (u[3] - 0.5) * high[1] * 2)
-    return union([vehicle, _at(occluder, 0.8, gap + lateral_offset), _at(occluder, 0.8, -lateral_offset)])
+    vehicle = at(vehicle, -(high[0] if u[7] < 0.5 else -low[0]), (u[3] - 0.5) * high[1] * 2)
+    return union([vehicle, at(occluder, 0.8, gap + lateral_offset), at(occluder, 0.8, -lateral_offset)])
 
 
 # --- indoors
@@ -439,34 +242,23 @@ def _shelf(u: Uniforms, rng: np.random.Generator) -> Mesh:
 
 def _cupboard(u: Uniforms, rng: np.random.Generator) -> Mesh:
     depth, width, height = 0.35 + 0.3 * u[0], 0.5 + 1.2 * u[1], 0.8 + 1.4 * u[2]
-    door = u[3] < 0.35 and _box((0.5, 0.02, height), depth / 2 + 0.25, width / 2)
-    case = u[4] < 0.3 and _box((0.3, 0.4, 0.3), 0, width * (u[5] - 0.5) / 2, height)
-    return _union(_box((depth, width, height)), door, case)
+    door = u[3] < 0.35 and box_at((0.5, 0.02, height), depth / 2 + 0.25, width / 2)
+    case = u[4] < 0.3 and box_at((0.3, 0.4, 0.3), 0, width * (u[5] - 0.5) / 2, height)
+    return union_of(box_at((depth, width, height)), door, case)
 
 
 def _door(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """An open door leaf with a piece of its frame."""
-    leaf = _box((0.04, 0.85, 2.0), 0, 0.42).moved((0, 0, 0), 1.5 * u[0])
-    return union([leaf, _box((0.12, 0.08, 2.1), 0, -0.05)])
-
-
-def _plant(u: Uniforms, rng: np.random.Generator) -> Mesh:
-    """A pot plant."""
-    pot_height, width = 0.25 + 0.35 * u[0], 0.3 + 0.6 * u[1]
-    return union(
-        [
-            _post(0.5 * pot_height, pot_height),
-            _at(crown((width, width, 0.4 + 1.1 * u[2]), rng, dense=0.5), z=pot_height),
-        ]
-    )
+    leaf = box_at((0.04, 0.85, 2.0), 0, 0.42).moved((0, 0, 0), 1.5 * u[0])
+    return union([leaf, box_at((0.12, 0.08, 2.1), 0, -0.05)])
 
 
 def _floor_lamp(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A floor lamp, a coat stand, a music stand, a screen on a stand."""
     height = 1.2 + 0.7 * u[0]
-    shade = u[2] < 0.4 and _post(0.12 + 0.12 * u[3], 0.25, 0, 0, height - 0.1)
-    screen = 0.4 <= u[2] < 0.7 and _box((0.05, 0.5 + 0.5 * u[3], 0.35 + 0.3 * u[4]), 0, 0, height - 0.3)
-    return _union(_post(0.015 + 0.01 * u[1], height), _post(0.14, 0.03), shade, screen)
+    shade = u[2] < 0.4 and post(0.12 + 0.12 * u[3], 0.25, 0, 0, height - 0.1)
+    screen = 0.4 <= u[2] < 0.7 and box_at((0.05, 0.5 + 0.5 * u[3], 0.35 + 0.3 * u[4]), 0, 0, height - 0.3)
+    return union_of(post(0.015 + 0.01 * u[1], height), post(0.14, 0.03), shade, screen)
 
 
 # --- pieces
@@ -476,25 +268,25 @@ def _fragment(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A person-sized or smaller piece of no particular thing: a plate, foliage, a corner, some posts or boxes."""
     height, width = 0.5 + 1.4 * u[0], 0.15 + 0.6 * u[1]
     if u[2] < 0.3:
-        piece = _box((0.05, width, height))
+        piece = box_at((0.05, width, height))
     elif u[2] < 0.5:
         piece = shapes.foliage((width, width, height), 40 + int(70 * u[3]), 0.1, rng)
     elif u[2] < 0.7:
-        half = _box((0.05, width, height), 0, width / 2)
+        half = box_at((0.05, width, height), 0, width / 2)
         piece = union([half, half.moved((0, 0, 0), 1.2 + 0.6 * u[3])])
     elif u[2] < 0.85:
-        piece = union([_post(0.05, height * (0.4 + 0.6 * rng.random()), 0, width * rng.random()) for _ in range(4)])
+        piece = union([post(0.05, height * (0.4 + 0.6 * rng.random()), 0, width * rng.random()) for _ in range(4)])
     else:
-        piece = union([_box(0.15 + 0.35 * rng.random(3), *(rng.random(3) * [width, width, height])) for _ in "abc"])
-    return _at(piece, z=0.7 * max(0.0, u[4] - 0.6))
+        piece = union([box_at(0.15 + 0.35 * rng.random(3), *(rng.random(3) * [width, width, height])) for _ in "abc"])
+    return at(piece, z=0.7 * max(0.0, u[4] - 0.6))
 
 
 def _floating(u: Uniforms, rng: np.random.Generator) -> Mesh:
     """A thing that hangs, or stands on legs too thin to be scanned: a sign, a lamp, a banner, a branch, a machine."""
     z, height, width = 0.35 + 1.1 * u[0], 0.3 + 0.9 * u[1], 0.2 + 0.7 * u[2]
     if u[3] < 0.5:
-        return _box((0.04 + 0.3 * u[4] ** 2, width, height), 0, 0, z)
-    return _at(shapes.foliage((width, width, height), 60, 0.1, rng), z=z)
+        return box_at((0.04 + 0.3 * u[4] ** 2, width, height), 0, 0, z)
+    return at(shapes.foliage((width, width, height), 60, 0.1, rng), z=z)
 
 
 def _mannequin(u: Uniforms, rng: np.random.Generator) -> Mesh:
@@ -504,11 +296,11 @@ def _mannequin(u: Uniforms, rng: np.random.Generator) -> Mesh:
         edges, parts = [0.0, *np.sort(rng.uniform(0.1, 0.9, 2)) * height, height], []
         for low, high in pairwise(edges):
             size = (width * (0.5 + 0.5 * rng.random()), width * (0.6 + 0.4 * rng.random()), high - low)
-            parts.append(_box(size, 0, 0, low))
+            parts.append(box_at(size, 0, 0, low))
         return union(parts)
     if u[2] < 0.7:
-        return _at(shape("ball", width / 2, width / 2, height / 2), z=height / 2)
-    return union([_post(width / 2 * (0.7 + 0.3 * u[3]), height * (0.6 + 0.3 * u[4])), _box((0.1, width, height))])
+        return at(shape("ball", width / 2, width / 2, height / 2), z=height / 2)
+    return union([post(width / 2 * (0.7 + 0.3 * u[3]), height * (0.6 + 0.3 * u[4])), box_at((0.1, width, height))])
 
 
 THINGS: dict[str, Thing] = {
@@ -516,13 +308,13 @@ THINGS: dict[str, Thing] = {
     "window bars": Thing(_bars, 0.5, 0.1),
     "cabinet": Thing(_cabinet, 1.0, 0.4, left_out=True),
     "pillar": Thing(_pillar, 1.0, 1.5, left_out=True),
-    "tree": Thing(_tree, 1.2),
-    "young tree": Thing(_young_tree, 1.0),
-    "low crown": Thing(_low_crown, 1.0),
-    "staked tree": Thing(_staked_tree, 1.2, left_out=True),
-    "hedge": Thing(_hedge, 1.0),
-    "hedge at wall": Thing(_hedge_at_wall, 1.0, 0.2, left_out=True),
-    "bush": Thing(_bush, 1.0),
+    "tree": Thing(plants.tree, 1.2),
+    "young tree": Thing(plants.young_tree, 1.0),
+    "low crown": Thing(plants.low_crown, 1.0),
+    "staked tree": Thing(plants.staked_tree, 1.2, left_out=True),
+    "hedge": Thing(plants.hedge, 1.0),
+    "hedge at wall": Thing(plants.hedge_at_wall, 1.0, 0.2, left_out=True),
+    "bush": Thing(plants.bush, 1.0),
     "bollard": Thing(_bollard, 1.0, 0.1),
     "pole": Thing(_pole, 1.2, 0.2),
     "sign": Thing(_sign, 1.2, 0.5),
@@ -541,7 +333,7 @@ THINGS: dict[str, Thing] = {
     "shelf": Thing(_shelf, 0.1, 1.2),
     "cupboard": Thing(_cupboard, 0.0, 1.2),
     "door": Thing(_door, 0.1, 0.8),
-    "pot plant": Thing(_plant, 0.3, 0.8),
+    "pot plant": Thing(plants.pot_plant, 0.3, 0.8),
     "floor lamp": Thing(_floor_lamp, 0.1, 0.8),
     "fragment": Thing(_fragment, 0.6, 0.3),
     "floating piece": Thing(_floating, 0.5, 0.3),

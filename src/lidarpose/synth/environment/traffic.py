@@ -9,9 +9,10 @@ from math import pi
 import numpy as np
 
 from lidarpose.synth.environment import mesh as shapes
+from lidarpose.synth.environment.facades import facade
 from lidarpose.synth.environment.mesh import Mesh, shape, union
 from lidarpose.synth.environment.site import Site
-from lidarpose.synth.environment.things import draw_thing, facade
+from lidarpose.synth.environment.things import draw_thing
 
 # half the length of roads and rows of houses, minimum distance of vehicles from the sensor, and minimum gap between an
 # added object and those already there, m
