@@ -46,7 +46,7 @@ from lidarpose.inference.predictor import Predictor
 from lidarpose.inference.torch_backend import TorchBackend
 from lidarpose.io.atomic import write_atomic
 from lidarpose.models.checkpoint import Header, SafetensorsFile, load_checkpoint, read_header
-from lidarpose.models.config import NetworkConfig, preset
+from lidarpose.models.config import SIZES, NetworkConfig
 from lidarpose.models.expand import expand_weights
 from lidarpose.models.posenet import PoseNet
 from lidarpose.synth.generator import BLOCK, Generator
@@ -217,7 +217,7 @@ def keeps_network(variant: Variant) -> bool:
 def configuration(variant: Variant, init: str) -> NetworkConfig:
     """The configuration of the variant's network: without convolutions, or with those of the initial weights."""
     convolution = read_header(init).config.convolution if init else 0
-    return replace(preset(variant.size), **{"convolution": convolution} | variant.config)
+    return replace(SIZES[variant.size], **{"convolution": convolution} | variant.config)
 
 
 def job(variant: Variant, settings: Pretrain) -> TrainSetup:

@@ -38,8 +38,8 @@ from network_report import CROPS, Key, Report, Times
 from runners import (
     BATCH,
     DRAFT,
+    NETWORKS,
     PAPER_BATCH,
-    SIZES,
     Example,
     Runner,
     Session,
@@ -262,7 +262,7 @@ def parsed(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--threads", type=_whole, default=2, help="of torch and ONNX Runtime (default 2)")
     parser.add_argument("--rounds", type=_whole, help="turns of everything (default 5)")
     parser.add_argument("--quick", action="store_true", help="2 rounds, 128 and 512 points, fewer crops: a trial")
-    parser.add_argument("--sizes", nargs="+", choices=SIZES, default=list(SIZES), help="of the package's networks")
+    parser.add_argument("--sizes", nargs="+", choices=NETWORKS, default=list(NETWORKS), help="networks to measure")
     parser.add_argument("--sections", nargs="+", choices=SECTIONS, default=list(SECTIONS))
     parser.add_argument("--no-onnx", action="store_true", help="without ONNX, whose export takes a minute")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
@@ -274,8 +274,8 @@ def parsed(arguments: list[str] | None = None) -> argparse.Namespace:
         parser.error("--device cuda: torch finds no such device here")
     if options.json is not None and not options.json.resolve().parent.is_dir():
         parser.error(f"--json: the folder {options.json.resolve().parent} does not exist")
-    # each size once, in the order of SIZES
-    options.sizes = [size for size in SIZES if size in options.sizes]
+    # each size once, in the order of NETWORKS
+    options.sizes = [size for size in NETWORKS if size in options.sizes]
     options.rounds = options.rounds or (2 if options.quick else 5)
     options.points = (128, 512) if options.quick else POINTS
     options.scaling_points = (128, 512) if options.quick else SCALING_POINTS

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from runners import BATCH, DRAFT, PAPER_BATCH, SIZES, Runner
+from runners import BATCH, DRAFT, NETWORKS, PAPER_BATCH, Runner
 from speed_tables import asked, rate, shown
 
 MEBIBYTE = 1 << 20
@@ -127,7 +127,7 @@ class Report:
         pairs = []
         for size, draft in draft_by_size.items():
             pairs += [(size, other) for other in (draft, f"ViT as {size}", f"PointNet++ as {size}")]
-        pairs += [(f"{size} ONNX", size) for size in SIZES[:3]] + [("tiny", "small"), ("small", "base")]
+        pairs += [(f"{size} ONNX", size) for size in NETWORKS[:3]] + [("tiny", "small"), ("small", "base")]
         pairs += [("tiny", "paper")]
         columns = (*self.options.points, CROPS)
         rows = []

@@ -19,7 +19,7 @@ import torch
 from backbones import Draft, GroupedViT, PointNet2, count
 from torch import nn
 
-from lidarpose.models.config import preset
+from lidarpose.models.config import SIZES
 from lidarpose.models.onnx import voxelize_people
 from lidarpose.models.posenet import Batch, PoseNet
 from lidarpose.skeleton import BODY26
@@ -31,7 +31,7 @@ from lidarpose.train.objectives.posenet_objective import PoseNetObjective
 from lidarpose.train.optim import average, optimizers
 from lidarpose.train.recipes import Pretrain
 
-SIZES = ("tiny", "small", "base", "paper")
+NETWORKS = ("tiny", "small", "base", "paper")
 # median points per person of crops as in training
 CROP_POINTS = 170
 # people per batch; the paper's network is a hundred times as large
@@ -143,7 +143,7 @@ class Ours(Runner):
 
     def __init__(self, size: str, device: str = "cpu"):
         torch.manual_seed(0)
-        self.config = preset(size)
+        self.config = SIZES[size]
         self.task = PoseNetObjective(config=self.config)
         super().__init__(size, PoseNet(self.config), device)
         self.mean = {name: value.detach().clone() for name, value in self.network.named_parameters()}
@@ -307,7 +307,7 @@ def _distance(joints: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
 def baselines(size: str) -> dict[str, Callable[[], nn.Module]]:
     """By name, the baselines for a size of our network, with about the same number of parameters."""
     kinds = {"ViT": GroupedViT, "PointNet++": PointNet2}
-    parameters = count(PoseNet(preset(size)))
+    parameters = count(PoseNet(SIZES[size]))
     factories = {
         f"{name} as {size}": (lambda kind=kind: kind.of_parameters(parameters)) for name, kind in kinds.items()
     }
@@ -316,7 +316,7 @@ def baselines(size: str) -> dict[str, Callable[[], nn.Module]]:
 
 def runner(name: str, device: str = "cpu") -> Runner:
     """A runner by name, except for ONNX and predictor runners. Raises ImportError if its code is missing."""
-    if name in SIZES:
+    if name in NETWORKS:
         return Paper(device) if name == "paper" else Ours(name, device)
     factories = baselines("tiny") | baselines("small")
     torch.manual_seed(0)

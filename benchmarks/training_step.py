@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from lidarpose.models.config import SIZES, preset
+from lidarpose.models.config import SIZES
 from lidarpose.models.posenet import Batch, PoseNet, Targets
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("--size", choices=SIZES, default="tiny")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    config = preset(options.size)
+    config = SIZES[options.size]
     generator = Generator(scene=scene_config("wild"), measure=False)
     generator.person(0, 0)
     times_by_threads: dict[int, list[float]] = {1: [], 2: []}

@@ -9,7 +9,7 @@ import pytest
 import torch
 from test_results import benchmark
 
-from lidarpose.models.config import preset
+from lidarpose.models.config import SIZES
 from lidarpose.skeleton import BODY26
 from lidarpose.synth.generator import Generator
 from lidarpose.train.augment import example
@@ -44,7 +44,7 @@ def terms_of(objective, people):
 @pytest.mark.parametrize("name", NAMES)
 def test_variant_losses_give_gradients_to_all_weights(ablations, people, name):
     variant = ablations.VARIANTS[name]
-    objective = variant.objective(config=preset("tiny"), made=variant.network)
+    objective = variant.objective(config=SIZES["tiny"], made=variant.network)
     torch.manual_seed(0)
     network = objective.network()
     total(objective.terms(network, objective.collate(people))).backward()
@@ -64,7 +64,7 @@ def test_mirrored_twice_restores_example(objectives, people):
 
 
 def test_mirrored_pairs_consistency_loss_measures_asymmetry(objectives, people):
-    objective = objectives.MirroredPairs(config=preset("tiny"))
+    objective = objectives.MirroredPairs(config=SIZES["tiny"])
     arrays = objective.collate(people)
     joints = torch.as_tensor(arrays["joints"])
 
@@ -98,7 +98,7 @@ def test_mirrored_pairs_validates_all_people_unmirrored(ablations, people):
 
 
 def test_hardest_people_weights_large_errors_more(objectives, people):
-    config = preset("tiny")
+    config = SIZES["tiny"]
     plain = terms_of(objectives.VariantObjective(config=config), people)
     found = terms_of(objectives.HardestPeople(config=config), people)
     assert found["mpjpe"] == plain["mpjpe"]
@@ -106,7 +106,7 @@ def test_hardest_people_weights_large_errors_more(objectives, people):
 
 
 def test_point_joints_losses_of_clutter_and_unlabeled_points(objectives, people):
-    config = preset("tiny")
+    config = SIZES["tiny"]
     objective = objectives.PointJoints(config=config, made=objectives.with_point_joints)
     arrays = objective.collate(people)
     torch.manual_seed(0)
@@ -118,7 +118,7 @@ def test_point_joints_losses_of_clutter_and_unlabeled_points(objectives, people)
 
 
 def test_local_refinement_starts_equal_to_votes(objectives, people):
-    config = preset("tiny")
+    config = SIZES["tiny"]
     objective = objectives.PointJoints(config=config, made=objectives.with_local_refinement)
     arrays = objective.collate(people)
     network = objective.network().eval()

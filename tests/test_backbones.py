@@ -5,13 +5,13 @@ import pytest
 import torch
 from scripts import load_script
 
-from lidarpose.models.config import preset
+from lidarpose.models.config import SIZES
 from lidarpose.models.posenet import PoseNet
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 backbones = load_script("benchmarks/backbones.py")
 KINDS = (backbones.Draft, backbones.GroupedViT, backbones.PointNet2)
-SIZES = (1, 40, 300)
+POINT_COUNTS = (1, 40, 300)
 
 
 @pytest.fixture(scope="module", params=KINDS, ids=lambda kind: kind.__name__)
@@ -33,7 +33,7 @@ def run(network, clouds):
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_of_parameters_matches_requested_count(kind):
     for size in ("tiny", "small"):
-        due = backbones.count(PoseNet(preset(size)))
+        due = backbones.count(PoseNet(SIZES[size]))
         assert backbones.count(kind.of_parameters(due)) == pytest.approx(due, rel=0.1)
     # the size of the draft that was measured
     assert backbones.count(backbones.Draft()) == pytest.approx(1.2e6, rel=0.1)
@@ -42,9 +42,9 @@ def test_of_parameters_matches_requested_count(kind):
 
 
 def test_joints_independent_of_batch_and_finite_for_few_points(network):
-    clouds = [person(n, n) for n in SIZES]
+    clouds = [person(n, n) for n in POINT_COUNTS]
     together = run(network, clouds)
-    assert together.shape == (len(SIZES), 26, 3)
+    assert together.shape == (len(POINT_COUNTS), 26, 3)
     for k, cloud in enumerate(clouds):
         torch.testing.assert_close(together[k : k + 1], run(network, [cloud]), atol=1e-5, rtol=1e-4)
     for few in ([person(1)], [person(0), person(3)], [np.ones((50, 3), np.float32)]):
@@ -73,7 +73,7 @@ def test_grouped_collects_points_within_radius():
 
 
 def test_draft_pools_each_voxel_into_its_own_parent():
-    tables = backbones.Draft().prepare([person(n, n) for n in SIZES])
+    tables = backbones.Draft().prepare([person(n, n) for n in POINT_COUNTS])
     for level, above in zip(tables.levels, tables.levels[1:], strict=False):
         assert sorted(set(level.children.flatten().tolist())) == list(range(len(level.position)))
         for parent, children in enumerate(level.children):

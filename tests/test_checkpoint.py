@@ -25,7 +25,7 @@ from lidarpose.models.checkpoint import (
     save_checkpoint,
     with_digest,
 )
-from lidarpose.models.config import preset
+from lidarpose.models.config import SIZES
 from lidarpose.models.dapt.dapt_config import DaptConfig
 from lidarpose.models.dapt.dapt_net import DaptNet
 from lidarpose.models.dapt.import_weights import import_released
@@ -38,7 +38,7 @@ CARD = {"command": "lidarpose pretrain run", "people_seen": 12, "scores": {"mpjp
 @pytest.fixture(scope="module")
 def network():
     torch.manual_seed(0)
-    return PoseNet(preset("tiny"))
+    return PoseNet(SIZES["tiny"])
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import torch
 from lidarpose.errors import InputError
 from lidarpose.models import bundled_path
 from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
-from lidarpose.models.config import preset
+from lidarpose.models.config import SIZES
 from lidarpose.models.expand import expand_weights
 from lidarpose.models.posenet import Batch, PoseNet
 from lidarpose.synth.generator import Generator
@@ -27,7 +27,7 @@ def arrays():
     generator, rng = Generator(scene=scene_config("wild"), measure=False), np.random.default_rng(0)
     people = [example(generator.person(77, k).sample, rng, pelvis_centered=0.0) for k in range(24)]
     # with the neighbor tables of convolutions, which other networks ignore
-    return PoseNetObjective(config=preset("tiny")).collate(people)
+    return PoseNetObjective(config=SIZES["tiny"]).collate(people)
 
 
 def outputs_of(network, arrays):
@@ -39,7 +39,7 @@ def outputs_of(network, arrays):
 @pytest.mark.parametrize("heatmap", ["window", "full", "none"])
 def test_expand_weights_keeps_outputs(arrays, heatmap):
     torch.manual_seed(0)
-    config = replace(preset("tiny"), heatmap=heatmap, convolution=0)
+    config = replace(SIZES["tiny"], heatmap=heatmap, convolution=0)
     small = PoseNet(config)
     larger = expand_weights(small, replace(config, size="deep", blocks=(2, 3, 2), convolution=8))
     before, after = outputs_of(small, arrays), outputs_of(larger, arrays)
@@ -53,23 +53,23 @@ def test_expand_weights_tiny_to_small_keeps_joints(arrays):
     torch.manual_seed(0)
     before, after = (
         outputs_of(network, arrays).joints(),
-        outputs_of(expand_weights(network, preset("small")), arrays).joints(),
+        outputs_of(expand_weights(network, SIZES["small"]), arrays).joints(),
     )
     true = torch.as_tensor(arrays["joints"])
     errors = [float((joints - true).norm(dim=-1).mean()) for joints in (before, after)]
     moved = float((after - before).norm(dim=-1).mean())
     assert moved < 0.02 * errors[0] and errors[1] < 1.05 * errors[0], (moved, errors)
     # a network with random weights predicts other joints
-    assert (outputs_of(PoseNet(preset("small")), arrays).joints() - before).norm(dim=-1).mean() > 0.2
+    assert (outputs_of(PoseNet(SIZES["small"]), arrays).joints() - before).norm(dim=-1).mean() > 0.2
 
 
 @pytest.mark.long
 def test_expanded_network_trains_all_weights(arrays):
     torch.manual_seed(0)
     network, _ = load_checkpoint(bundled_path("tiny"))
-    larger = expand_weights(network, preset("small"))
+    larger = expand_weights(network, SIZES["small"])
     before = {name: value.clone() for name, value in larger.named_parameters()}
-    steppers, objective = optimizers(larger, Pretrain()), PoseNetObjective(config=preset("small"))
+    steppers, objective = optimizers(larger, Pretrain()), PoseNetObjective(config=SIZES["small"])
     for _ in range(3):
         terms = objective.terms(larger, arrays)
         total(terms).backward()
@@ -86,7 +86,7 @@ def test_expanded_network_trains_all_weights(arrays):
 
 
 def test_expand_weights_rejects_incompatible_configs():
-    tiny = PoseNet(preset("tiny"))
+    tiny = PoseNet(SIZES["tiny"])
     for change, words in (
         ({"channels": (32, 64, 96)}, "must not shrink"),
         ({"blocks": (1, 0, 1)}, "must not shrink"),
@@ -97,18 +97,18 @@ def test_expand_weights_rejects_incompatible_configs():
         ({"convolution": 16}, "convolution is 16 instead of 12"),
     ):
         with pytest.raises(InputError, match=words):
-            expand_weights(tiny, replace(preset("tiny"), **change))
+            expand_weights(tiny, replace(SIZES["tiny"], **change))
 
 
 def test_pretrain_initializes_from_smaller_network(tmp_path):
     setup = make_setup(Pretrain(size="small", init="tiny"))
     torch.manual_seed(0)
     network = setup.network()
-    assert network.config == preset("small") and network.training
+    assert network.config == SIZES["small"] and network.training
     assert setup.card["init_card"]["people_seen"] > 0
     torch.manual_seed(0)
     assert all(map(torch.equal, network.state_dict().values(), setup.network().state_dict().values()))
-    assert make_setup(Pretrain(size="base", init="tiny")).network().config == preset("base")
+    assert make_setup(Pretrain(size="base", init="tiny")).network().config == SIZES["base"]
     with pytest.raises(InputError, match="dapt starts from random weights"):
         make_setup(Pretrain(size="paper-small", init="tiny"))
     path = tmp_path / "small.safetensors"

@@ -75,7 +75,7 @@ def test_charts_draw_metric_rows(monkeypatch):
     rows = metric_rows.metric_rows(predictions, setting)
     result = Result(setting=setting, counts={}, skipped={}, notes=(), lines=rows)
     figures = []
-    monkeypatch.setattr(charts, "png_of", lambda figure, path: figures.append(figure) or b"")
+    monkeypatch.setattr(charts, "png_of", lambda figure: figures.append(figure) or b"")
     charts.draw_errors(result)
     charts.draw_reliability(predictions, result)
     by_group = dict(zip(("distance, m", "points", "hidden share", "joints"), figures[0].axes, strict=True))

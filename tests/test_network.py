@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
-from lidarpose.models.config import BIN, NetworkConfig, preset
+from lidarpose.models.config import BIN, SIZES, NetworkConfig
 from lidarpose.models.decode import HALF_WIDTH
 from lidarpose.models.decode import window as window_mean
 from lidarpose.models.layers import (
@@ -41,7 +41,7 @@ from lidarpose.train.objectives.posenet_objective import MAX_VOXELS, SIGMA, Pose
 from lidarpose.train.optim import optimizers
 from lidarpose.train.recipes import Pretrain
 
-TINY = preset("tiny")
+TINY = SIZES["tiny"]
 TINY_PARAMETERS = 456_371
 WINDOW = REACH["window"]
 BINS = round(2 * WINDOW / BIN)
@@ -175,13 +175,11 @@ def test_network_config_rejects_invalid_values(change, message):
     assert NetworkConfig(**SMALL_ONE).blocks == (1, 0, 1)
     # older files have false instead of a number
     assert NetworkConfig(**SMALL_ONE | {"convolution": False}).convolution == 0
-    with pytest.raises(InputError, match="unknown network size 'huge'.*tiny"):
-        preset("huge")
 
 
 @pytest.mark.parametrize("size, parameters", [("tiny", TINY_PARAMETERS), ("small", 1_452_054), ("base", 5_509_087)])
 def test_posenet_sizes(size, parameters):
-    config = preset(size)
+    config = SIZES[size]
     assert NetworkConfig(**config.to_dict()) == config
     network = PoseNet(config)
     assert sum(p.numel() for p in network.parameters()) == parameters

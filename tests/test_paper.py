@@ -713,7 +713,7 @@ def _study(scale):
 @pytest.mark.parametrize("name", ["fig7", "fig8"])
 def test_fig7_and_fig8_draw_several_networks(tmp_path, name, monkeypatch):
     drawn, png_of = [], charts.png_of
-    monkeypatch.setattr(charts, "png_of", lambda figure, path: drawn.append(figure) or png_of(figure, path))
+    monkeypatch.setattr(charts, "png_of", lambda figure: drawn.append(figure) or png_of(figure))
     selected = cells(TABLES[name], Options(), ["dapt", "ours"])
     for scale, cell in enumerate(selected, 1):
         folder = cell.evaluation.product(tmp_path)
@@ -744,7 +744,7 @@ def test_fig7_is_drawn_from_copied_cells(tmp_path):
 
 
 def test_compare_stability_aligns_amounts_without_poses(monkeypatch):
-    monkeypatch.setattr(charts, "png_of", lambda figure, _: figure)
+    monkeypatch.setattr(charts, "png_of", lambda figure: figure)
     whole, gap = _study(1), _study(2)
     for curve in gap["curves"]:
         curve["points"][1]["mpjpe"] = None
@@ -765,7 +765,7 @@ def _drawn_alone(name, selected, out):
 
 def test_fig6_draws_one_body_at_all_distances(tmp_path, monkeypatch, capsys):
     drawn = []
-    monkeypatch.setattr(figures, "draw_people", lambda panels, *_, **__: drawn.extend(panels))
+    monkeypatch.setattr(figures, "draw_people", lambda panels, **_: drawn.extend(panels) or b"PNG")
     assert main(["paper", "fig6", "--out", str(tmp_path / "out")]) == 0
     bodies = np.array([panel.truth.joints - panel.truth.joints[0] for panel in drawn])
     # the same body and rotation: masks and distances change only the points

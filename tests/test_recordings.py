@@ -199,7 +199,7 @@ def test_unfinished_file_of_other_frames_raises(drive, folder, monkeypatch, tmp_
     steps = FramePredictor(crop=True, model=lidarpose.load("tiny", tta=1))
     frame = Frame(points=np.ones((9, 3)), index=0, id="gone", time=0.0)
     with output.PartFile(tmp_path / "a.jsonl", {}) as part:
-        part.append(steps.predict(frame), steps.state(), 0)
+        part.append(next(steps.predict_all(iter([frame]))), steps.state(), 0)
         written = part.path.read_bytes()
         # opening it a second time fails, with the same command and with another
         for command in ({}, {"min_score": 0.1}):
@@ -759,7 +759,7 @@ def test_full_disk_error_names_file(tmp_path, monkeypatch):
     steps = FramePredictor(crop=True, model=lidarpose.load("tiny", tta=1))
     frame = Frame(points=np.ones((9, 3)), index=0, id="a", time=0.0)
     with output.PartFile(tmp_path / "a.jsonl", {}) as part:
-        poses = steps.predict(frame)
+        poses = next(steps.predict_all(iter([frame])))
 
         def full(*_):
             raise OSError(errno.ENOSPC, "No space left on device")

@@ -24,7 +24,7 @@ from lidarpose.errors import InputError
 from lidarpose.io.atomic import LOCK
 from lidarpose.models import weights_path
 from lidarpose.models.checkpoint import load_checkpoint
-from lidarpose.models.config import preset
+from lidarpose.models.config import SIZES
 from lidarpose.models.posenet import PoseNet
 from lidarpose.train import loop, run_dir, setup
 from lidarpose.train.data_loader import SyntheticSource, lanes_of
@@ -36,7 +36,7 @@ from lidarpose.train.recipes import Pretrain
 # people per chunk; a run has three chunks
 CHUNK = BATCHES * 2
 RECIPE = Pretrain(scene="paper", people=3 * CHUNK, batch=2, workers=0, seed=5, easy=0.15, pictures=0, validate=1000)
-TINY = preset("tiny")
+TINY = SIZES["tiny"]
 
 
 def log_of(folder):

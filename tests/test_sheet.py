@@ -154,9 +154,8 @@ def pixels(png):
     return imread(io.BytesIO(png))[..., :3]
 
 
-def test_draw_scans_shows_boxes_poses_and_tracks(tmp_path):
-    png = draw_scans([panel()], tmp_path / "scan.png", title="one")
-    assert (tmp_path / "scan.png").read_bytes() == png
+def test_draw_scans_shows_boxes_poses_and_tracks():
+    png = draw_scans([panel()], title="one")
     # boxes are red, skeletons blue, tracks orange
     bare = pixels(draw_scans([panel(boxes=(), poses=None, tracks=())], title="one"))
     added = pixels(png)
@@ -164,8 +163,6 @@ def test_draw_scans_shows_boxes_poses_and_tracks(tmp_path):
     for color in ((0.70, 0.15, 0.12), (0.0, 0.45, 0.70), (0.88, 0.44, 0.0)):
         near = [(np.abs(image - color).max(-1) < 0.1).sum() for image in (bare, added)]
         assert near[1] > near[0] + 5, color
-    with pytest.raises(InputError, match="ends in .png"):
-        draw_scans([panel()], tmp_path / "scan.jpg")
 
 
 @pytest.mark.long

@@ -15,7 +15,7 @@ import torch
 from motion_files import a_clip, write_amass
 
 from lidarpose.errors import InputError
-from lidarpose.models.config import BIN, preset
+from lidarpose.models.config import BIN, SIZES
 from lidarpose.models.layers import REACH, encode
 from lidarpose.models.posenet import Outputs, PoseNet, Targets
 from lidarpose.sample import center_of
@@ -44,7 +44,7 @@ from lidarpose.train.validation import validate
 
 # three chunks of `BATCHES` batches
 RECIPE = Pretrain(scene="paper", people=3 * BATCHES * 2, batch=2, workers=0, seed=5, easy=0.15, pictures=0)
-TINY = preset("tiny")
+TINY = SIZES["tiny"]
 OBJECTIVE = PoseNetObjective(config=TINY)
 WINDOW = REACH["window"]
 BINS = round(2 * WINDOW / BIN)

@@ -4,8 +4,8 @@ import difflib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from math import isfinite
-from numbers import Integral
-from typing import Any
+from numbers import Integral, Real
+from typing import Any, TypeGuard
 
 
 class LidarPoseError(Exception):
@@ -104,3 +104,8 @@ def first_names(names: Sequence[str], most: int = 3) -> str:
 def counted(number: int, one: str, many: str | None = None) -> str:
     """ "1 frame", "1,200 frames"; many: the plural if it is not formed with "s"."""
     return f"{number:,} {one if number == 1 else many or one + 's'}"
+
+
+def is_number(value: object) -> TypeGuard[float]:
+    """Whether a value is a real number of Python or numpy; truth values are not."""
+    return isinstance(value, Real) and not isinstance(value, bool)

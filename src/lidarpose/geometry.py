@@ -104,14 +104,9 @@ def nearest_rotation(R: np.ndarray) -> np.ndarray:
 
 def quaternion_to_matrix(quaternion: np.ndarray) -> np.ndarray:
     """The rotation matrix (3, 3) of a quaternion (4,) w, x, y, z of any length > 0."""
-    w, x, y, z = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
 
 
 def unit(vector: np.ndarray) -> np.ndarray:

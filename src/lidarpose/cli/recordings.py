@@ -41,7 +41,9 @@ def _predict(predict_scan: Callable[[argparse.Namespace], None], options: argpar
     if not _is_recording(options):
         predict_scan(options)
         return
-    formats = (options.format,) if options.format else ("jsonl", "csv", "parquet")
+    from lidarpose.recording.result_files import FORMATS
+
+    formats = (options.format,) if options.format else FORMATS
     outputs = output_paths(options, _name_of(options.source), formats)
     _predict_recording(options, *outputs, prediction_options(options))
 

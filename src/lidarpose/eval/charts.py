@@ -54,7 +54,7 @@ def draw_errors(result: Result) -> bytes:
             elif value < axes.get_ylim()[1] * 1.6:
                 axes.set_ylim(0, max(axes.get_ylim()[1], value * 1.12))
                 _level(axes, value, method.removeprefix(BASELINE), ORANGE)
-    return png_of(figure, None)
+    return png_of(figure)
 
 
 def draw_reliability(predictions: Predictions, result: Result) -> bytes | None:
@@ -77,7 +77,7 @@ def draw_reliability(predictions: Predictions, result: Result) -> bytes | None:
     left_axes, right_axes = (figure := _figure(9.0, 4.3, title, setting.summary)).subplots(1, 2)
     _confidence(left_axes, confidence, error < 1e3 * CONFIDENCE_RADIUS, result)
     _spread(right_axes, spread * 1e3, error)
-    return png_of(figure, None)
+    return png_of(figure)
 
 
 def draw_stability(study: Stability) -> bytes:
@@ -100,7 +100,7 @@ def draw_stability(study: Stability) -> bytes:
         _end_joints(next(axes), study.ends)
     for unused_axes in axes:
         unused_axes.set_axis_off()
-    return png_of(figure, None)
+    return png_of(figure)
 
 
 def compare_stability(studies: dict[str, dict[str, Any]]) -> bytes:
@@ -123,7 +123,7 @@ def compare_stability(studies: dict[str, dict[str, Any]]) -> bytes:
         _styled(axes, title)
     # below the axes, where it cannot cover a curve
     figure.legend(*axes.get_legend_handles_labels(), fontsize=8, frameon=False, ncols=3, loc="outside lower center")
-    return png_of(figure, None)
+    return png_of(figure)
 
 
 def compare_ends(studies: dict[str, dict[str, Any]]) -> bytes:
@@ -146,7 +146,7 @@ def compare_ends(studies: dict[str, dict[str, Any]]) -> bytes:
         axes.set_xticks(np.arange(len(ends)), [f"{end['group']}\nworst {end['worst']:,}" for end in ends])
     _styled(axes, "means; lines from the lower to the upper quartile")
     axes.legend(fontsize=8, frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, -0.32))
-    return png_of(figure, None)
+    return png_of(figure)
 
 
 def _scored(people: str, study: dict[str, Any]) -> str:

@@ -8,12 +8,11 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from numbers import Real
 from typing import Any
 
 import numpy as np
 
-from lidarpose.errors import InputError, check_int
+from lidarpose.errors import InputError, check_int, is_number
 from lidarpose.geometry import UP_AXES, rotation_about, up_text
 from lidarpose.inference.background import is_static, read_background
 from lidarpose.inference.checks import flat_along_another_axis, scan_unit_warning, unlikely_origin
@@ -57,9 +56,9 @@ class Search:
     exact_up: bool = False
 
     def __post_init__(self):
-        if not _is_number(self.max_range) or not 0 < self.max_range < np.inf:
+        if not is_number(self.max_range) or not 0 < self.max_range < np.inf:
             raise InputError(f"max_range: expected meters, more than 0, got {self.max_range!r}")
-        if self.min_score is not None and not (_is_number(self.min_score) and 0 <= self.min_score <= 1):
+        if self.min_score is not None and not (is_number(self.min_score) and 0 <= self.min_score <= 1):
             raise InputError(f"min_score: expected a probability from 0 to 1, got {self.min_score!r}")
         if self.max_people is not None:
             check_int("max_people", self.max_people, least=1)
@@ -363,7 +362,3 @@ def _in_input(box: Box, scan: Scan, input_scan: Scan) -> Box:
         size = np.abs(rotation_about("z", yaw).T @ R_boxes_level @ rotation_about("z", box.yaw)) @ box.size
     center = input_scan.R_boxes_input.T @ center
     return rounded(replace(box, center=center, size=size, yaw=yaw))
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool)

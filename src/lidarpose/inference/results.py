@@ -360,11 +360,14 @@ class Poses(Sequence[PersonPose]):
         from lidarpose.viz.bird_eye import draw_scan_and_people
         from lidarpose.viz.draw import draw_people
 
+        if path is not None:
+            check_suffix(path, ".png")
         title = title or (self.source or "")
         panels, scan = panels_of(self)
-        if scan is None:
-            return Picture(draw_people(panels, path, title=title))
-        return Picture(draw_scan_and_people(scan, panels, path, title=title))
+        png = draw_people(panels, title=title) if scan is None else draw_scan_and_people(scan, panels, title=title)
+        if path is not None:
+            write_atomic(path, png)
+        return Picture(png)
 
     def html(self, path: str | Path | None = None, *, title: str = "") -> str:
         """An HTML page with interactive 3D views of all people; also written to `path` if given.
@@ -372,14 +375,16 @@ class Poses(Sequence[PersonPose]):
         For a scan with boxes or detected people, a view of the scan is placed above them.
         """
         from lidarpose.inference.result_panels import panels_of
-        from lidarpose.viz.html import render_report, write_report
+        from lidarpose.viz.html import render_report
 
-        title = title or (self.source or "lidarpose")
+        if path is not None:
+            check_suffix(path, ".html", ".htm")
         panels, scan = panels_of(self)
         scans = [] if scan is None else [scan]
+        text = render_report(panels, title=title or (self.source or "lidarpose"), summary=[], scans=scans)
         if path is not None:
-            return write_report(path, panels, title=title, summary=[], scans=scans)
-        return render_report(panels, title=title, summary=[], scans=scans)
+            write_atomic(path, text.encode("utf-8", "replace"))
+        return text
 
 
 def _rounded(values: np.ndarray | None, digits: int) -> list:

@@ -167,9 +167,3 @@ SIZES = {
     "small": NetworkConfig(size="small", channels=(64, 96, 160), head_channels=32, blocks=(2, 2, 2), convolution=12),
     "base": NetworkConfig(size="base", channels=(96, 192, 288), head_channels=32, blocks=(2, 3, 2), convolution=12),
 }
-
-
-def preset(size: str) -> NetworkConfig:
-    """The configuration of a named size."""
-    check_name("network size", size, SIZES)
-    return SIZES[size]

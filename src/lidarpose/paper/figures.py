@@ -109,7 +109,8 @@ def draw_one_body(out: Path, *, motion: str | None = None) -> Path:
             truth = None if joints is None else Pose(joints=joints, skeleton=SMPL24)
             label = f"{distance:g} m, r_keep {keep:g}"
             panels.append(Panel(points=sample.points, truth=truth, part=sample.part, label=label))
-    draw_people(panels, out / "fig6.png", title="one body at several distances, with several masks", per_row=len(_KEPT))
+    picture = draw_people(panels, title="one body at several distances, with several masks", per_row=len(_KEPT))
+    write_atomic(out / "fig6.png", picture)
     return out / "fig6.png"
 
 

@@ -282,10 +282,6 @@ class FramePredictor:
             yield self._predicted(frame, scan)
         self.check_boxes(last)
 
-    def predict(self, frame: Frame | DamagedFrame) -> FramePoses:
-        """Poses the next frame."""
-        return self._predicted(frame, self._prepared(frame))
-
     def _prepared(self, frame: Frame | DamagedFrame) -> Scan | DetectedScan | InputError:
         """The steps that do not depend on other frames: returns the scan, with detections if people are searched for,
         or the error."""

@@ -42,6 +42,8 @@ _INTENSITY_DROPOUT, _RING_BIAS = 0.6, 0.008
 _RINGS = 256
 # errors of a detector's box in `samples`: center m, size m, yaw rad
 _OFF, _GROWN, _TURNED = 0.06, (0.0, 0.2), 0.08
+# minimum number of points of a person in `samples`
+_LEAST_IN_CROP = 15
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -335,8 +337,8 @@ def _scan_turn(
 # --- people of a street as samples
 
 
-def samples(scene: Street, rng: np.random.Generator, *, least: int = 15) -> list[tuple[int, Sample]]:
-    """(frame, sample) of all people with at least `least` points in the crop; its box has a detector's errors.
+def samples(scene: Street, rng: np.random.Generator) -> list[tuple[int, Sample]]:
+    """(frame, sample) of all people with at least 15 points in the crop; its box has a detector's errors.
 
     The box's id is the track id; frame_id is "frame/track".
     """
@@ -348,7 +350,7 @@ def samples(scene: Street, rng: np.random.Generator, *, least: int = 15) -> list
             box = Box(center=center, size=label.size + extra_size, yaw=label.yaw + yaw_error, id=label.id)
             is_inside = box.contains(frame.points)
             is_person = is_inside & (frame.person == track)
-            if np.count_nonzero(is_person) < least:
+            if np.count_nonzero(is_person) < _LEAST_IN_CROP:
                 continue
             points = frame.points[is_inside]
             sample = Sample(

@@ -86,7 +86,7 @@ def pretraining_network(recipe: Pretrain) -> tuple[Any, Skeleton]:
         raise InputError(f"whole_scans {reason}: omit whole_scans or {'shards' if recipe.shards else recipe.size}")
     if (recipe.neck, recipe.head, recipe.drop_path) != ("mde", "coordinates", None):
         config = _with_neck_and_head(recipe, config)
-    _check_rates(recipe, config)
+    check_rates(recipe, config)
     return _with_options(config, recipe.options), joints
 
 
@@ -128,15 +128,6 @@ def finetuned_network(
 
     trained: the network to start from, None for random weights.
     """
-    config, make = _finetuned_network(recipe, trained, joints, dataset)
-    _check_rates(recipe, config)
-    return config, make
-
-
-def _finetuned_network(
-    recipe: Finetune, trained: Any, joints: Skeleton, dataset: str
-) -> tuple[Config, Callable[[], nn.Module]]:
-    """`finetuned_network` without a check of the learning rates."""
     base_config = PRETRAINED[recipe.size][0] if trained is None else trained.config
     # keep_anchors for the package's own networks has its own error below, which says what to do instead
     dapt_settings = ("neck", "head", "keep_anchors") if isinstance(base_config, BaselineConfig) else ("neck", "head")
@@ -184,7 +175,7 @@ def _finetuned_network(
     return config, partial(transferred, trained, config, keep_anchors=recipe.keep_anchors)
 
 
-def _check_rates(recipe: Pretrain | Finetune, config: Config) -> None:
+def check_rates(recipe: Pretrain | Finetune, config: Config) -> None:
     """Raises InputError for a learning rate of layers that the network does not have."""
     if recipe.heatmap_rate != 1 and not (isinstance(config, DaptConfig) and config.bins):
         raise InputError(f"heatmap_rate is for the paper's network with heatmaps, {config.name} has none: omit it")

@@ -34,7 +34,14 @@ from lidarpose.train.augment import Augmentation, ClipExample, Example, augmenta
 from lidarpose.train.data_loader import BATCHES, ClipSource, MixedSource, Source, StoredSource, SyntheticSource
 from lidarpose.train.detector.candidate_source import SceneSource, draw_candidates, scan_example, validation_scans
 from lidarpose.train.detector.crop_source import draw_crops, scan_crops, validation_crops
-from lidarpose.train.networks import Config, expanded_network, finetuned_network, initial_network, pretraining_network
+from lidarpose.train.networks import (
+    Config,
+    check_rates,
+    expanded_network,
+    finetuned_network,
+    initial_network,
+    pretraining_network,
+)
 from lidarpose.train.objectives.detector_objective import DetectorObjective, missed_people
 from lidarpose.train.objectives.objective import Objective
 from lidarpose.train.objectives.verifier_objective import VerifierObjective, missed_by_verifier
@@ -291,6 +298,7 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
     dataset = full_dataset.without(held_out_sequences)
     joints = skeleton(dataset.skeleton)
     config, network = finetuned_network(recipe, trained, joints, dataset.dataset)
+    check_rates(recipe, config)
     card |= {"data": folder_names(recipe.data), "held_out_sequences": list(held_out_sequences)}
     source: Source = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=kind)
     if recipe.mix:

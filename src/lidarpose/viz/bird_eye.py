@@ -5,12 +5,10 @@ Drawn with matplotlib's object interface, as in `draw`: no global state is chang
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from lidarpose.arrays import evenly_spaced
-from lidarpose.io.atomic import check_suffix
 from lidarpose.models.detector.ground import Ground, estimate_ground
 from lidarpose.models.detector.proposals import heights_above
 from lidarpose.sample import Box, Pose
@@ -59,43 +57,27 @@ class ScanPanel:
     step: float = 100.0
 
 
-def draw_scan_and_people(
-    scan: ScanPanel, people: Sequence[Panel], path: str | Path | None = None, *, title: str = ""
-) -> bytes:
-    """Draws a scan from above and, below it, a card for each person, as `draw_scans` and `draw_people` do.
-
-    Returns:
-        The PNG's bytes.
-
-    Raises:
-        InputError: a path that does not end in .png or cannot be written.
-    """
+def draw_scan_and_people(scan: ScanPanel, people: Sequence[Panel], *, title: str = "") -> bytes:
+    """Draws a scan from above and, below it, a card for each person, as `draw_scans` and `draw_people` do; returns the
+    PNG's bytes."""
     is_wide = len(people) >= _CARDS_IN_ROW
     pictures = [draw_scans([scan], title=title, panel_width=_WIDE if is_wide else _PANEL)]
-    return stack_pictures([*pictures, draw_people(list(people))] if people else pictures, path)
+    return stack_pictures([*pictures, draw_people(list(people))] if people else pictures)
 
 
-def draw_scans(
-    panels: Sequence[ScanPanel], path: str | Path | None = None, *, title: str = "", panel_width: float = _PANEL
-) -> bytes:
+def draw_scans(panels: Sequence[ScanPanel], *, title: str = "", panel_width: float = _PANEL) -> bytes:
     """Draws scans from above, side by side.
 
     Args:
         panels: at most the first 12 are drawn.
-        path: the PNG is also written to this file.
         title: printed at the top.
         panel_width: width of each panel, inches.
 
     Returns:
         The PNG's bytes.
-
-    Raises:
-        InputError: a path that does not end in .png or cannot be written.
     """
     from matplotlib.figure import Figure
 
-    if path is not None:
-        check_suffix(path, ".png")
     panels = list(panels)[:MAX_SCANS]
     columns = min(2, max(len(panels), 1))
     rows = max(-(-len(panels) // columns), 1)
@@ -120,7 +102,7 @@ def draw_scans(
         place = ((column * panel_width + 0.55) / width, (height - _TITLE - (row + 1) * _PANEL + 0.45) / height)
         size = np.array([panel_width - 0.7, _PANEL - 0.75])
         _draw_panel(figure.add_axes((*place, *size / (width, height))), panel, size)
-    return png_of(figure, path)
+    return png_of(figure)
 
 
 def _draw_panel(ax, panel: ScanPanel, size: np.ndarray) -> None:

@@ -8,12 +8,13 @@ import numpy as np
 from lidarpose.data.dataset_card import CARD, content_count
 from lidarpose.data.shards import DatasetReader, open_dataset
 from lidarpose.errors import InputError
+from lidarpose.io.atomic import check_suffix, write_atomic
 from lidarpose.io.files import check_not_input, file_error
 from lidarpose.sample import Box, LabeledSample, PersonInfo, Pose
 from lidarpose.skeleton import skeleton
 from lidarpose.viz.bird_eye import MAX_SCANS, ScanPanel, draw_scans
 from lidarpose.viz.draw import MAX_PEOPLE, Panel, draw_people
-from lidarpose.viz.html import write_report
+from lidarpose.viz.html import render_report
 
 
 def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out: str | Path | None = None) -> Path:
@@ -39,6 +40,7 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
     name = Path(folder).resolve().name
     path = Path(out) if out is not None else Path(f"{name}.{'html' if html else 'png'}")
     check_not_input(path, dataset.folder / CARD, *dataset.folder.glob("*.parquet"))
+    check_suffix(path, *((".html", ".htm") if html else (".png",)))
     settings = dataset.card.settings
     title = f"{name}: {content_count(dataset.card.count, settings.get('what', 'people'))}"
     if "scene" in settings:
@@ -49,15 +51,16 @@ def draw_dataset(folder: str | Path, *, count: int = 24, html: bool = False, out
     if "frames" in dataset.card.tables:
         streets = [_street_panel(rows, dataset) for rows in _spread(dataset, "frames", min(count, MAX_SCANS))]
         if not html:
-            draw_scans(streets, path, title=title)
+            write_atomic(path, draw_scans(streets, title=title))
             return path
     samples = [(row["index"], dataset.sample(row)) for (row,) in _spread(dataset, dataset.card.people, count)]
     panels = [_panel(index, sample, dataset) for index, sample in samples]
     if html:
         summary = [_summary_row(panel.label, sample) for panel, (_, sample) in zip(panels, samples, strict=True)]
-        write_report(path, panels, title=title, summary=summary, scans=streets)
+        page = render_report(panels, title=title, summary=summary, scans=streets)
+        write_atomic(path, page.encode("utf-8", "replace"))
     else:
-        draw_people(panels, path, title=title)
+        write_atomic(path, draw_people(panels, title=title))
     return path
 
 

@@ -6,13 +6,11 @@ matplotlib is imported only when something is drawn.
 
 import io
 import warnings
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lidarpose.arrays import evenly_spaced
-from lidarpose.io.atomic import check_suffix, write_atomic
 from lidarpose.sample import Pose
 from lidarpose.skeleton import SMPL24
 from lidarpose.viz.person_view import (
@@ -58,9 +56,7 @@ _TALLEST = 1.8  # m: minimum height of a view, so that most people on a sheet ha
 _DEPTH_SPAN = 0.35  # m in front of and behind the middle that the points' gray levels cover
 
 
-def draw_people(
-    panels: list[Panel], path: str | Path | None = None, *, title: str = "", per_row: int = _PER_ROW
-) -> bytes:
+def draw_people(panels: list[Panel], *, title: str = "", per_row: int = _PER_ROW) -> bytes:
     """Draws people from the front and from the side on one sheet.
 
     The front is the facing of the panel, else of the predicted pose, else of the true one, else +x. Left limbs are
@@ -68,20 +64,14 @@ def draw_people(
 
     Args:
         panels: the people; at most the first 60 are drawn, which the sheet then states.
-        path: the PNG is also written to this file.
         title: printed at the top.
         per_row: number of people per row.
 
     Returns:
         The PNG's bytes.
-
-    Raises:
-        InputError: a path that does not end in .png or cannot be written.
     """
     from matplotlib.figure import Figure
 
-    if path is not None:
-        check_suffix(path, ".png")
     panels = list(panels)
     shown_panels = panels[:MAX_PEOPLE]
     columns = min(per_row, max(len(shown_panels), 1))
@@ -105,11 +95,11 @@ def draw_people(
             ax.set_axis_off()
     if not shown_panels:
         _text(figure, 0.5, 0.5, "no people", size=11, color=FAINT, ha="center")
-    return png_of(figure, path)
+    return png_of(figure)
 
 
-def png_of(figure, path: str | Path | None) -> bytes:
-    """A matplotlib figure as the bytes of a PNG, independent of the user's savefig settings; also written to `path`."""
+def png_of(figure) -> bytes:
+    """A matplotlib figure as the bytes of a PNG, independent of the user's savefig settings."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     buffer = io.BytesIO()
@@ -117,17 +107,13 @@ def png_of(figure, path: str | Path | None) -> bytes:
         # characters that the font lacks become boxes, without a warning
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
-    if path is not None:
-        write_atomic(path, buffer.getvalue())
     return buffer.getvalue()
 
 
-def stack_pictures(pictures: list[bytes], path: str | Path | None = None) -> bytes:
-    """Stacks PNGs vertically in one PNG, with white beside the narrower ones; also written to `path`."""
+def stack_pictures(pictures: list[bytes]) -> bytes:
+    """Stacks PNGs vertically in one PNG, with white beside the narrower ones."""
     from PIL import Image
 
-    if path is not None:
-        check_suffix(path, ".png")
     images = [Image.open(io.BytesIO(picture)).convert("RGB") for picture in pictures]
     sheet = Image.new("RGB", (max(i.width for i in images), sum(i.height for i in images)), "white")
     top = 0
@@ -136,8 +122,6 @@ def stack_pictures(pictures: list[bytes], path: str | Path | None = None) -> byt
         top += image.height
     buffer = io.BytesIO()
     sheet.save(buffer, "PNG")
-    if path is not None:
-        write_atomic(path, buffer.getvalue())
     return buffer.getvalue()
 
 

@@ -5,15 +5,13 @@ import math
 from collections.abc import Sequence
 from html import escape
 from importlib import resources
-from numbers import Integral, Real
-from pathlib import Path
-from typing import TypeGuard
+from numbers import Integral
 
 import numpy as np
 
 from lidarpose._version import __version__
 from lidarpose.arrays import evenly_spaced
-from lidarpose.io.atomic import check_suffix, write_atomic
+from lidarpose.errors import is_number
 from lidarpose.sample import Pose, within_reach
 from lidarpose.skeleton import SMPL24, Skeleton
 from lidarpose.viz.bird_eye import ScanPanel
@@ -38,30 +36,16 @@ _FEW_BOXES = 100
 _SCAN_POINTS, _FEWEST_SCAN_POINTS, _NEAR, _SCAN_REACH = 40_000, 15_000, 1.0, 15.0
 
 
-def write_report(
-    path: str | Path, people: list[Panel], *, title: str, summary: list[dict], scans: Sequence[ScanPanel] = ()
-) -> str:
-    """Writes the report to `path` atomically and returns its text.
+def render_report(people: list[Panel], *, title: str, summary: list[dict], scans: Sequence[ScanPanel] = ()) -> str:
+    """The text of an HTML page; deterministic.
 
     Args:
-        path: ends in .html or .htm.
         people: one 3D view each; more than 60,000 points in total are thinned evenly.
         title: printed at the top.
         summary: rows of the table at the top. Its columns are the rows' keys in order of appearance; columns of numbers
             are right-aligned.
         scans: whole scans with all their people, shown first.
-
-    Raises:
-        InputError: for a path with another suffix, or one that cannot be written.
     """
-    check_suffix(path, ".html", ".htm")
-    text = render_report(people, title=title, summary=summary, scans=scans)
-    write_atomic(path, text.encode("utf-8", "replace"))
-    return text
-
-
-def render_report(people: list[Panel], *, title: str, summary: list[dict], scans: Sequence[ScanPanel] = ()) -> str:
-    """The text of the file that `write_report` writes; deterministic."""
     people = list(people)
     skeletons = {pose.skeleton.name: pose.skeleton for p in people for pose in (p.pose, p.truth) if pose is not None}
     panels = [panel for scan in scans for panel in (scan, *scan.frames)]
@@ -200,12 +184,8 @@ def _figure(key: str, kind: str, label: str, caption: str, notes: list[str], pla
     )
 
 
-def _is_number(value: object) -> TypeGuard[float]:
-    return isinstance(value, Real) and not isinstance(value, bool | np.bool_)
-
-
 def _is_missing(value: object) -> bool:
-    return value is None or (_is_number(value) and not math.isfinite(value))
+    return value is None or (is_number(value) and not math.isfinite(value))
 
 
 def _decimals(values: list) -> int:
@@ -224,7 +204,7 @@ def _table(rows: list[dict]) -> str:
     classes, decimals = {}, {}
     for key in columns:
         values = [row[key] for row in rows if not _is_missing(row.get(key))]
-        is_numeric = bool(values) and all(_is_number(v) for v in values)
+        is_numeric = bool(values) and all(is_number(v) for v in values)
         classes[key] = ' class="number"' if is_numeric else ""
         decimals[key] = _decimals(values) if is_numeric else 3
 
@@ -234,7 +214,7 @@ def _table(rows: list[dict]) -> str:
             text = "–"
         elif isinstance(value, bool | np.bool_):
             text = "yes" if value else "no"
-        elif isinstance(value, Integral) or not _is_number(value):
+        elif isinstance(value, Integral) or not is_number(value):
             text = str(value)
         else:
             text = f"{float(value):.{decimals[key]}f}"

@@ -91,7 +91,7 @@ def _sheet(crops: Sequence[_Crop], title: str) -> bytes | None:
         _draw_crop(axes[2 * row, column], crop, right, away)
         _draw_crop(axes[2 * row + 1, column], crop, right, np.array([0, 0, 1.0]))
         axes[2 * row, column].set_title(crop.label, fontsize=7, color=INK, parse_math=False)
-    return png_of(figure, None)
+    return png_of(figure)
 
 
 def _draw_crop(ax, crop: _Crop, right: np.ndarray, up: np.ndarray) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 from lidarpose.geometry import axis_angle_to_matrix
@@ -22,7 +22,7 @@ from lidarpose.models.checkpoint import build
 from lidarpose.models.voxelize import WINDOW
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.train.augment import ClipExample, Example
-from lidarpose.train.objectives.objective import Share, at_least_one, in_body26, on_device, one_process
+from lidarpose.train.objectives.objective import BuiltNetwork, Share, at_least_one, in_body26, on_device, one_process
 
 # a point is labeled with the nearest joint within this distance, m
 LABEL_RADIUS = 0.25
@@ -30,13 +30,10 @@ _COLUMNS = BODY26.map_to(SMPL24)
 
 
 @dataclass(frozen=True, kw_only=True)
-class BaselineObjective:
+class BaselineObjective(BuiltNetwork):
     """The `Objective` of a `Prn` or `Lpformer` with this configuration."""
 
     config: PrnConfig | LpformerConfig
-
-    def network(self) -> nn.Module:
-        return build(self.config)
 
     def collate(self, examples: list[Example]) -> dict[str, np.ndarray]:
         """The arrays of `pad_clouds`; joints (B, J, 3) float32 m about "middle", NaN if unlabeled; radius (B,) float32
@@ -70,13 +67,10 @@ class BaselineObjective:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClipObjective:
+class ClipObjective(BuiltNetwork):
     """The `Objective` of a `Lidarcap` or `Ne` with this configuration."""
 
     config: LidarcapConfig
-
-    def network(self) -> nn.Module:
-        return build(self.config)
 
     def collate(self, examples: list[ClipExample]) -> dict[str, np.ndarray]:
         """For each cloud, NAME (B, T, N, 3): points in m about the frames' centers, and NAME_valid (B, T, N); joints

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from lidarpose.errors import InputError, check_name
 from lidarpose.models.dapt.dapt_config import PARTS, RELEASED_FAULTS, DaptConfig, named_config
-from lidarpose.models.dapt.dapt_net import DaptNet, to_tensors
+from lidarpose.models.dapt.dapt_net import to_tensors
 from lidarpose.models.dapt.voxel_tables import LAYOUTS, Tables, build_tables
 from lidarpose.train.augment import UNKNOWN_PART, Example
 from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, pretraining, prn
-from lidarpose.train.objectives.objective import Share, in_body26, majority_part, one_process
+from lidarpose.train.objectives.objective import BuiltNetwork, Share, in_body26, majority_part, one_process
 from lidarpose.train.recipes import SMALL_PAPER, TINY_PAPER
 
 STAGES = ("pretrain", "finetune")
@@ -50,7 +50,7 @@ class DaptArrays:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DaptObjective:
+class DaptObjective(BuiltNetwork):
     """The `Objective` of a `DaptNet` with this configuration.
 
     stage: "pretrain", which needs coordinates and parts, or "finetune", which learns heatmaps, or coordinates if the
@@ -72,9 +72,6 @@ class DaptObjective:
                 f"pre-training needs coordinates and {PARTS} parts, {config.name} has coordinates={config.coordinates} "
                 f"and parts={config.parts}: see pretraining_config"
             )
-
-    def network(self) -> DaptNet:
-        return DaptNet(self.config)
 
     def collate(self, examples: list[Example]) -> DaptArrays:
         """Collates a batch; one random point per voxel is kept, as in the released code, drawn with the sample's seed.

@@ -15,10 +15,9 @@ from torch.nn import functional as F
 from lidarpose.models.detector.candidates import suppress_near
 from lidarpose.models.detector.detector import SAME, predicted_boxes
 from lidarpose.models.detector.detector_config import INPUTS, DetectorConfig
-from lidarpose.models.detector.network import DetectorNet
 from lidarpose.models.detector.render import render
 from lidarpose.train.detector.candidate_source import IGNORE, NOBODY, DetectorExample
-from lidarpose.train.objectives.objective import Share, at_least_one, on_device, one_process
+from lidarpose.train.objectives.objective import BuiltNetwork, Share, at_least_one, on_device, one_process
 
 # loss weights; distances are in meters
 PERSON, OFFSET, FOOT, HEIGHT, MOUNTED = 1.0, 2.0, 1.0, 1.0, 0.5
@@ -30,13 +29,10 @@ FALSE_PER_SCAN = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class DetectorObjective:
+class DetectorObjective(BuiltNetwork):
     """The `Objective` of a `DetectorNet` with this configuration."""
 
     config: DetectorConfig
-
-    def network(self) -> DetectorNet:
-        return DetectorNet(self.config)
 
     def collate(self, examples: list[DetectorExample]) -> dict[str, np.ndarray]:
         """The network's inputs as float16, which halves the data sent between processes; labels (K, ...) of all scans,

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lidarpose.models.checkpoint import build
 from lidarpose.skeleton import BODY26
 from lidarpose.train.augment import UNKNOWN_PART
 
@@ -47,6 +48,15 @@ class Objective(Protocol):
         """Weighted loss terms by name; their sum is minimized, except for those in `LOGGED`, which are detached.
         network: the network or a wrapper that is called the same way."""
         ...
+
+
+class BuiltNetwork:
+    """Base of objectives whose network is that of `models.NETWORKS` for their configuration."""
+
+    config: Any
+
+    def network(self) -> nn.Module:
+        return build(self.config)
 
 
 class PoseObjective(Objective, Protocol):

@@ -13,12 +13,12 @@ from torch.nn import functional as F
 
 from lidarpose.models.config import BIN, NetworkConfig
 from lidarpose.models.layers import encode
-from lidarpose.models.posenet import Batch, Outputs, PoseNet, Targets
+from lidarpose.models.posenet import Batch, Outputs, Targets
 from lidarpose.models.voxelize import VoxelPyramid, voxelize
 from lidarpose.sample import CONFIDENCE_RADIUS
 from lidarpose.skeleton import BODY26
 from lidarpose.train.augment import Example
-from lidarpose.train.objectives.objective import Share, at_least_one, majority_part, one_process
+from lidarpose.train.objectives.objective import BuiltNetwork, Share, at_least_one, majority_part, one_process
 
 # maximum number of fine voxels per person in training
 MAX_VOXELS = 224
@@ -56,15 +56,12 @@ def training_voxels(
 
 
 @dataclass(frozen=True, kw_only=True)
-class PoseNetObjective:
+class PoseNetObjective(BuiltNetwork):
     """The `Objective` of a `PoseNet` with this configuration. bone, symmetry: weights, see `losses`."""
 
     config: NetworkConfig
     bone: float = 0.0
     symmetry: float = 0.0
-
-    def network(self) -> PoseNet:
-        return PoseNet(self.config)
 
     def collate(self, examples: list[Example]) -> dict[str, np.ndarray]:
         """The arrays of a `VoxelPyramid`, and those of `Targets`."""

@@ -12,11 +12,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from lidarpose.models.config import NetworkConfig
-from lidarpose.models.posenet import Batch, PoseNet
+from lidarpose.models.posenet import Batch
 from lidarpose.train.detector.candidate_source import NOBODY
 from lidarpose.train.detector.crop_source import CropExample
 from lidarpose.train.objectives.detector_objective import average_precision, share_missed
-from lidarpose.train.objectives.objective import Share, at_least_one, one_process
+from lidarpose.train.objectives.objective import BuiltNetwork, Share, at_least_one, one_process
 from lidarpose.train.objectives.posenet_objective import training_voxels
 
 # weight of the loss of "mounted": the person rides or sits in a wheelchair
@@ -26,13 +26,10 @@ _GROUP = 32
 
 
 @dataclass(frozen=True, kw_only=True)
-class VerifierObjective:
+class VerifierObjective(BuiltNetwork):
     """The objective of a `PoseNet` of which only `person` is used: the logits of a person and of a mounted one."""
 
     config: NetworkConfig
-
-    def network(self) -> PoseNet:
-        return PoseNet(self.config)
 
     def collate(self, examples: list[CropExample]) -> list[dict[str, np.ndarray]]:
         """G groups of the detections of all scans, sorted by size: the arrays of a `VoxelPyramid`, and "person" (K, 2)
