@@ -199,7 +199,7 @@ def test_view_draws_streets_from_above(tmp_path, monkeypatch):
     write_dataset(SynthesisJob(what="streets", count=3, seed=4, sensors=("vlp-16",)), tmp_path / "s")
     panels = []
     draw = contact_sheet.draw_scans
-    monkeypatch.setattr(contact_sheet, "draw_scans", lambda p, path, **more: panels.extend(p) or draw(p, path, **more))
+    monkeypatch.setattr(contact_sheet, "draw_scans", lambda p, **more: panels.extend(p) or draw(p, **more))
     assert draw_dataset(tmp_path / "s", out=tmp_path / "s.png").read_bytes().startswith(b"\x89PNG")
     assert [p.label.split(":")[0] for p in panels] == [f"#{k} vlp-16" for k in range(3)]
     for index, shown in enumerate(panels):

@@ -61,7 +61,7 @@ $ lidarpose predict street.mcap --every 2 --format parquet
 {_SEARCH}
 [output]
 --out PATH = .  a folder, or a .json or .csv file (of a recording .jsonl, .csv or .parquet); - prints the JSON
---picture  also draw STEM.poses.png, or FILE.png
+--picture  also draw STEM.poses.png; with --out FILE.json FILE.png
 --html  also write STEM.poses.html: people and scan in 3D; a recording is played
 --skeleton NAME  smpl24, human15, waymo14, itop14 or body26 (default smpl24, else the network's own)
 [network]
