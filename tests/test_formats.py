@@ -9,6 +9,7 @@ import sys
 
 import laspy
 import numpy as np
+import pandas as pd
 import pytest
 from hostile_files import (
     POINTS,
@@ -30,6 +31,7 @@ from hypothesis.extra import numpy as hnp
 from lidarpose.errors import InputError, MissingExtra
 from lidarpose.io.files import check_unpacked
 from lidarpose.io.point_cloud import SUFFIXES, Cloud, read_points
+from lidarpose.io.text import parse_text
 
 float32_points = hnp.arrays(
     np.float32,
@@ -748,3 +750,12 @@ def test_read_text_with_long_runs_of_blanks(tmp_path, text):
     path = tmp_path / "b.txt"
     path.write_text(text.format(" " * 200_000, " " * 200_000))
     assert len(read_points(path).points) == text.count("\n")
+
+
+@pytest.mark.parametrize("options", [{}, {"index": False}, {"sep": ";"}, {"sep": ";", "decimal": ",", "index": False}])
+def test_header_of_column_numbers_is_no_point(options):
+    points = np.random.default_rng(0).normal(size=(20, 4))
+    read, _ = parse_text(pd.DataFrame(points).to_csv(**options).encode())
+    np.testing.assert_allclose(read, points[:, :3])
+    # a point that looks like such a header
+    np.testing.assert_array_equal(parse_text(b"0,1,2\n3,4,5\n")[0], [[0, 1, 2], [3, 4, 5]])

@@ -146,6 +146,9 @@ def _find_columns(text: str) -> tuple[Sequence[str], int, bool, str | None, str]
     # CloudCompare starts its header with slashes
     cells = _split(first_line.removeprefix("//").strip(), separator)
     where = f"on line {num_skipped + 1}, {shorten(first_line)!r}"
+    next_line = "".join(text.split("\n", num_skipped + 2)[num_skipped + 1 : num_skipped + 2])
+    if names := _pandas_names(cells, next_line, separator):
+        return names, num_skipped + 1, True, separator, decimal
     if not all(_is_number(cell, decimal) for cell in cells):
         if not has_xyz(cells):
             raise FormatError("numbers, or a header with x, y and z", f"neither {where}", "export or rename x, y, z")
@@ -161,6 +164,18 @@ def _find_columns(text: str) -> tuple[Sequence[str], int, bool, str | None, str]
             # names of other columns: the first three need not be x, y and z
             pick_xyz(words)
     return numbered(len(cells)), num_skipped, False, separator, decimal
+
+
+def _pandas_names(cells: list[str], next_line: str, separator: str | None) -> tuple[str, ...]:
+    """Names of the columns if the first line is a header as pandas writes it for an array: 0,1,2, after an empty cell
+    if the rows have numbers; else none. Without the empty cell it may be the point 0, 1, 2: it is a header if the next
+    line has decimals."""
+    has_row_numbers = not cells[0]
+    numbers = cells[1:] if has_row_numbers else cells
+    has_decimals = re.search(r"\d\.\d" if separator == "," else r"\d[.,]\d", next_line)
+    if len(numbers) < 3 or numbers != [str(i) for i in range(len(numbers))] or not (has_row_numbers or has_decimals):
+        return ()
+    return ("row",) * has_row_numbers + numbered(len(numbers))
 
 
 def _check_width(body: str, names: Sequence[str], separator: str | None, num_skipped: int) -> None:
