@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
-from lidarpose.inference.results import Poses
+from lidarpose.inference.results import PersonPose
 from lidarpose.sample import Box, Pose, facing
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14, Skeleton
 from lidarpose.viz import draw
@@ -402,9 +402,21 @@ def test_report_label_survives_round_trip(label):
 def test_undecodable_titles_are_written(tmp_path):
     label = "a\udc80\x00b"
     assert draw_people([Panel(points=np.ones((9, 3)), label=label)], title=label)
-    path = tmp_path / "report.html"
-    Poses(people=(), skeleton=SMPL24, model={}).html(path, title=label)
+    poses, path = PersonPose(pose=None, skeleton=SMPL24, points=np.ones((9, 3))).alone(), tmp_path / "report.html"
+    poses.html(path, title=label)
     assert "a?" in path.read_text(encoding="utf-8")
+
+
+def test_pictures_and_reports_are_written_with_their_suffixes(tmp_path):
+    poses, page, picture = PersonPose(pose=None, skeleton=SMPL24, points=np.ones((9, 3))).alone(), "a.html", "a.png"
+    assert (poses.html(tmp_path / page), poses.picture(tmp_path / picture)) == (poses.html(), poses.picture())
+    assert (tmp_path / page).read_text(encoding="utf-8") == poses.html()
+    assert (tmp_path / picture).read_bytes() == poses.picture()
+    with pytest.raises(InputError, match="ends in .png"):
+        poses.picture(tmp_path / "b.jpg")
+    with pytest.raises(InputError, match="ends in .html"):
+        poses.html(tmp_path / "b.png")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [page, picture]
 
 
 def test_report_has_side_of_every_joint_and_point():

@@ -246,3 +246,19 @@ def is_few(points: np.ndarray) -> bool:
             return True
         points = points[(points != points[0]).any(1)]
     return False
+
+
+def is_many(points) -> bool:
+    """Whether the input is a list of clouds rather than one cloud. A list of points is one cloud."""
+    return isinstance(points, list | tuple) and (len(points) == 0 or not _is_row(points[0]))
+
+
+def _is_row(value) -> bool:
+    """Whether the value is one point: a flat list or array of numbers. Ragged values are not; empty values are
+    clouds."""
+    if isinstance(value, list | tuple):
+        is_flat = not any(isinstance(entry, list | tuple) or getattr(entry, "ndim", 0) for entry in value)
+    else:
+        # an array of records is a cloud
+        is_flat = getattr(value, "ndim", 0) == 1 and not getattr(getattr(value, "dtype", None), "names", None)
+    return is_flat and len(value) > 0

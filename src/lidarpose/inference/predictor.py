@@ -29,6 +29,7 @@ from lidarpose.inference.inputs import (
     clean,
     clip_times,
     is_few,
+    is_many,
     only_returns,
     rounding_warning,
 )
@@ -260,7 +261,7 @@ class Predictor(PoseEstimator):
                 scan = search_alone(scan, Search())
             return pose_scan(scan, self, skeleton=skeleton, progress=progress)
         origin = as_origin(sensor_origin)
-        is_one = not _is_many(points)
+        is_one = not is_many(points)
         clouds = [as_points(points)] if is_one else [as_points(cloud, f"points[{i}]") for i, cloud in enumerate(points)]
         clips = None if clips is None else clips.checked(len(clouds))
         poses = self._predict_clouds(clouds, origin, skeleton, progress, clips)
@@ -293,7 +294,7 @@ class Predictor(PoseEstimator):
             InputError: as in `predict`, or times that are not strictly increasing seconds.
         """
         self.in_skeleton(skeleton)
-        if not _is_many(clouds) and getattr(clouds, "ndim", 0) != 3:
+        if not is_many(clouds) and getattr(clouds, "ndim", 0) != 3:
             raise InputError("predict_clip: expected a list of clouds, one per frame, got one cloud: use predict")
         seconds = clip_times(times, len(clouds))
         clips = Clips.of_run(len(clouds)) if len(clouds) and getattr(self.backend, "frames", 1) > 1 else None
@@ -459,19 +460,3 @@ def _steady_warnings(person: PersonPose, pose: Pose | None) -> tuple[str, ...]:
     if person.pose is not None or pose is None:
         return person.warnings
     return ("filled in from other frames: the person was not seen in this one",)
-
-
-def _is_many(points) -> bool:
-    """Whether the input is a list of clouds rather than one cloud. A list of points is one cloud."""
-    return isinstance(points, list | tuple) and (len(points) == 0 or not _is_row(points[0]))
-
-
-def _is_row(value) -> bool:
-    """Whether the value is one point: a flat list or array of numbers. Ragged values are not; empty values are
-    clouds."""
-    if isinstance(value, list | tuple):
-        is_flat = not any(isinstance(entry, list | tuple) or getattr(entry, "ndim", 0) for entry in value)
-    else:
-        # an array of records is a cloud
-        is_flat = getattr(value, "ndim", 0) == 1 and not getattr(getattr(value, "dtype", None), "names", None)
-    return is_flat and len(value) > 0

@@ -133,8 +133,8 @@ def _with_plain_nan(text: str) -> str:
 
 def _find_columns(text: str) -> tuple[Sequence[str], int, bool, str | None, str]:
     """(names of the columns, lines before the first row, whether a header names them, separator, decimal mark)."""
-    num_skipped, comment = 0, ""
-    for line in io.StringIO(text):
+    num_skipped, comment, lines = 0, "", io.StringIO(text)
+    for line in lines:
         first_line = line.split("#")[0].strip()
         if first_line:
             break
@@ -146,8 +146,7 @@ def _find_columns(text: str) -> tuple[Sequence[str], int, bool, str | None, str]
     # CloudCompare starts its header with slashes
     cells = _split(first_line.removeprefix("//").strip(), separator)
     where = f"on line {num_skipped + 1}, {shorten(first_line)!r}"
-    next_line = "".join(text.split("\n", num_skipped + 2)[num_skipped + 1 : num_skipped + 2])
-    if names := _pandas_names(cells, next_line, separator):
+    if names := _pandas_names(cells, next(lines, ""), separator):
         return names, num_skipped + 1, True, separator, decimal
     if not all(_is_number(cell, decimal) for cell in cells):
         if not has_xyz(cells):

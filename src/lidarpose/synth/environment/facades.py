@@ -1,4 +1,4 @@
-"""House fronts with relief."""
+"""Fronts of buildings, with relief."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from lidarpose.synth.environment.mesh import Mesh, at, post
 def facade(
     length: float, height: float, rng: np.random.Generator, *, bars: float = 0.2, niches: float = 0.25
 ) -> list[tuple[str, Mesh]]:
-    """A house front along y with its face at x = 0 and relief: recessed windows, some with bars, niches and doorways,
+    """A front along y with its face at x = 0 and relief: recessed windows, some with bars, niches and doorways,
     pilasters, drainpipes, ledges; open windows show a room behind."""
     centers, sizes, rods = [], [], []
 
