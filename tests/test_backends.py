@@ -304,6 +304,7 @@ BAD = {
     "onnx file elsewhere": ({"weights": bundled_path(suffix=".onnx"), "device": "cuda"}, "needs the backend torch"),
     "onnx file by torch": ({"weights": bundled_path(suffix=".onnx"), "backend": "torch"}, "torch runs a .safetensors"),
     "device": ({"device": "hal9000"}, "device 'hal9000' cannot be used"),
+    "unknown device": ({"device": "gpu", "backend": "torch"}, "device 'gpu' cannot be used (torch has no such device)"),
     "missing": ({"weights": "no/such.onnx"}, "no such file"),
     "missing checkpoint": ({"weights": "no/such.safetensors"}, "does not exist"),
     "missing path": ({"weights": Path("nothing")}, "does not exist"),

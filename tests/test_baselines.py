@@ -254,6 +254,25 @@ def test_offset_head_averages_votes_of_confident_points():
 
 
 @torch.no_grad()
+def test_prn_neck_equals_padded_attention():
+    torch.manual_seed(0)
+    neck, count = PrnNeck(8, 3).eval(), torch.tensor([40, 3, 9])
+    rows = Rows(xyz=torch.randn(52, 3), person=torch.repeat_interleave(torch.arange(3), count), count=count)
+    features = torch.randn(52, 8)
+    slots, valid = rows.padded()
+    with torch.no_grad():
+        nn.init.normal_(neck.joint)
+        neck.vote.parts[7].weight *= 100
+        found = neck(features, rows)
+        joint_features = neck.embed(torch.cat([found.voted, neck.joint.expand(3, -1, -1)], -1))
+        joint_tokens = torch.cat([found.voted, joint_features], -1)
+        tokens = neck.token(torch.cat([joint_tokens, torch.cat([rows.xyz, features], -1)[slots]], 1))
+        is_padding = torch.cat([valid.new_zeros(3, 3), ~valid], 1)
+        expected = neck.output(neck.norm(neck.layers(tokens, src_key_padding_mask=is_padding))[:, :3])
+    assert found.voted.abs().amax((1, 2)).min() > 0.01
+    torch.testing.assert_close(found.joints, expected, atol=1e-5, rtol=1e-5)
+
+
 def test_lpformer_weights_fit_any_grid_and_points_read_own_cell():
     torch.manual_seed(0)
     networks = {grid: Lpformer(LpformerConfig(grid=grid, width_divisor=8)).eval() for grid in (64, 32)}

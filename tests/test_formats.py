@@ -759,3 +759,24 @@ def test_header_of_column_numbers_is_no_point(options):
     np.testing.assert_allclose(read, points[:, :3])
     # a point that looks like such a header
     np.testing.assert_array_equal(parse_text(b"0,1,2\n3,4,5\n")[0], [[0, 1, 2], [3, 4, 5]])
+
+
+@pytest.mark.parametrize("first, count, counts", [(0, 20, True), (1, 300, True), (2, 300, False), (0, 19, False)])
+def test_first_column_that_counts_rows_is_not_x(first, count, counts):
+    rows = np.c_[first + np.arange(count), np.random.default_rng(0).normal(size=(count, 3)).round(3)]
+    text = "\n".join(" ".join(map(str, row)) for row in rows.tolist()).encode()
+    points, names = parse_text(text)
+    assert names == (("row", "x", "y", "z") if counts else ("x", "y", "z", "column_4"))
+    np.testing.assert_array_equal(points, rows[:, 1:] if counts else rows[:, :3])
+    # a header says what the column is
+    assert parse_text(b"x y z i\n" + text)[1] == ("x", "y", "z", "i")
+
+
+@pytest.mark.parametrize("viewpoint, warns", [("1 -2.5 3 1 0 0 0", True), ("0 0 0 1 0 0 0", False), ("a b c", False)])
+def test_pcd_viewpoint_is_named_and_not_used(folder, viewpoint, warns):
+    header = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 1\nHEIGHT 1\n"
+    path = folder / "viewpoint.pcd"
+    path.write_text(f"{header}VIEWPOINT {viewpoint}\nPOINTS 1\nDATA ascii\n4 5 6\n")
+    cloud = read_points(path)
+    assert cloud.points.tolist() == [[4, 5, 6]] and len(cloud.warnings) == warns
+    assert not warns or cloud.warnings[0].endswith("--sensor-origin 1,-2.5,3")

@@ -159,6 +159,14 @@ def test_predict_of_one_scan_rejects_list_of_scans(points):
     for predict in (lidarpose.predict, lidarpose.detect):
         with pytest.raises(InputError, match=r"got a list of 2: one call per scan, or lidarpose.load\(\).predict"):
             predict([points, points[:50]])
+        with pytest.raises(InputError, match=r"got a list of 2 paths: one call per file, or .*predict_recording"):
+            predict(["a.pcd", Path("b.pcd")])
+
+
+def test_predict_rejects_table_of_boxes(points):
+    table = pd.DataFrame(np.zeros((1, 7)), columns=list("xyzlwhr"))
+    with pytest.raises(InputError, match=r"got a table: give table\[\[x, y, z, l, w, h, yaw\]\].to_numpy"):
+        lidarpose.predict(points, boxes=table)
 
 
 def test_predict_drops_and_counts_nonfinite_and_huge_points(model, points):

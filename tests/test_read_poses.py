@@ -79,3 +79,8 @@ def test_read_poses_reports_wrong_values(tmp_path):
     lines.write_text("{}\n{}\n")
     with pytest.raises(InputError, match=r"one document per line: call it with each line"):
         lidarpose.read_poses(lines)
+
+
+def test_read_poses_names_missing_file(tmp_path):
+    with pytest.raises(InputError, match=r"^\S*nope.json: no such file; expected a file of poses"):
+        lidarpose.read_poses(tmp_path / "nope.json")

@@ -226,13 +226,21 @@ def test_label_offsets_avoid_overlap():
     rng = np.random.default_rng(0)
     centers = np.concatenate([[[0.0, 0.0], [900.0, 0.0]], 300 + rng.uniform(-25, 25, (6, 2))])
     tips = centers[1:2] + 20.0
-    offsets = label_offsets(centers, np.zeros((0, 2)))
+    offsets = label_offsets(centers, np.zeros((0, 2)), np.full(8, 6.0))
     # labels avoid the tip of the heading arrow, too
-    assert np.linalg.norm(centers[1] + label_offsets(centers, tips)[1] - tips[0]) > 15
+    assert np.linalg.norm(centers[1] + label_offsets(centers, tips, np.full(8, 6.0))[1] - tips[0]) > 15
     # the label of an isolated person is close, to the upper right
     assert (offsets[:2] > 0).all() and (np.linalg.norm(offsets[:2], axis=1) < 16).all()
     places = centers + offsets
     apart = np.linalg.norm(places[:, None] - places, axis=-1) + 99 * np.eye(len(places))
     plain = np.linalg.norm((centers + [11, 11])[:, None] - (centers + [11, 11]), axis=-1) + 99 * np.eye(len(centers))
     assert apart.min() > 12 > plain.min()
-    assert label_offsets(np.zeros((0, 2)), np.zeros((0, 2))).shape == (0, 2)
+    assert label_offsets(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)).shape == (0, 2)
+
+
+def test_label_offsets_keep_long_names_apart():
+    # a row of people with wide names, as detections of a queue
+    centers, width = np.stack([np.arange(4) * 30.0, np.zeros(4)], -1), 72.0
+    places = centers + label_offsets(centers, np.zeros((0, 2)), np.full(4, width))
+    apart = np.abs(places[:, None] - places)
+    assert ((apart[..., 0] > 0.8 * width) | (apart[..., 1] > 10) | np.eye(4, dtype=bool)).all()

@@ -151,9 +151,13 @@ def output_paths(
 
 def prediction_options(options: argparse.Namespace) -> dict[str, Any]:
     """Arguments of `lidarpose.predict`; the network is loaded once the input has proved readable."""
-    from lidarpose.inference.predictor import load
+    from lidarpose.inference.predictor import check_settings, load
+    from lidarpose.skeleton import as_skeleton
 
     choices = {name: getattr(options, name) for name in ("backend", "device", "decode", "tta")}
+    check_settings(options.weights, backend=options.backend, decode=options.decode, tta=options.tta)
+    if options.skeleton is not None:
+        as_skeleton(options.skeleton)
     scan_options = {name: getattr(options, name) for name in ("boxes", "calib", "crop", "skeleton")}
     # without --find, the input decides
     scan_options["find"] = options.find or None

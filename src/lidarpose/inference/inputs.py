@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.arrays import to_numpy
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, counted
 from lidarpose.geometry import vector_of
 from lidarpose.io.files import FormatError, one_line
 from lidarpose.io.text import is_image, is_transposed, pick_xyz
@@ -104,6 +104,11 @@ def as_points(points: Any, what: str = "points") -> np.ndarray:
     """
     if isinstance(points, str | os.PathLike):
         raise InputError(f"{what} must be an (n, 3) array, got a path: use lidarpose.predict({str(points)!r})")
+    if isinstance(points, list | tuple) and points and isinstance(points[0], str | os.PathLike):
+        raise InputError(
+            f"{what}: expected one file or array, got a list of {counted(len(points), 'path')}: one call per file, or "
+            "lidarpose.predict_recording for frames of a recording"
+        )
     if isinstance(points, list | tuple) and points and getattr(points[0], "ndim", 0) > 1:
         raise InputError(
             f"{what} must be one (n, 3) array, got a list of {len(points)}: one call per scan, or "

@@ -90,14 +90,10 @@ def load(
         InputError: an unknown name, a file that is not a checkpoint, or a device that is not available.
         MissingExtra: torch is needed but not installed.
     """
-    decoder(decode)
-    tta_transforms(tta)
+    path = check_settings(weights, backend=backend, decode=decode, tta=tta)
     device = "cpu" if device is None else str(device)
     if threads is not None:
         threads = check_int("threads", threads, least=1)
-    if backend is not None:
-        check_name("backend", backend, BACKENDS)
-    path = weights_path(weights)
     is_bundled, is_exported = os.fspath(weights) in BUNDLED, path.suffix.lower() == ".onnx"
     is_plain = device == "cpu" and not compile
     if backend is None:
@@ -121,6 +117,15 @@ def load(
     if not network_backend.header.config.poses:
         raise file_error(path, "contains a detection network: give the weights of a pose network")
     return Predictor(network_backend, name=path.stem, decode=decode, tta=tta)
+
+
+def check_settings(weights: str | os.PathLike, *, backend: str | None, decode: str, tta: int) -> Path:
+    """Checks the settings of `load` without loading anything; returns the path of the weights. Raises InputError."""
+    decoder(decode)
+    tta_transforms(tta)
+    if backend is not None:
+        check_name("backend", backend, BACKENDS)
+    return weights_path(weights)
 
 
 def _torch_backend(path: Path, device: str, compile: bool) -> Backend:

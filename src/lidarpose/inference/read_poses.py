@@ -33,8 +33,9 @@ def read_poses(source: str | os.PathLike | dict[str, Any]) -> Poses:
         InputError: one line that names the file and the problem.
     """
     name = "poses" if isinstance(source, dict) else source
+    data = b"" if isinstance(source, dict) else read_bytes(source, expected="a file of poses")
     try:
-        return _poses(source if isinstance(source, dict) else _load(source))
+        return _poses(source if isinstance(source, dict) else _parse(data, source))
     except FormatError as problem:
         raise file_error(name, problem) from None
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
@@ -43,10 +44,9 @@ def read_poses(source: str | os.PathLike | dict[str, Any]) -> Poses:
         raise file_error(name, f"expected {_EXPECTED}, got a damaged document ({reason}): write it again") from None
 
 
-def _load(path: str | os.PathLike) -> Any:
-    text = read_bytes(path, expected="a file of poses").decode("utf-8-sig", "replace")
+def _parse(data: bytes, path: str | os.PathLike) -> Any:
     try:
-        return json.loads(text)
+        return json.loads(data.decode("utf-8-sig", "replace"))
     except (ValueError, RecursionError) as error:
         if os.fsdecode(path).lower().endswith(".jsonl"):
             remedy = "call it with each line, decoded by json.loads"

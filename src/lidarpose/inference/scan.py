@@ -108,7 +108,9 @@ def read_scan(scan: Scan, points: str | os.PathLike | ArrayLike, columns: int | 
     cloud = Cloud(points=as_points(points)) if source is None else read_points(source, columns=columns)
     returns, notes = only_returns(cloud.points)
     if source is not None and not len(returns):
-        problem = f"none within {FARTHEST:g} m" if cloud.points.any() else "only 0,0,0, which are not returns"
+        problem = (
+            f"only coordinates beyond {FARTHEST:,.0f} m" if cloud.points.any() else "only 0,0,0, which are not returns"
+        )
         raise file_error(source, f"expected points in meters, got {problem}: export it again")
     return replace(scan, points=returns, warnings=(*cloud.warnings, *notes), source=source)
 
@@ -144,7 +146,7 @@ def pose_scan(
     people = [_in_input(person, scan) for person in level_poses]
     if scan.boxes is None:
         # warnings from reading a crop belong to its person
-        people = [replace(people[0], warnings=(*scan.warnings, *people[0].warnings))]
+        people = [replace(people[0], warnings=tuple(dict.fromkeys((*scan.warnings, *people[0].warnings))))]
         warnings = warnings[len(scan.warnings) :]
     per_person = predict_ms / max(sum(person.has_pose for person in people), 1)
     return replace(

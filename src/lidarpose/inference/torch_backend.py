@@ -38,6 +38,8 @@ def torch_backend(path: str | os.PathLike, *, device: str = "cpu", compile: bool
     except (RuntimeError, AssertionError) as error:
         # for an unknown or missing device torch raises one of these, or NotImplementedError, a RuntimeError
         reason = str(error).partition("\n")[0]
+        # torch lists all of its devices
+        reason = "torch has no such device" if reason.startswith("Expected one of") else reason
         raise InputError(
             f"device {device!r} cannot be used ({reason}); expected cpu, or cuda where torch has it"
         ) from None

@@ -127,6 +127,8 @@ def read_boxes(source: "str | os.PathLike | _Content | Poses", *, calib: str | o
             with the same id are an error, since results are identified by it.
     """
     source = to_numpy(source)
+    if hasattr(source, "columns") and hasattr(source, "to_numpy"):
+        raise InputError("boxes: expected rows or a file, got a table: give table[[x, y, z, l, w, h, yaw]].to_numpy()")
     if hasattr(source, "people"):
         poses: Any = source
         people = [p.to_dict() if p.box is None else replace(p.box, id=p.id) for p in poses.people]
@@ -208,7 +210,8 @@ def _load_file(path: str | os.PathLike, calib: str | os.PathLike | None) -> obje
         where = f"line {error.lineno}, column {error.colno}"
         raise FormatError(f"is not JSON: {error.msg} at {where}; correct it there") from None
     except UnicodeDecodeError as error:
-        raise FormatError("JSON in UTF-8", f"an invalid byte at {error.start}", "save it as UTF-8") from None
+        expected = "boxes as JSON in UTF-8, .npy rows or a KITTI label"
+        raise FormatError(expected, f"an invalid byte at {error.start}", "give the file of the boxes") from None
     except (ValueError, RecursionError) as error:
         raise FormatError(f"cannot be read as JSON ({error}); expected a list of boxes") from None
 

@@ -65,6 +65,20 @@ def parse_pcd(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
     return _columns(data, num_points, [f"<{formats[i]}" for i in xyz_indices], starts, steps), names
 
 
+def viewpoint_notes(data: bytes) -> tuple[str, ...]:
+    """A note for the user if a PCD header states another sensor position than 0, 0, 0. It is not used, since some
+    programs store the points relative to it, and others do not."""
+    header, _, _ = _pcd_header(data)
+    try:
+        position = np.array(header.get("VIEWPOINT", [])[:3], float)
+    except ValueError:
+        return ()
+    if len(position) < 3 or not np.isfinite(position).all() or not position.any():
+        return ()
+    text = ",".join(f"{value:g}" for value in position)
+    return (f"the header's VIEWPOINT is not used: if the sensor is there in the points' frame, --sensor-origin {text}",)
+
+
 def _pcd_header(data: bytes) -> tuple[dict[str, list[str]], str, int]:
     """(values by key, encoding, where the body starts)."""
     if not re.match(rb"\s*(#|VERSION|FIELDS|COLUMNS)", data):

@@ -19,7 +19,7 @@ from lidarpose.errors import MissingExtra, check_int
 from lidarpose.io.files import FormatError, file_error, read_bytes, shorten
 from lidarpose.io.las import parse_las
 from lidarpose.io.npz import load_array, member_header, open_npz, unpack
-from lidarpose.io.pcd_ply import parse_pcd, parse_ply
+from lidarpose.io.pcd_ply import parse_pcd, parse_ply, viewpoint_notes
 from lidarpose.io.text import FEW_ROWS, is_image, is_transposed, numbered, parse_text, pick_xyz
 
 KITTI_FIELDS = ("x", "y", "z", "intensity")
@@ -114,6 +114,9 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
     """
     if columns is not None:
         columns = check_int("columns", columns, least=3, hint=" (x y z first)")
+    if isinstance(path, str | os.PathLike) and os.path.isdir(path):
+        remedy = "give a file in it, or read all of it with lidarpose predict, in Python with predict_recording"
+        raise file_error(path, FormatError("one point cloud", "a folder", remedy))
     data = read_bytes(path, expected=f"a point cloud ({' '.join(SUFFIXES)})")
     name = os.path.basename(os.fsdecode(path)).lower()
     suffix = os.path.splitext(name)[1]
@@ -128,6 +131,7 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
                 points, fields, notes = _parse_bin(data, columns)
             else:
                 points, fields = _PARSERS[suffix](data)
+                notes = viewpoint_notes(data) if suffix == ".pcd" else ()
             points = np.ascontiguousarray(points, dtype=np.float64)
             is_finite = np.isfinite(points).all(axis=1)
         num_dropped = len(points) - int(is_finite.sum())

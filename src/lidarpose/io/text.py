@@ -13,6 +13,8 @@ from lidarpose.io.files import FormatError, shorten
 
 # a table of at most this many rows and more than this many columns has a point per column
 FEW_ROWS, _MANY_COLUMNS = 5, 50
+# a first column that counts at least this many rows is a row number, not x
+_FEWEST_COUNTED = 20
 # how the usual exports write a missing value, in lower or upper case
 _MISSING = ("", "na", "n/a", "nan", "-nan", "+nan", "null", "none", "<na>")
 # how Microsoft's libraries begin NaN and infinity, after the sign
@@ -116,7 +118,11 @@ def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
             decimal = ","
     if has_header:
         _check_width(body, names, separator, num_skipped)
-    points = _read_csv(body, pick_xyz(names), separator=separator, decimal=decimal, num_skipped=num_skipped)
+    style: dict[str, Any] = {"separator": separator, "decimal": decimal, "num_skipped": num_skipped}
+    points = _read_csv(body, pick_xyz(names), **style)
+    if names == numbered(len(names)) and len(names) > 3 and _is_counter(points[:, 0]):
+        names = ("row", *numbered(len(names) - 1))
+        points = _read_csv(body, pick_xyz(names), **style)
     if not has_header and is_transposed((len(points), len(names))):
         actual = f"{len(points)} lines of {len(names)} values"
         raise FormatError("a line of x y z for each point", actual, "save its transpose")
@@ -175,6 +181,12 @@ def _pandas_names(cells: list[str], next_line: str, separator: str | None) -> tu
     if len(numbers) < 3 or numbers != [str(i) for i in range(len(numbers))] or not (has_row_numbers or has_decimals):
         return ()
     return ("row",) * has_row_numbers + numbered(len(numbers))
+
+
+def _is_counter(column: np.ndarray) -> bool:
+    """Whether a column without a name counts the rows, from 0 or 1."""
+    count = len(column)
+    return count >= _FEWEST_COUNTED and column[0] in (0, 1) and np.array_equal(column, column[0] + np.arange(count))
 
 
 def _check_width(body: str, names: Sequence[str], separator: str | None, num_skipped: int) -> None:

@@ -19,6 +19,12 @@ _TURNED = ("--augment", "turn")
 # and at full width smaller batches, since it sees few people there
 _FASTER, _FASTER_WIDE = ("--rate", "2e-3"), ("--rate", "1e-3", "--batch", "32")
 _ONE_CYCLE = (*_FASTER, "--schedule", "cosine", "--warmup", "0.04")
+# likewise baselines at full width: steps of 2 clips, and LPFormer with an eighth of its cells and the same weights
+_WIDE_BASELINES = {
+    "lidarcap": ("--batch", "32"),
+    "ne": ("--batch", "32"),
+    "lpformer": ("--options", "grid=32"),
+}
 # an Adam step moves a weight by about the learning rate, and logits of narrow heatmaps are large (docs/log.md)
 _HEATMAP_RATE = ("--heatmap-rate", "10")
 _KEPT = ("0.5", "0.6", "0.7", "0.8", "0.9")
@@ -130,8 +136,9 @@ def _methods(options: Options) -> list[Row]:
 def _baseline(options: Options, model: str, *words: str) -> tuple[str, ...]:
     """Options of a baseline's training, at the width that matches the size of the paper's network. Reduced sizes use
     the same learning-rate cycle as the paper's network."""
-    cycle = () if options.size == PAPER else _ONE_CYCLE
-    return ("--model", model, "--size", model + options.size.removeprefix(PAPER), *cycle, *words)
+    wide = () if options.real else _WIDE_BASELINES.get(model, ())
+    changes = wide if options.size == PAPER else _ONE_CYCLE
+    return ("--model", model, "--size", model + options.size.removeprefix(PAPER), *changes, *words)
 
 
 def _of_clips(options: Options, name: str, *published: float) -> Row:

@@ -20,7 +20,8 @@ LONGEST_NAME = 12  # characters of a person's name that are drawn in a scan
 _MAX_POINTS = 120_000  # per scan; more points would only cover each other at this size
 _DPI, _PANEL, _TITLE = 110, 7.6, 0.6  # inches
 _WIDE, _CARDS_IN_ROW = 11.5, 4  # width of a scan, inches, above the cards of at least this number of people
-_LABEL_RADII, _LABEL_SIZE = (15.0, 26.0, 38.0), 13.0  # pt: distances of a number from its box, size of a number
+# pt: distances of a name from its box, size of a short name, width of a letter
+_LABEL_RADII, _LABEL_SIZE, _LETTER = (15.0, 26.0, 38.0), 13.0, 6.0
 _MARGIN, _LEAST_SPAN = 3.0, 16.0  # m: margin around the people, and minimum side of a view
 _BELOW, _ABOVE = 0.25, 2.5  # range of heights that the colors cover, m above the ground
 _GROUND, _HIGH = "#d5d9de", "#eceff2"
@@ -130,7 +131,8 @@ def _draw_panel(ax, panel: ScanPanel, size: np.ndarray) -> None:
         ax.plot(panel.places[:, 0], panel.places[:, 1], ls="", marker="o", ms=2.5, color=ALERT, alpha=0.5, zorder=4)
     centers = np.array([box.center[:2] for box in panel.boxes]).reshape(-1, 2)
     arrow_tips = np.array([_arrow_tip(box) for box in panel.boxes]).reshape(-1, 2)
-    offsets = label_offsets(centers * 72 / scale, arrow_tips * 72 / scale)
+    widths = _LETTER * np.array([len(_name(box)) for box in panel.boxes])
+    offsets = label_offsets(centers * 72 / scale, arrow_tips * 72 / scale, widths)
     for box, offset in zip(panel.boxes, offsets.tolist(), strict=True):
         _draw_box(ax, box, offset)
     if is_known(panel.poses):
@@ -160,6 +162,7 @@ def _window(panel: ScanPanel, points: np.ndarray, size: np.ndarray) -> tuple[np.
 def _draw_points(ax, points: np.ndarray, ground: Ground | None) -> None:
     """Draws the ground in light gray, points above it colored by height, and points higher than people even fainter."""
     from matplotlib import colormaps
+    from matplotlib.patches import Rectangle
 
     if ground is not None:
         height = heights_above(points, ground)
@@ -172,25 +175,38 @@ def _draw_points(ax, points: np.ndarray, ground: Ground | None) -> None:
     cmap = colormaps["viridis_r"].with_extremes(under=_GROUND, over=_HIGH)
     limits = {"cmap": cmap, "vmin": _BELOW, "vmax": _ABOVE}
     dots = ax.scatter(*points[order, :2].T, s=size[order], c=height[order], linewidths=0, zorder=2, **limits)
+    corner = Rectangle((0.008, 0.03), 0.085, 0.24, transform=ax.transAxes, fc="white", alpha=0.85, zorder=4.5)
+    ax.add_patch(corner)
     bar = ax.figure.colorbar(dots, cax=ax.inset_axes((0.02, 0.05, 0.012, 0.2)), extend="neither")
     bar.set_label("height, m", fontsize=7)
     bar.ax.tick_params(labelsize=6)
     bar.outline.set_visible(False)
 
 
-def label_offsets(centers: np.ndarray, arrow_tips: np.ndarray) -> np.ndarray:
-    """Offsets (B, 2) of the numbers from the centers (B, 2) of their boxes, all in pt: away from arrows with tips
-    (A, 2), other boxes and numbers placed before, else to the upper right."""
+def label_offsets(centers: np.ndarray, arrow_tips: np.ndarray, widths: np.ndarray) -> np.ndarray:
+    """Offsets (B, 2) of names with widths (B,) from the centers (B, 2) of their boxes, all in pt: away from arrows with
+    tips (A, 2), other boxes and names placed before, else to the upper right."""
     angles = np.pi / 4 * (1 + np.arange(8))
-    directions = np.stack([np.cos(angles), np.sin(angles)], -1)
-    candidates = np.concatenate([radius * directions for radius in _LABEL_RADII])
+    directions = np.stack([np.cos(angles), np.sin(angles)], -1).round(6)
     effort = np.repeat(np.array(_LABEL_RADII) / _LABEL_RADII[0], 8) * 0.05
+    widths = np.maximum(widths, _LABEL_SIZE)
     offsets = np.zeros((len(centers), 2))
     for i, center in enumerate(centers):
+        # a wide name moves aside by half of its additional width
+        aside = np.sign(directions) * ((widths[i] - _LABEL_SIZE) / 2, 0)
+        candidates = np.concatenate([radius * directions + aside for radius in _LABEL_RADII])
         others = np.concatenate([np.delete(centers, i, 0), centers[:i] + offsets[:i], arrow_tips])
-        distance = np.linalg.norm(others[:, None] - (center + candidates), axis=-1)
-        offsets[i] = candidates[np.argmin(np.exp(-((distance / _LABEL_SIZE) ** 2)).sum(0).round(3) + effort)]
+        other_widths = np.full(len(others), _LABEL_SIZE)
+        other_widths[len(centers) - 1 : len(centers) - 1 + i] = widths[:i]
+        apart = (others[:, None] - (center + candidates)) / _LABEL_SIZE
+        apart[..., 0] *= (2 * _LABEL_SIZE / (widths[i] + other_widths))[:, None]
+        offsets[i] = candidates[np.argmin(np.exp(-(apart**2).sum(-1)).sum(0).round(3) + effort)]
     return offsets
+
+
+def _name(box: Box) -> str:
+    """The name that is drawn beside a box."""
+    return "" if box.id is None else shortened(str(box.id), LONGEST_NAME)
 
 
 def _arrow_tip(box: Box) -> np.ndarray:
@@ -208,7 +224,7 @@ def _draw_box(ax, box: Box, offset: tuple[float, float]) -> None:
     )
     if box.id is not None:
         ax.annotate(
-            shortened(str(box.id), LONGEST_NAME), box.center[:2], offset, textcoords="offset points", fontsize=9,
+            _name(box), box.center[:2], offset, textcoords="offset points", fontsize=9,
             weight="bold", color=ALERT, zorder=7, parse_math=False,
             bbox={"fc": "white", "ec": "none", "alpha": 0.7, "pad": 0.8},
             ha="center", va="center", arrowprops={"arrowstyle": "-", "color": ALERT, "lw": 0.4, "shrinkB": 6},

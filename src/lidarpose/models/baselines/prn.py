@@ -142,11 +142,15 @@ class PrnNeck(nn.Module):
     def forward(self, features: Tensor, rows: Rows) -> PrnOutputs:
         voted, parts, offsets = self.vote(features, rows)
         joint_features = self.embed(torch.cat([voted, self.joint.expand(len(voted), -1, -1)], -1))
-        slots, valid = rows.padded()
-        tokens = torch.cat([torch.cat([voted, joint_features], -1), torch.cat([rows.xyz, features], -1)[slots]], 1)
-        mask = torch.cat([valid.new_ones(voted.shape[:2]), valid], 1)
-        tokens = self.norm(self.layers(self.token(tokens), src_key_padding_mask=~mask))
-        return PrnOutputs(joints=self.output(tokens[:, : voted.shape[1]]), voted=voted, parts=parts, offsets=offsets)
+        joint_tokens = self.token(torch.cat([voted, joint_features], -1))
+        point_tokens = self.token(torch.cat([rows.xyz, features], -1)).split(rows.count.tolist())
+        # person by person: padded to the largest one, attention took several times the memory and the time
+        refined = [
+            self.layers(torch.cat([joint_tokens[i], tokens])[None])[0, : voted.shape[1]]
+            for i, tokens in enumerate(point_tokens)
+        ]
+        joints = self.output(self.norm(torch.stack(refined)))
+        return PrnOutputs(joints=joints, voted=voted, parts=parts, offsets=offsets)
 
 
 def _point_head(channels: int, out_channels: int) -> nn.Sequential:
