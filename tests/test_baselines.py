@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 from torch import nn
 
 from lidarpose.models.baselines.baseline_config import CLOUDS, LidarcapConfig, LpformerConfig, NeConfig, PrnConfig
@@ -19,7 +20,7 @@ from lidarpose.models.baselines.lpformer import V2V, Lpformer
 from lidarpose.models.baselines.ne import CloudExchange, Ne
 from lidarpose.models.baselines.point_ops import ball_query, farthest_points, nearest_neighbors
 from lidarpose.models.baselines.point_transformer_v2 import Rows
-from lidarpose.models.baselines.prn import OffsetHead, Prn, PrnNeck
+from lidarpose.models.baselines.prn import BareAttention, OffsetHead, Prn, PrnNeck
 from lidarpose.models.checkpoint import build, parameter_count, save_checkpoint
 from lidarpose.sample import CLIP_FRAMES
 from lidarpose.skeleton import SMPL24, WAYMO14
@@ -199,6 +200,32 @@ def _run(network: torch.nn.Module, points: torch.Tensor, valid: torch.Tensor) ->
     return outputs.posed()
 
 
+@torch.no_grad()
+def test_bare_attention_equals_masked_attention():
+    torch.manual_seed(0)
+    layer, x = BareAttention(12, heads=3).eval(), torch.randn(3, 9, 12)
+    # not all padding is at the end, and a person may have no row
+    valid = torch.rand(3, 9) < 0.6
+    valid[:2, :2], valid[2] = True, False
+    query, key, value = (
+        linear(x).unflatten(-1, (3, -1)).transpose(1, 2) for linear in (layer.query, layer.key, layer.value)
+    )
+    expected = x + F.scaled_dot_product_attention(query, key, value, valid[:, None, None]).transpose(1, 2).flatten(2)
+    found = layer(x, valid)
+    torch.testing.assert_close(found[valid], expected[valid], atol=1e-6, rtol=1e-5)
+    assert torch.equal(found[~valid], x[~valid])
+    torch.testing.assert_close(layer(x, valid, queries=2)[:2], expected[:2, :2], atol=1e-6, rtol=1e-5)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("count", [3, 40, 60, 200])
+def test_pointnet_features_are_independent_of_batch(count):
+    torch.manual_seed(0)
+    network, (points, valid) = PointNet2(64, 8).eval(), _cloud(4, (512, count))
+    alone = network(points[1:, :count], valid[1:, :count])
+    torch.testing.assert_close(network(points, valid)[1:], alone, atol=1e-5, rtol=1e-5)
+
+
 @pytest.mark.long
 @torch.no_grad()
 @pytest.mark.parametrize(
@@ -259,7 +286,8 @@ def test_prn_neck_equals_padded_attention():
     neck, count = PrnNeck(8, 3).eval(), torch.tensor([40, 3, 9])
     rows = Rows(xyz=torch.randn(52, 3), person=torch.repeat_interleave(torch.arange(3), count), count=count)
     features = torch.randn(52, 8)
-    slots, valid = rows.padded()
+    slots = nn.utils.rnn.pad_sequence(torch.arange(52).split(count.tolist()), batch_first=True)
+    valid = torch.arange(40) < count[:, None]
     with torch.no_grad():
         nn.init.normal_(neck.joint)
         neck.vote.parts[7].weight *= 100

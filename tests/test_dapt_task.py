@@ -291,16 +291,18 @@ def test_example_size_counts_occupied_cells(seed, n, reach):
 
 
 def test_prn_collate_labels_voxels_by_nearest_joint():
-    people = [person(60, 1, labelled=5, size=0.1), person(0, 2), person(40, 3, labelled=0)]
+    people = [person(60, 1, labelled=5, size=0.1), person(0, 2), person(40, 3, labelled=0), person(60, 4)]
     arrays = PRN.collate(people)
-    rows = np.repeat(np.arange(3), arrays.tables.levels[0].lengths)
+    rows = np.repeat(np.arange(4), arrays.tables.levels[0].lengths)
     want = []
     for b, at in zip(rows, arrays.tables.features, strict=True):
         distances = [math.dist(at, joint) if np.isfinite(joint).all() else math.inf for joint in arrays.joints[b]]
         nearest = min(distances)
-        want.append(1 + distances.index(nearest) if nearest < 0.1 else 0)
+        # far from all joints is background, if no joint lacks a label
+        far = -1 if math.inf in distances else 0
+        want.append(1 + distances.index(nearest) if nearest < 0.1 else far)
     # people without points or labels are not supervised
-    want = np.where(rows == 0, want, -1)
+    want = np.where((rows == 0) | (rows == 3), want, -1)
     assert arrays.part.tolist() == want.tolist() and {0, -1} < set(arrays.part.tolist())
 
 

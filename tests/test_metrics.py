@@ -219,6 +219,7 @@ def test_acceleration_error_of_known_motion():
     assert metrics.acceleration_error(even, true, 20) == pytest.approx(0, abs=1e-6)
     falling = true + 0.5 * 9.81 * time[:, None, None] ** 2 * [0, 0, 1.0]
     assert metrics.acceleration_error(falling, true, 20) == pytest.approx(9810)
+    assert np.isnan(metrics.acceleration_error(true[:0], true[:0], 20))
     assert metrics.acceleration_error(falling, true, 1) == pytest.approx(9810 / 400)
     assert metrics.acceleration_error(falling[0], true[0], 20) == pytest.approx(9810)
 

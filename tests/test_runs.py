@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ from lidarpose.train.data_loader import SyntheticSource, lanes_of
 from lidarpose.train.loop import Interrupted, StopRequest
 from lidarpose.train.objectives.posenet_objective import PoseNetObjective
 from lidarpose.train.optim import optimizers, rate_factor
-from lidarpose.train.recipes import Pretrain
+from lidarpose.train.recipes import Pretrain, recipe
 
 # people per chunk; a run has three chunks
 CHUNK = BATCHES * 2
@@ -553,6 +554,12 @@ def test_two_processes_match_single_process(tmp_path):
     within = {"losses": {"rel": 2e-3, "abs": 2e-4}, "weights": {"atol": 3e-4, "rtol": 1e-2}}
     assert_close(tmp_path / "two", tmp_path / "one", [run_dir.MODEL], **within)
     assert people_of(tmp_path / "two") == [2 * CHUNK, 4 * CHUNK]
+
+
+def test_prn_needs_two_people_in_each_process(tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, "_accelerator", lambda *_: SimpleNamespace(num_processes=8))
+    with pytest.raises(InputError, match="batch must be at least 2 for prn"):
+        loop.train(recipe(Pretrain, "prn", model="prn", size="prn-tiny", batch=8, people=64), tmp_path / "run")
 
 
 def test_lanes_of_rejects_batch_not_divisible_by_processes():

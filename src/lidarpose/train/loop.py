@@ -37,7 +37,7 @@ from lidarpose.train.objectives.objective import LOGGED, PoseObjective, total
 from lidarpose.train.optim import average, optimizers, plateau_factor, rate_factor, set_rates
 from lidarpose.train.recipes import PoseRecipe, Recipe
 from lidarpose.train.run_dir import BEST, LOG, MODEL, STATE
-from lidarpose.train.setup import TrainSetup, make_setup
+from lidarpose.train.setup import TrainSetup, check_prn_batch, make_setup
 from lidarpose.train.validation import Draw, batch_norms, update_batch_norms
 
 # Accelerate's trackers that are known to work with a run's folder
@@ -119,6 +119,7 @@ def train(
     if recipe.batch % setup.frames:
         raise InputError(f"batch counts frames, and a clip has {setup.frames}: give a multiple, got {recipe.batch}")
     lanes_of(recipe.batch // setup.frames, accelerator.num_processes)
+    check_prn_batch(getattr(setup.objective, "config", None), recipe.batch // accelerator.num_processes)
     # every process must have checked the folder before the first one writes
     accelerator.wait_for_everyone()
     folder = run_dir.numbered(recipe.kind) if folder is None else Path(folder)

@@ -113,11 +113,16 @@ def objective_of(config: Config, recipe: PoseRecipe, layout: str = "ragged") -> 
     stage = "finetune" if isinstance(config, DaptConfig) and config.bins else recipe.kind
     settings_by_kind: dict[str, dict] = {"pose": bone_weights, "dapt": {"stage": stage, "layout": layout}}
     settings = settings_by_kind.get(config.kind, {})
-    if "prn" in (config.kind, getattr(config, "neck", "")) and recipe.batch < 2:
-        raise InputError("batch must be at least 2 for prn (its batch norms see a few points per person), got 1")
+    check_prn_batch(config, recipe.batch)
     if settings is not bone_weights and any(bone_weights.values()):
         raise InputError("bone and symmetry are terms of the package's own networks: leave them at 0")
     return NETWORKS[config.kind].part("objective")(config=config, **settings)
+
+
+def check_prn_batch(config: Any, batch: int) -> None:
+    """Raises InputError for a batch of one person, of each process, for PRN or its neck."""
+    if "prn" in (getattr(config, "kind", ""), getattr(config, "neck", "")) and batch < 2:
+        raise InputError("batch must be at least 2 for prn (its batch norms see a few points per person), got 1")
 
 
 def make_setup(recipe: Recipe, *, on_cpu: bool = True) -> TrainSetup:

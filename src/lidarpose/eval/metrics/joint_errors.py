@@ -194,7 +194,7 @@ def acceleration_errors(pred: ArrayLike, true: ArrayLike, rate: float, visible: 
     offset = np.where(is_labeled[..., None], pred - true, 0.0)
     has_acceleration = is_labeled[:, :-2] & is_labeled[:, 1:-1] & is_labeled[:, 2:]
     error = np.linalg.norm(offset[:, :-2] - 2 * offset[:, 1:-1] + offset[:, 2:], axis=-1) * rate**2 * 1e3
-    return np.where(has_acceleration, error, np.nan).reshape(len(error), -1)
+    return np.where(has_acceleration, error, np.nan).reshape(len(error), error.shape[1] * error.shape[2])
 
 
 def joint_hits(

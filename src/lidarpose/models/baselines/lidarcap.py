@@ -115,7 +115,6 @@ class SetAbstraction(nn.Module):
         self.layers = _perceptron(channels)
 
     def forward(self, points: Tensor, valid: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        # with fewer points, centers would repeat, which changes no maximum
         count = self.centers if self.as_published else min(self.centers, points.shape[1])
         center_index = farthest_points(points, valid, count, as_published=self.as_published)
         centers = gather_points(points, center_index)
@@ -124,8 +123,12 @@ class SetAbstraction(nn.Module):
         rows = torch.cat([offsets, gather_points(features, index)], -1)
         shape = rows.shape[:3]
         center_features = self.layers(rows.flatten(0, 2)).unflatten(0, shape).amax(2)
-        # centers that were chosen twice do not change a maximum, so all are valid from here on
-        return centers, torch.ones_like(center_index, dtype=torch.bool), center_features
+        is_center = torch.ones_like(center_index, dtype=torch.bool)
+        if not self.as_published:
+            # a small cloud repeats a center; as neighbors of the next layer, copies would displace others
+            is_equal = center_index[:, :, None] == center_index[:, None]
+            is_center = ~is_equal.tril(-1).any(2)
+        return centers, is_center, center_features
 
 
 class StGcn(nn.Module):

@@ -27,18 +27,14 @@ class Rows:
     person: Tensor
     count: Tensor
 
-    def padded(self) -> tuple[Tensor, Tensor]:
-        """Row numbers (B, N), 0 for padding, and `valid` (B, N), False for padding."""
-        column = torch.arange(int(self.count.max()), device=self.count.device)
-        valid = column < self.count[:, None]
-        return ((self.count.cumsum(0) - self.count)[:, None] + column).masked_fill(~valid, 0), valid
-
     def neighbors(self, count: int) -> Tensor:
         """(M, count) numbers of each row's nearest rows of the same person, itself first; -1 for a missing neighbor."""
-        rows, valid = self.padded()
-        index = nearest_neighbors(self.xyz[rows], valid, count)
-        start = rows[:, :1, None]
-        return torch.where(index >= 0, index + start, -1)[valid]
+        start = (self.count.cumsum(0) - self.count).tolist()
+        index = [
+            nearest_neighbors(xyz[None], xyz.new_ones(1, len(xyz), dtype=torch.bool), count)[0]
+            for xyz in self.xyz.split(self.count.tolist())
+        ]
+        return torch.cat([torch.where(rows >= 0, rows + first, -1) for rows, first in zip(index, start, strict=True)])
 
     def pooled(self, grid: float) -> tuple["Rows", Tensor]:
         """Cells of `grid` m, counted from each person's minimum, as rows at their points' mean; each row's cell."""

@@ -111,15 +111,26 @@ class BareAttention(nn.Module):
         self.query, self.key, self.value = (nn.Linear(channels, channels) for _ in range(3))
 
     def forward(self, x: Tensor, valid: Tensor, queries: int | None = None) -> Tensor:
-        """x (B, N, C), valid (B, N): rows that may be attended to -> (B, N, C), or the first `queries` rows of it."""
-        query_rows = x[:, :queries]
-        query, key, value = (
-            layer(rows).unflatten(-1, (self.heads, -1)).transpose(1, 2)
-            for layer, rows in ((self.query, query_rows), (self.key, x), (self.value, x))
-        )
+        """x (B, N, C), valid (B, N): rows that may be attended to -> (B, N, C), or the first `queries` rows of it. Rows
+        that are not valid are returned as they are."""
+        query_rows, is_query = x[:, :queries], valid[:, :queries]
         dropout = self.dropout if self.training else 0.0
-        output = attend(query, key, value, valid[:, None, None], dropout=dropout)
-        return query_rows + output.transpose(1, 2).flatten(2)
+        counts, query_counts = valid.sum(1).tolist(), is_query.sum(1).tolist()
+        projected = [
+            layer(rows).unflatten(-1, (self.heads, -1)).split(lengths)
+            for layer, rows, lengths in (
+                (self.query, query_rows[is_query], query_counts),
+                (self.key, x[valid], counts),
+                (self.value, x[valid], counts),
+            )
+        ]
+        # person by person: padded to the largest one, attention takes several times the memory and the time
+        attended = [
+            attend(*(rows.transpose(0, 1)[None] for rows in person), dropout=dropout)[0].transpose(0, 1).flatten(1)
+            for person in zip(*projected, strict=True)
+        ]
+        output = torch.zeros_like(query_rows).masked_scatter(is_query[..., None], torch.cat(attended))
+        return query_rows + output
 
 
 class PrnNeck(nn.Module):

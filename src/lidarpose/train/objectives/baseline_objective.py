@@ -113,8 +113,8 @@ class ClipObjective(BuiltNetwork):
 def point_labels(
     points: Tensor, valid: Tensor, joints: Tensor, known: Tensor, radius: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Labels (B, N): the index of the nearest labeled joint, J for background, -1 for padding; and the offsets
-    (B, N, 3) m from the points to those joints.
+    """Labels (B, N): the index of the nearest labeled joint, J for background, -1 for padding and for points that may
+    belong to a joint without a label; and the offsets (B, N, 3) m from the points to the nearest joints.
 
     joints (B, J, 3) m; known (B, J): whether a joint is labeled; radius (B,) m, None for `LABEL_RADIUS`.
     """
@@ -122,7 +122,9 @@ def point_labels(
     distance = torch.cdist(points, joints).masked_fill(~known[:, None], torch.inf)
     nearest, joint = distance.min(-1)
     offsets = joints.gather(1, joint[..., None].expand(-1, -1, 3)) - points
-    label = torch.where(nearest < bound, joint, joints.shape[1])
+    # where a joint has no label, background is unknown
+    other = torch.where(known.all(1, keepdim=True), joints.shape[1], -1)
+    label = torch.where(nearest < bound, joint, other)
     return label.masked_fill(~valid, -1), offsets
 
 
@@ -149,7 +151,7 @@ def frame_losses(
         parts = (outputs.parts.softmax(-1) if config.second_softmax else outputs.parts)[valid]
         # adds zero times the head without a loss: gradient averaging across processes waits for all heads
         return {"joints": distance + 0 * outputs.visible.sum(), "part": _cross_entropy(parts, label, share)}
-    is_body = label < joints.shape[1]
+    is_body = (label >= 0) & (label < joints.shape[1])
     offset_error = (outputs.offsets - offset[valid]).norm(dim=-1)[is_body]
     return {
         "joints": distance,
@@ -182,7 +184,8 @@ def mean_distance(joints: Tensor, true: Tensor, known: Tensor, share: Share = on
 
 
 def _cross_entropy(logits: Tensor, label: Tensor, share: Share) -> Tensor:
-    return F.cross_entropy(logits.float(), label, reduction="sum") / at_least_one(share(label.new_tensor(len(label))))
+    count = at_least_one(share((label >= 0).sum()))
+    return F.cross_entropy(logits.float(), label, reduction="sum", ignore_index=-1) / count
 
 
 # ---- initial weights

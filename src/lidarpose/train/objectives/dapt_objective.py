@@ -181,12 +181,13 @@ REDUCED = {SMALL_PAPER: small, TINY_PAPER: tiny}
 
 def nearest_joints(points: np.ndarray, joints: np.ndarray) -> np.ndarray:
     """points (M, 3) m, joints (M, J, 3) m of each point's person, NaN if unknown -> (M,) int64: 1 + the index of the
-    nearest joint within `PRN_RADIUS`, 0 for background, -1 for people without any label."""
+    nearest joint within `PRN_RADIUS`, 0 for background, -1 for points that may belong to a joint without a label."""
     distance = np.linalg.norm(joints - points[:, None], axis=-1)
     is_known = np.isfinite(distance)
     distance = np.where(is_known, distance, np.inf)
-    label = np.where(distance.min(1) < PRN_RADIUS, 1 + distance.argmin(1), 0)
-    return np.where(is_known.any(1), label, UNKNOWN_PART)
+    # where a joint has no label, background is unknown
+    other = np.where(is_known.all(1), 0, UNKNOWN_PART)
+    return np.where(distance.min(1) < PRN_RADIUS, 1 + distance.argmin(1), other)
 
 
 def _thinned(example: Example, grid: float) -> tuple[np.ndarray, np.ndarray]:
