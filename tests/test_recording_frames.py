@@ -168,7 +168,7 @@ def walker(times, rng):
 def steady_rows(times, damaged=()):
     """Indices of the frames whose pose is changed by smoothing, for a person at the given times."""
     lines = [
-        {"time": time, "T_world_sensor": None, "error": None, "people": []}
+        {"time": time, "T_world_sensor": None, "error": None, "up": "z", "people": []}
         | ({"error": "damaged"} if k in damaged else {"people": [{"track": 0} | person_values(pose)]})
         for k, (time, pose) in enumerate(zip(times, walker(times, np.random.default_rng(0)), strict=True))
     ]
@@ -203,11 +203,19 @@ def test_smoothed_lines_of_flipped_and_unposed_frames_are_consistent():
         joints = pose.joints[flip] if is_flipped else pose.joints
         box = {"center": [1.2 * k / 10, 0, 0.9], "size": [0.6, 0.6, 1.8], "yaw": 3.1 if is_flipped else 0.0}
         person = {"track": 0, "score": 0.9, "box": box, "warnings": [], "out_of_range": ["left_hand"] * is_flipped}
-        person |= {"joints": joints.tolist(), "spread": [0.05] * 24, "visible": [], "confidence": []}
+        facing = [-1.0, 0.0, 0.0] if is_flipped else [1.0, 0.0, 0.0]
+        person |= {"joints": joints.tolist(), "spread": [0.05] * 24, "visible": [], "confidence": [], "facing": facing}
         if k == 8:
-            person |= {"joints": None, "spread": [], "warnings": ["no pose: under 5 points", "other"]}
-        lines.append({"time": k / 10, "T_world_sensor": None, "error": None, "people": [person]})
+            person |= {"joints": None, "spread": [], "warnings": ["no pose: under 5 points", "other"], "facing": None}
+        lines.append({"time": k / 10, "T_world_sensor": None, "error": None, "up": "z", "people": [person]})
     people = [line["people"][0] for line in smoothed_lines(lambda: iter(lines), "z", SMPL24)]
+    assert all(p["facing"][0] > 0.9 for p in people)
+    # boxes of the user are not turned, nor those that already agree with the smoothed pose
+    given = list(smoothed_lines(lambda: iter(lines), "z", SMPL24, are_boxes_given=True))
+    assert given[5]["people"][0]["box"]["yaw"] == 3.1
+    turned = json.loads(json.dumps(lines))
+    turned[5]["people"][0]["box"]["yaw"] = 0.3
+    assert list(smoothed_lines(lambda: iter(turned), "z", SMPL24))[5]["people"][0]["box"]["yaw"] == 0.3
     left, right = (
         np.array([p["joints"] for p in people])[:, SMPL24.index(f"{side}_hip"), 1] for side in ("left", "right")
     )

@@ -20,7 +20,7 @@ from walking_people import FRAMES, PLACES, STEPS, moving_source, walking_clouds
 import lidarpose
 from lidarpose import Box, Boxes, InputError
 from lidarpose.cli import main
-from lidarpose.geometry import UP_AXES, rigid_transform, rotation_about
+from lidarpose.geometry import UP_AXES, rigid_transform, rotation_about, rotation_from_up
 from lidarpose.io.sources.frame import Frame, FrameSource, IndexedRecording, LazyFrame, Sweep
 from lidarpose.recording import output, page, picture, result_files
 from lidarpose.recording.coordinates import in_world
@@ -160,7 +160,7 @@ def test_killed_command_resumes_to_same_file(flag, drive, folder, tracked, monke
 
 
 def test_stopped_command_keeps_unfinished_file_only_with_frames(drive, tmp_path, monkeypatch, capsys):
-    def stop(*_):
+    def stop(*_, **__):
         raise KeyboardInterrupt
 
     words = (drive, "--end", 0.1, "--track", "--out", tmp_path / "a.jsonl")
@@ -284,14 +284,34 @@ def test_printing_rejects_boxes_of_other_frames(drive, tmp_path, capsys):
     assert "has boxes of frames elsewhere, but this recording has other frames" in capsys.readouterr().err
 
 
+def test_boxes_state_up_axis_of_recording(clouds, tmp_path, capsys):
+    """Results of `predict --up y`, and of tilted scans, are boxes without `--up`."""
+    R_tilted_level = rotation_about("x", np.radians(12.0))
+    for name, R, up in (("turned", rotation_from_up("y").T, ["--up", "y"]), ("tilted", R_tilted_level, [])):
+        (tmp_path / name).mkdir()
+        for k, cloud in enumerate(clouds[:2]):
+            np.save(tmp_path / name / f"{k}.npy", cloud @ R.T)
+        found, posed = tmp_path / f"{name}.jsonl", tmp_path / f"{name}-2.jsonl"
+        first = run(tmp_path / name, *up, "--out", found)
+        lines = [json.loads(line) for line in found.read_text().splitlines()]
+        again = run(tmp_path / name, "--boxes", found, "--track", "--out", posed)
+        assert [line["error"] for line in again] == [None, None] and all(line["people"] for line in first)
+        assert [line["up"] for line in again] == [line["up"] for line in lines]
+        assert name == "turned" or any("," in line["up"] for line in lines)
+        for line, other in zip(lines, again, strict=True):
+            for person, posed_person in zip(line["people"], other["people"], strict=True):
+                np.testing.assert_allclose(posed_person["joints"], person["joints"], atol=0.2)
+
+
 def test_boxes_with_other_up_axis_are_rejected(drive, tmp_path, capsys):
     people = [{"center": [4.1, 0, 1.5], "size": [1, 1, 2]}]
     entry = {"schema": "lidarpose.boxes/1", "people": people, "up": "y"}
     (tmp_path / "b.json").write_text(json.dumps([{"frame": k} | entry for k in range(2)]))
     words = ["predict", str(drive), "--end", "0.1", "--boxes", str(tmp_path / "b.json"), "--out"]
-    assert main([*words, str(tmp_path / "o.jsonl")]) == 2
+    assert main([*words, str(tmp_path / "o.jsonl"), "--up", "z"]) == 2
     assert "the up axis of the boxes is y, not z: give --up y" in capsys.readouterr().err
-    assert main([*words, str(tmp_path / "o.jsonl"), "--up", "y"]) == 0
+    for up in ([], ["--up", "y"]):
+        assert main([*words, str(tmp_path / "o.jsonl"), *up]) == 0
 
 
 def test_frame_without_points_gives_no_pose_and_no_error(clouds, model, tmp_path, capsys):
@@ -384,12 +404,22 @@ def test_in_world_converts_box_heading(up):
     R_level_input, R_world_level = UP_AXES[up], rotation_about("z", 0.4)
     T_world_sensor = rigid_transform(R_world_level @ R_level_input, np.array([1.0, 2.0, 3.0]))
     box = {"center": [4.0, 5.0, 6.0], "size": [0.5, 0.6, 1.8], "yaw": 0.3}
-    person = {"joints": None, "box": box, "velocity": [1, 2, 3]}
-    person = in_world({"T_world_sensor": T_world_sensor.tolist(), "people": [person]}, up)["people"][0]
-    moved = person["box"]
+    person = {"joints": None, "box": box, "velocity": [1, 2, 3], "facing": [0, 0, 1]}
+    line = in_world({"T_world_sensor": T_world_sensor.tolist(), "people": [person], "up": up}, up)
+    (person,), moved = line["people"], line["people"][0]["box"]
+    assert line["up"] == "z"
+    np.testing.assert_allclose(person["facing"], R_world_level @ R_level_input @ [0, 0, 1], atol=1e-4)
     np.testing.assert_allclose(person["velocity"], R_world_level @ R_level_input @ [1, 2, 3], atol=1e-4)
     assert abs(moved["yaw"] - 0.7) < 1e-9
     np.testing.assert_allclose(moved["center"], R_world_level @ R_level_input @ [4, 5, 6] + [1, 2, 3], atol=1e-4)
+
+
+def test_recording_of_crops_without_search(clouds, model):
+    frames = [Frame(index=k, id=str(k), points=cloud) for k, cloud in enumerate(clouds[:2])]
+    results = list(lidarpose.predict_recording(iter(frames), find=False, model=model))
+    assert [[person.box for person in frame.poses] for frame in results] == [[None], [None]]
+    with pytest.raises(InputError, match="options of the detection: omit them with find=False"):
+        lidarpose.predict_recording(iter(frames), find=False, min_score=0.5, model=model)
 
 
 def test_first_frame_suggests_up_axis(clouds, model, tmp_path):

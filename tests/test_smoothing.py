@@ -350,6 +350,9 @@ def test_predict_clip_smooths_poses_of_clouds(clouds):
     assert not np.allclose(steady[3].joints, each[3].joints)
     first = model.predict_clip(given[:3], sensor_origin=(0, 0, 0), live=True)
     same = model.predict_clip(given, sensor_origin=(0, 0, 0), live=True)
+    # joints out of range are those of the frames
+    assert all((a.in_range == b.in_range).all() for a, b in zip(steady, each, strict=True) if b.has_pose)
+    assert all(person.in_range is not None for person in same if person.num_points)
     # the track is smoothed, or filtered if live, with the given times
     own = [person.pose for person in each]
     for seconds in (None, np.cumsum([0.0, 0.1, 0.4, 0.1, 0.1, 0.3, 0.1, 0.1])):

@@ -196,6 +196,8 @@ def test_open_source_accepts_patterns_lists_and_recursion(tmp_path, monkeypatch)
     assert ids(open_source("day/a/*")) == ["f_2", "f_10"]
     assert ids(open_source(["day/a/f_10.npy", Path("day/a/f_2.npy")])) == ["f_2", "f_10"]
     assert ids(open_source("day/**/*.npy")) == [str(Path(p)) for p in ("a/f_2.npy", "a/f_10.npy", "b/f_2.npy")]
+    # folders match, too, and their files are not read twice
+    assert ids(open_source("day/**")) == ids(open_source("day/**/*.npy"))
     folders = open_source(["day/b", "day/a"])
     assert ids(folders) == ["a/f_2", "a/f_10", "b/f_2"]
     assert folders.count == 3 and [frame.index for frame in folders.frames(2)] == [2]

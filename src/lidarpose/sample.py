@@ -116,25 +116,25 @@ def known_values(record: object, *names: str) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def facing(pose: Pose | None) -> np.ndarray | None:
-    """The horizontal heading of a person: (3,) of length 1 with z = 0.
+def facing(pose: Pose | None, up: str = "z") -> np.ndarray | None:
+    """The horizontal heading of a person: (3,) of length 1, perpendicular to the up axis of the pose's frame.
 
     Computed from the left-right axis of hips and shoulders, by name. None without a pose, or if this axis is unknown or
-    vertical, as for a person lying on the side.
+    vertical, as for a person lying on the side. up: as in `rotation_from_up`.
     """
     if pose is None:
         return None
     names = pose.skeleton.joints
-    axis = np.zeros(3)
+    axis, R_level_pose = np.zeros(3), rotation_from_up(up)
     for joint in ("hip", "shoulder"):
         if f"left_{joint}" in names and f"right_{joint}" in names:
             right_to_left = pose.joints[names.index(f"left_{joint}")] - pose.joints[names.index(f"right_{joint}")]
             if np.isfinite(right_to_left).all():
-                axis = axis + right_to_left
+                axis = axis + R_level_pose @ right_to_left
     length = np.hypot(axis[0], axis[1])
     if length < 0.3 * np.linalg.norm(axis) or length < 0.02:
         return None
-    return np.array([axis[1], -axis[0], 0.0]) / length
+    return R_level_pose.T @ np.array([axis[1], -axis[0], 0.0]) / length
 
 
 def facing_yaw(pose: Pose | None) -> float:

@@ -37,7 +37,7 @@ _SEARCH_OPTIONS = "min_score, max_range, max_people and background"
 # maximum difference of equal up directions, as unit vectors: `detect` rounds them to three decimals
 _SAME_UP = 2e-3
 # maximum difference of up directions along the same axis: 45 degrees, the limit for tilted scans
-_SAME_AXIS = 0.77
+SAME_AXIS = 0.77
 
 
 def predict(
@@ -100,9 +100,7 @@ def predict(
     """
     options = (min_score, max_range, max_people, background)
     is_searched = any(option is not None for option in options)
-    check_choice(boxes, crop, find or is_searched, calib)
-    if find is False and is_searched:
-        raise InputError(f"{_SEARCH_OPTIONS} are options of the detection: omit them with find=False")
+    check_choice(boxes, crop, find or is_searched, calib, find=find)
     start = time.perf_counter()
     input_boxes = None if boxes is None else read_boxes(boxes, calib=calib)
     given_up = up
@@ -111,7 +109,7 @@ def predict(
     rotation_from_up(up)
     if input_boxes is not None:
         # boxes of a tilted scan state its up direction, which may differ from the given axis
-        check_up(input_boxes, up, most=_SAME_AXIS)
+        check_up(input_boxes, up, most=SAME_AXIS)
     scan = Scan(points=np.zeros((0, 3)), boxes=input_boxes, origin=as_origin(sensor_origin), up=up_text(up))
     scan = read_scan(scan, path, columns)
     if find is None:
@@ -207,16 +205,19 @@ def check_up(boxes: Boxes, up: str | Sequence[float], *, most: float = _SAME_UP)
     directions, as unit vectors."""
     difference = rotation_from_up(boxes.up)[2] - rotation_from_up(up)[2]
     # boxes along z may belong to a tilted scan
-    most = _SAME_AXIS if boxes.up == "z" else most
+    most = SAME_AXIS if boxes.up == "z" else most
     if boxes.has_up and np.linalg.norm(difference) > most:
         raise InputError(f"the up axis of the boxes is {boxes.up}, not {up_text(up)}: give --up {boxes.up}")
 
 
-def check_choice(boxes: object, crop: bool, searched: bool, calib: object) -> None:
-    """Raises InputError if more than one of boxes, crop and search is given, or a calibration without boxes."""
+def check_choice(boxes: object, crop: bool, searched: bool, calib: object, *, find: bool | None = None) -> None:
+    """Raises InputError if more than one of boxes, crop and search is given, a calibration without boxes, or options of
+    the search with find=False."""
     if calib is not None and boxes is None:
         raise InputError("calib is for boxes from a KITTI label: expected boxes too, got none: give the label")
     if boxes is not None and crop:
         raise InputError("expected boxes or a crop, got both: a crop contains one person, so omit the boxes")
     if searched and (boxes is not None or crop):
         raise InputError(f"find, {_SEARCH_OPTIONS} are options of the detection: omit them with boxes or a crop")
+    if find is False and searched:
+        raise InputError(f"{_SEARCH_OPTIONS} are options of the detection: omit them with find=False")

@@ -306,12 +306,16 @@ class Predictor(PoseEstimator):
         frame_clouds = [as_points(cloud, f"clouds[{i}]") for i, cloud in enumerate(clouds)]
         poses = self._predict_clouds(frame_clouds, as_origin(sensor_origin), skeleton, progress, clips)
         track = TrackPoses.of_poses(seconds, [person.pose for person in poses], poses.skeleton)
-        steady_poses = filter_track(track) if live else smooth(track).poses()
+        is_swapped: np.ndarray = np.zeros(len(track), bool)
+        if live:
+            steady_poses = filter_track(track)
+        else:
+            steady_track = smooth(track)
+            assert steady_track.swapped is not None
+            steady_poses, is_swapped = steady_track.poses(), steady_track.swapped
         frames = [
-            replace(
-                person, id=i, pose=_with_person_probabilities(person, pose), warnings=_steady_warnings(person, pose)
-            )
-            for i, (person, pose) in enumerate(zip(poses, steady_poses, strict=True))
+            replace(person, id=i, pose=_with_frame_values(person, pose, swap), warnings=_steady_warnings(person, pose))
+            for i, (person, pose, swap) in enumerate(zip(poses, steady_poses, is_swapped.tolist(), strict=True))
         ]
         return replace(poses, people=tuple(frames))
 
@@ -452,12 +456,15 @@ def _range_warning(pose: Pose) -> str | None:
     return f"at the edge of the heatmap's range, perhaps farther out than predicted: {first_names(names)}"
 
 
-def _with_person_probabilities(person: PersonPose, pose: Pose | None) -> Pose | None:
-    """The smoothed pose with the per-person probabilities of its frame, which are not smoothed. Filled-in frames
-    have none."""
+def _with_frame_values(person: PersonPose, pose: Pose | None, is_swapped: bool) -> Pose | None:
+    """The smoothed pose with the values of its frame that are not smoothed: the per-person probabilities and which
+    joints are in range. Filled-in frames have none. is_swapped: whether left and right were exchanged."""
     if pose is None or person.pose is None:
         return pose
-    return replace(pose, **{name: getattr(person.pose, name) for name in PER_PERSON})
+    in_range = person.pose.in_range
+    if in_range is not None and is_swapped:
+        in_range = in_range[list(pose.skeleton.flip)]
+    return replace(pose, in_range=in_range, **{name: getattr(person.pose, name) for name in PER_PERSON})
 
 
 def _steady_warnings(person: PersonPose, pose: Pose | None) -> tuple[str, ...]:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, cast, overload
 import numpy as np
 
 from lidarpose.errors import counted
-from lidarpose.geometry import rotation_from_up
 from lidarpose.io.atomic import check_suffix, write_atomic
 from lidarpose.io.files import encodable, lined_json
 from lidarpose.sample import JOINT_COLUMNS, PER_JOINT, Box, Pose, facing
@@ -102,11 +101,7 @@ class PersonPose:
         """(3,): the horizontal direction of length 1 in which hips and shoulders face, in the frame of the input; for
         people who lie on the back or belly, toward their feet or head. None without a pose and for people who lie on
         their side."""
-        if self.pose is None:
-            return None
-        R_level_input = rotation_from_up(self.up)
-        forward = facing(replace(self.pose, joints=self.pose.joints @ R_level_input.T))
-        return None if forward is None else forward @ R_level_input
+        return facing(self.pose, self.up)
 
     @property
     def person(self) -> float | None:
@@ -158,7 +153,7 @@ class PersonPose:
             "second_person": None
             if self.second_person is None
             else round(self.second_person, _DECIMALS["second_person"]),
-            "facing": None if (forward := self.facing) is None else _rounded(forward, _DECIMALS["facing"]),
+            "facing": facing_entry(self.pose, self.up),
             "joints": None if self.pose is None else _rounded(self.joints, _DECIMALS["x"]),
             "confidence": _rounded(self.confidence, _DECIMALS["confidence"]),
             "spread": _rounded(self.spread, _DECIMALS["spread"]),
@@ -385,6 +380,12 @@ class Poses(Sequence[PersonPose]):
         if path is not None:
             write_atomic(path, text.encode("utf-8", "replace"))
         return text
+
+
+def facing_entry(pose: Pose | None, up: str) -> list | None:
+    """The entry `facing` of a person in JSON; up: up axis of the pose's frame."""
+    forward = facing(pose, up)
+    return None if forward is None else _rounded(forward, _DECIMALS["facing"])
 
 
 def _rounded(values: np.ndarray | None, digits: int) -> list:

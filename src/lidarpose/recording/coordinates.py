@@ -57,8 +57,8 @@ def moved_yaw(yaw: float, T: np.ndarray, R_from: np.ndarray | None = None, R_to:
 
 
 def in_world(line: dict[str, Any], up: str = "z") -> dict[str, Any]:
-    """The line with joints, boxes and velocities in the world frame if the sensor pose is known, else unchanged. up: up
-    axis of the sensor frame."""
+    """The line in the world frame, z up, if the sensor pose is known, else unchanged. up: up axis of the sensor
+    frame."""
     if line["T_world_sensor"] is None:
         return line
     T = np.array(line["T_world_sensor"])
@@ -67,13 +67,14 @@ def in_world(line: dict[str, Any], up: str = "z") -> dict[str, Any]:
         changes: dict[str, Any] = {}
         if person["joints"] is not None:
             changes["joints"] = rounded_points(T, person["joints"])
-        if (velocity := person.get("velocity")) is not None:
-            changes["velocity"] = (T[:3, :3] @ velocity).round(4).tolist()
+        for name in ("velocity", "facing"):
+            if (direction := person.get(name)) is not None:
+                changes[name] = (T[:3, :3] @ direction).round(4).tolist()
         if (box := person["box"]) is not None:
-            yaw = moved_yaw(box["yaw"], T, rotation_of_boxes(up))
+            yaw = round(moved_yaw(box["yaw"], T, rotation_of_boxes(up)), 4)
             changes["box"] = box | {"center": rounded_points(T, box["center"]), "yaw": yaw}
         people.append(person | changes)
-    return line | {"people": people, "coordinates": "world"}
+    return line | {"people": people, "coordinates": "world", "up": "z"}
 
 
 def rounded_points(T: np.ndarray, points: Any) -> list:

@@ -3,12 +3,14 @@
 import json
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from functools import partial
 from numbers import Integral
 from pathlib import Path
 from typing import Any
 
 from lidarpose.errors import InputError
+from lidarpose.geometry import upright_axis
 from lidarpose.io.boxes import Boxes, read_boxes
 from lidarpose.io.files import FRAME_NUMBER, file_error, read_bytes, shorten
 from lidarpose.io.sources import DamagedFrame, Frame
@@ -80,6 +82,14 @@ class FrameBoxes:
         except InputError as error:
             boxes = self._by_frame[key]
             raise error if isinstance(boxes, str | os.PathLike) else file_error(f"frame {key}", error) from None
+
+    def up_axis(self) -> str:
+        """The axis nearest to the up direction that the first boxes state; z if they state none. Boxes that cannot be
+        read are left to `of`."""
+        for content in self._by_frame.values():
+            with suppress(InputError):
+                return upright_axis(self._read(content).up)
+        return "z"
 
     def check_used(self, last: str) -> None:
         """Raises InputError if none of the frames had boxes, which means that the boxes belong to another recording.

@@ -260,7 +260,10 @@ def write_recording(
                 part.remove()
                 raise nothing_read(source.name, part.frames, error)
             is_smoothed = predictor.is_tracked and not predictor.live
-            lines = smoothed_lines(part.lines, predictor.up, predictor.wanted) if is_smoothed else part.lines()
+            lines = part.lines()
+            if is_smoothed:
+                are_boxes_given = predictor.boxes is not None
+                lines = smoothed_lines(part.lines, predictor.up, predictor.wanted, are_boxes_given=are_boxes_given)
 
             def final() -> Iterator[dict[str, Any]]:
                 for line in lines:

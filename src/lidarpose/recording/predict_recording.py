@@ -15,7 +15,7 @@ from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_from_up, up_text
 from lidarpose.inference.detection import DetectedScan, detect_places, least_score, search_options
 from lidarpose.inference.inputs import as_origin, as_points, only_returns
-from lidarpose.inference.predict_scan import check_choice, check_up, is_whole, predict_scan, predictor_of
+from lidarpose.inference.predict_scan import SAME_AXIS, check_choice, check_up, is_whole, predict_scan, predictor_of
 from lidarpose.inference.predictor import Predictor
 from lidarpose.inference.results import Poses
 from lidarpose.inference.scan import Scan
@@ -80,7 +80,7 @@ class PosingOptions(TypedDict, total=False):
     boxes: "str | os.PathLike | Mapping[Any, Any] | None"
     calib: str | os.PathLike | None
     crop: bool
-    find: bool
+    find: bool | None
     min_score: float | None
     max_range: float | None
     max_people: int | None
@@ -217,7 +217,7 @@ class FramePredictor:
         boxes: "str | os.PathLike | Mapping[Any, Any] | None" = None,
         calib: str | os.PathLike | None = None,
         crop: bool = False,
-        find: bool = False,
+        find: bool | None = None,
         min_score: float | None = None,
         max_range: float | None = None,
         max_people: int | None = None,
@@ -235,17 +235,22 @@ class FramePredictor:
     ):
         search_arguments = (min_score, max_range, max_people, background)
         is_searched = find or any(option is not None for option in search_arguments)
-        check_choice(boxes, crop, is_searched, calib)
-        up_direction = "z" if up is None else up
-        rotation_from_up(up_direction)
-        self.up, self.name, self.skeleton = up_text(up_direction), name, skeleton
+        check_choice(boxes, crop, is_searched, calib, find=find)
         self.boxes = None if boxes is None else FrameBoxes(boxes, calib=calib)
+        # without `up`, boxes that state their up direction determine it: all along one axis, but each frame its own
+        self._has_up = up is not None
+        if up is None:
+            up = "z" if self.boxes is None else self.boxes.up_axis()
+        rotation_from_up(up)
+        self.up, self.name, self.skeleton = up_text(up), name, skeleton
         self._origin = sensor_origin if sensor_origin is None else (as_origin(sensor_origin),)
         # whether the frames are crops; None until the first frame with points decides
         self._is_crop = True if crop else False if is_searched or boxes is not None else None
+        if find is False and boxes is None:
+            self._is_crop = True
         # whether any frame was searched
         self._was_searched = False
-        self._search = search_options(*search_arguments, columns, topic, meta, up=up)
+        self._search = search_options(*search_arguments, columns, topic, meta, up=up if self._has_up else None)
         self._model = model
         self._loaded: Predictor | None = None
         self.live, self.people = live, None
@@ -329,8 +334,11 @@ class FramePredictor:
             boxes = self.boxes.of(frame)
             if boxes is None:
                 notes += ["no boxes are given for this frame"]
-            else:
+            elif self._has_up:
                 check_up(boxes, self.up)
+            else:
+                check_up(boxes, self.up, most=SAME_AXIS)
+                scan = replace(scan, up=boxes.up if boxes.has_up else self.up)
             scan = replace(scan, boxes=boxes or [])
         elif self._is_crop is None and len(points):
             self._is_crop = not is_whole(scan)

@@ -1,11 +1,13 @@
 """Smooths the poses of all tracks in the lines of a recording."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from lidarpose.geometry import inverse_transform, transform_points
+from lidarpose.geometry import inverse_transform, rotation_of_boxes, transform_points
+from lidarpose.inference.results import facing_entry
 from lidarpose.recording.coordinates import FixedFrame, rounded_points
 from lidarpose.sample import Pose, known_values
 from lidarpose.skeleton import Skeleton
@@ -18,7 +20,7 @@ _SMOOTHED = {"spread": 4, "visible": 3, "confidence": 3}
 
 
 def smoothed_lines(
-    lines: Callable[[], Iterator[dict[str, Any]]], up: str, skeleton: Skeleton
+    lines: Callable[[], Iterator[dict[str, Any]]], up: str, skeleton: Skeleton, *, are_boxes_given: bool = False
 ) -> Iterator[dict[str, Any]]:
     """The lines with all tracks smoothed, and with people added in frames in which they were occluded.
 
@@ -26,6 +28,7 @@ def smoothed_lines(
         lines: returns an iterator over the lines from the first; called twice.
         up: up axis of the points, as in `predict`.
         skeleton: skeleton of the poses.
+        are_boxes_given: whether the boxes are the user's, which are not changed.
     """
     times: list[float] = []
     to_fixed: list[np.ndarray] = []
@@ -51,23 +54,41 @@ def smoothed_lines(
     for line, people, T_fixed_sensor in zip(lines(), steady_poses, to_fixed, strict=True):
         T_sensor_fixed = inverse_transform(T_fixed_sensor)
         entries = {
-            id: _entry(pose, T_sensor_fixed) | {"filled": is_filled} for id, (pose, is_filled, _) in people.items()
+            id: _entry(pose, T_sensor_fixed, line["up"]) | {"filled": is_filled}
+            for id, (pose, is_filled, _) in people.items()
         }
         swapped = {id for id, (_, _, is_swapped) in people.items() if is_swapped}
         people.clear()
         line_people = [_unswapped(p, skeleton) if p["track"] in swapped else p for p in line["people"]]
+        if not are_boxes_given:
+            R_boxes_sensor = rotation_of_boxes(line["up"])
+            line_people = [
+                _with_box_facing(person, entries[person["track"]]["facing"], R_boxes_sensor)
+                if person["track"] in swapped
+                else person
+                for person in line_people
+            ]
         yield line | {"people": list(_with_steady(line_people, entries))}
 
 
 def _unswapped(person: dict[str, Any], skeleton: Skeleton) -> dict[str, Any]:
-    """A person whose left and right were exchanged: with the other side's joints out of range, and the detected box,
-    which was fitted to the pose, turned by half a turn."""
-    joints, box = skeleton.joints, person["box"]
+    """A person whose left and right were exchanged, with the other side's joints out of range."""
+    joints = skeleton.joints
     others = {name: joints[skeleton.flip[k]] for k, name in enumerate(joints)}
-    if box is not None and person["score"] is not None:
-        yaw = (box["yaw"] + 2 * np.pi) % (2 * np.pi) - np.pi
-        box = box | {"yaw": round(float(yaw), 4)}
-    return person | {"box": box, "out_of_range": [others.get(name, name) for name in person["out_of_range"]]}
+    return person | {"out_of_range": [others.get(name, name) for name in person["out_of_range"]]}
+
+
+def _with_box_facing(person: dict[str, Any], facing: list | None, R_boxes_sensor: np.ndarray) -> dict[str, Any]:
+    """A person whose box was fitted to a pose with left and right exchanged: turned by half a turn if it is opposite to
+    `facing` (3,), the smoothed one."""
+    box = person["box"]
+    if box is None or facing is None:
+        return person
+    x, y, _ = R_boxes_sensor @ facing
+    if x * np.cos(box["yaw"]) + y * np.sin(box["yaw"]) > 0:
+        return person
+    yaw = (box["yaw"] + 2 * np.pi) % (2 * np.pi) - np.pi
+    return person | {"box": box | {"yaw": round(float(yaw), 4)}}
 
 
 def _steady(poses: dict[int, Pose], times: np.ndarray) -> Iterator[tuple[int, Pose, bool, bool]]:
@@ -87,13 +108,14 @@ def _steady(poses: dict[int, Pose], times: np.ndarray) -> Iterator[tuple[int, Po
                 yield row, pose, row not in poses, bool(track.swapped[i])
 
 
-def _entry(pose: Pose, T_sensor_fixed: np.ndarray) -> dict[str, Any]:
-    """The entries of a line for a smoothed pose."""
+def _entry(pose: Pose, T_sensor_fixed: np.ndarray, up: str) -> dict[str, Any]:
+    """The entries of a line for a smoothed pose. up: up axis of the sensor frame."""
     values = {
         name: value.astype(np.float32).astype(float).round(_SMOOTHED[name]).tolist()
         for name, value in known_values(pose, *_SMOOTHED).items()
     }
-    return values | {"joints": rounded_points(T_sensor_fixed, pose.joints)}
+    joints = rounded_points(T_sensor_fixed, pose.joints)
+    return values | {"joints": joints, "facing": facing_entry(replace(pose, joints=np.array(joints)), up)}
 
 
 def _with_steady(people: list[dict[str, Any]], entries: dict[int, dict[str, Any]]) -> Iterator[dict[str, Any]]:

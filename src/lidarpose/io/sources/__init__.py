@@ -105,6 +105,9 @@ def _matches(path: str | os.PathLike) -> list[Path]:
     paths = sorted(map(Path, glob.glob(pattern, recursive=True)), key=natural_key)
     # as in a folder, files of other formats, such as labels, are left out
     paths = [p for p in paths if p.is_dir() or p.suffix.lower() in (*SUFFIXES, *RECORDINGS)] or paths
+    # a/** matches folders and the files in them, which would be read twice
+    read_folders = {folder for p in paths if not p.is_dir() for folder in p.parents}
+    paths = [p for p in paths if p not in read_folders]
     if not paths:
         problem = "no file matches the pattern" if glob.has_magic(pattern) else "no such file or folder"
         raise file_error(path, f"{problem}; expected point files, a folder of them or a recording: check the path")
