@@ -92,6 +92,14 @@ def test_draw_moving_bodies_captured_share_and_jumps(share):
         np.testing.assert_array_equal(somebody.moved(0)[1], somebody.joints[1])
 
 
+def test_draw_moving_bodies_mixes_sources_in_any_order():
+    bank = PoseBank.of_motion(motion(frames=60))
+    kinds = [somebody.kinds[0] for somebody in draw_moving_bodies(bank, 0.5, 24, 2, np.random.default_rng(0))]
+    is_captured = [kind == "captured" for kind in kinds]
+    # captured ones are not all first; a kind of the prior is also called so
+    assert not all(is_captured[:8]) and any(is_captured[:8]) and any(is_captured[16:])
+
+
 def test_pose_bank_clip_tempo_changes_speed():
     bank = PoseBank.of_motion(motion(frames=60))
     own = bank.clip(9, np.random.default_rng(0))

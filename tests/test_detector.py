@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from test_proposals import column, nearest, plane
 
 from lidarpose.models.detector import detector, proposals
 from lidarpose.models.detector.detector import SAME, Detector
 from lidarpose.synth.street import street
-from tests.test_proposals import column, nearest, plane
 
 ORIGIN = np.zeros(3)
 

@@ -18,7 +18,7 @@ from lidarpose.models.detector.proposals import columns, heights_above, propose
 from lidarpose.models.detector.render import CandidateAugmentation, render
 from lidarpose.synth.street import street
 from lidarpose.train.detector.candidate_source import draw_augmentation
-from tests.reference.detector_reference import (
+from reference.detector_reference import (
     context_reference,
     fine_reference,
     range_reference,

@@ -117,6 +117,15 @@ def test_captured_people_keep_recorded_positions(offset):
         assert np.abs((away + np.pi) % (2 * np.pi) - np.pi).min() < 0.6
 
 
+def test_recorded_people_outside_a_rosettes_view_are_scanned_by_other_sensors():
+    # behind a sensor that looks ahead
+    bank, _ = _bank(np.array([-9.0, 3.0, 0.0]))
+    scene = scene_config("wide").changed(("accumulated=0", "integration=0", "recorded=1", "sparse=1"))
+    generator = Generator(scene=scene, bank=bank, captured=1.0, measure=False)
+    people = [generator.person(1, index).sample for index in range(30)]
+    assert all(person.pose.joints[:, 0].max() < -6 and len(person.points) for person in people)
+
+
 def test_recorded_positions_need_motion_and_single_frames(tmp_path):
     scene = scene_config("paper").changed(("recorded=1",))
     with pytest.raises(InputError, match="--motion"):

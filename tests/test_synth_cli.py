@@ -172,6 +172,8 @@ BAD = {
         "integration changes nothing without rosettes: name one by --sensor, or omit it",
     ),
     "sparse": (["-n", "1", "--sensor", "os1-64", "--set", "sparse=1"], "sparse scans with sensors of its own: omit it"),
+    "sensors twice": (["-n", "1", "--sensor", "os1-64", "--set", "sensors=vlp-16"], "expected --sensor or --set sens"),
+    "difficulty twice": (["-n", "1", "--hard", "0.3", "--set", "hard=0.8"], "expected --hard or --set hard=..., got"),
     "clips": (
         ["-n", "1", "--clips", "--set", "merged=1,crowded=1"],
         "clips are scanned in one way only: omit merged, crowded",

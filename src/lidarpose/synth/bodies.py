@@ -257,23 +257,25 @@ def draw_moving_bodies(
         bank.clip(frames + 1, rng, tempo=tempo) if bank is not None and rng.random() < captured else None
         for _ in range(count)
     ]
-    motion: list[tuple[np.ndarray, np.ndarray, str, np.ndarray | None]]
-    motion = [(*clip, "captured", None) for clip in clips if clip is not None]
+    is_captured = np.array([clip is not None for clip in clips], bool)
     if prior_count := clips.count(None):
         prior_clips = sample_clips(rng, prior_count, frames=frames + 1, hz=CLIP_HZ, mix=mix)
         flat_translation = prior_clips.translation * np.array([1, 1, 0], np.float32)
-        motion += zip(
+        prior_motion = zip(
             prior_clips.rotations,
             flat_translation,
             [KINDS[kind] for kind in prior_clips.kind],
             prior_clips.clearance,
             strict=True,
         )
+    # in the order of the draws, so that no person's source depends on their place in the block
+    motion: list[tuple[np.ndarray, np.ndarray, str, np.ndarray | None]]
+    motion = [next(prior_motion) if clip is None else (*clip, "captured", None) for clip in clips]
     people = rig.draw_people(rng, count)
     cloth_offsets = clothing(rng, count, rig) * np.float32(clothes)
     if clear_limbs and prior_count < count:
         rotations = np.stack([clip_rotations for clip_rotations, *_ in motion])
-        rotations = cleared(rig, people, cloth_offsets, rotations, np.arange(count - prior_count), is_clip=True)
+        rotations = cleared(rig, people, cloth_offsets, rotations, np.flatnonzero(is_captured), is_clip=True)
         motion = [(clip_rotations, *rest) for clip_rotations, (_, *rest) in zip(rotations, motion, strict=True)]
     return [
         _moving_body(

@@ -25,7 +25,7 @@ from lidarpose.synth.acquisition import ACQUISITION_DRAWS, MOST_FRAMES, SINGLE_S
 from lidarpose.synth.bodies import Bodies, PoseBank, draw_bodies, draw_moving_bodies
 from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.environment.surroundings import ground, occluder, surroundings
-from lidarpose.synth.place import Place, draw_place, recorded_place
+from lidarpose.synth.place import Place, draw_place
 from lidarpose.synth.props import POSED_WITH_A_PROP, draw_props
 from lidarpose.synth.scene import RandomStream, SceneConfig, scene_config
 from lidarpose.synth.simulate import (
@@ -192,6 +192,9 @@ class Generator:
         best_draw, most_points = None, 0.0
         draw = _draw_clip_frame if in_clip else _draw_sample
         for attempt in range(_TRIES if self.redraw else 1):
+            if attempt and config.recorded:
+                # the recorded place may be outside the field of view of the acquisition's sensors
+                acquisition = SINGLE_SCAN
             eased_config = config.eased(config.hard * (1 - attempt / (_TRIES - 1))) if attempt else config
             scene = _draw_scene(eased_config, bodies, rows[0], block, row, 0.8**attempt, rng, acquisition)
             samples = [draw(scene, bodies, k, frame, rng) for frame, k in enumerate(rows)]
@@ -224,9 +227,9 @@ def _draw_scene(
     low, high = bodies.extent[first_row]
     height, reach = high[2], max(-low[0], -low[1], high[0], high[1])
     place_config = acquisition.placing(config)
-    place = draw_place(place_config, device, height, reach, nearer, rng, acquisition.inverted)
-    if config.recorded and bodies.places is not None and np.isfinite(bodies.places[first_row]).all():
-        place = recorded_place(place, bodies.places[first_row])
+    recorded = bodies.places[first_row] if config.recorded and bodies.places is not None else None
+    recorded = recorded if recorded is not None and np.isfinite(recorded).all() else None
+    place = draw_place(place_config, device, height, reach, nearer, rng, acquisition.inverted, recorded)
     background = [ground(config, place.feet, rng), *surroundings(config, place.feet, reach, rng)]
     if (occluder_mesh := occluder(config, place.feet, height, rng)) is not None:
         background.append(occluder_mesh)

@@ -6,7 +6,7 @@ Frames: the level frame at the sensor (z up, the ground under the person at z = 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from math import atan2, cos, pi, sin, tan
+from math import atan2, cos, hypot, pi, sin, tan
 
 import numpy as np
 
@@ -68,16 +68,20 @@ class Place:
 
 def draw_place(
     config: SceneConfig, device: Sensor | RayPattern, tall: float, wide: float, nearer: float, rng: np.random.Generator,
-    inverted: bool = False,
+    inverted: bool = False, recorded: np.ndarray | None = None,
 ) -> Place:  # fmt: skip
     """The place of a person `tall` m high, who reaches `wide` m to the sides. Paper: section "Scene sampling".
 
     `nearer` scales the distance, for another draw of a person with too few points; `inverted`: the sensor is mounted
-    upside down.
+    upside down; `recorded` (3,): x, y m and heading rad of a recording, kept instead of drawn ones.
     """
     distance = max(draw_distance(config, device, rng) * nearer, config.distance[0])
     azimuth_share, yaw, cut_draw = rng.random(3).tolist()
     azimuth = _azimuth(device, atan2(wide, distance), azimuth_share, cut_draw < _CUT or not config.mount)
+    yaw = 2 * np.pi * yaw - np.pi
+    if recorded is not None:
+        x, y, yaw = recorded.astype(float).tolist()
+        distance, azimuth = hypot(x, y), atan2(y, x)
     pitch, roll = 0.0 if inverted else device.tilt, 0.0
     if config.mount:
         pitch, roll = pitch + _MOUNT_TILT * rng.standard_normal(), _MOUNT_TILT * rng.standard_normal()
@@ -91,16 +95,10 @@ def draw_place(
         height = draw_height(device, distance, tall, config.mount, pitch, azimuth, rng)
     return Place(
         feet=np.array([distance * cos(azimuth), distance * sin(azimuth), -height]),
-        yaw=float(2 * np.pi * yaw - np.pi),
+        yaw=float(yaw),
         distance=float(distance),
         R_sensor_level=R_sensor_level,
     )
-
-
-def recorded_place(place: Place, recorded: np.ndarray) -> Place:
-    """`place` with x, y m and heading rad replaced by those of a recording (3,)."""
-    x, y, yaw = recorded.astype(float)
-    return replace(place, feet=np.array([x, y, place.feet[2]]), yaw=float(yaw), distance=float(np.hypot(x, y)))
 
 
 def _azimuth(device: Sensor | RayPattern, half_width: float, share: float, may_cut: bool) -> float:

@@ -85,6 +85,10 @@ class SynthesisJob:
         if scene.recorded and self.what == "clips":
             raise InputError("recorded=1 keeps the positions of single poses: omit it or --clips")
         set_names = {change.partition("=")[0] for change in self.set}
+        twice = {"--sensor": ("sensors", self.sensors is not None), "--hard": ("hard", self.hard != 1)}
+        for option, (name, is_given) in twice.items():
+            if is_given and name in set_names:
+                raise InputError(f"expected {option} or --set {name}=..., got both: omit one of the two")
         acquisitions = [name for name in ACQUISITIONS if name in set_names and getattr(scene, name)]
         if acquisitions and self.what == "clips":
             raise InputError(f"clips are scanned in one way only: omit {', '.join(acquisitions)}, or --clips")
