@@ -9,6 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from reference.detector_reference import (
+    context_reference,
+    fine_reference,
+    range_reference,
+    suppress_near_reference,
+)
 
 from lidarpose.geometry import rotation_about
 from lidarpose.models.detector import proposals
@@ -18,12 +24,6 @@ from lidarpose.models.detector.proposals import columns, heights_above, propose
 from lidarpose.models.detector.render import CandidateAugmentation, render
 from lidarpose.synth.street import street
 from lidarpose.train.detector.candidate_source import draw_augmentation
-from reference.detector_reference import (
-    context_reference,
-    fine_reference,
-    range_reference,
-    suppress_near_reference,
-)
 
 ORIGIN = np.zeros(3)
 

@@ -19,7 +19,7 @@ _TURNED = ("--augment", "turn")
 # and at full width smaller batches, since it sees few people there
 _FASTER, _FASTER_WIDE = ("--rate", "2e-3"), ("--rate", "1e-3", "--batch", "32")
 _ONE_CYCLE = (*_FASTER, "--schedule", "cosine", "--warmup", "0.04")
-# likewise baselines at full width: steps of 2 clips, or 1, and LPFormer with an eighth of its cells and the same weights
+# likewise baselines at full width: steps of 2 clips, of NE 1, and LPFormer with an eighth of its cells
 _WIDE_BASELINES = {
     "lidarcap": ("--batch", "32"),
     "ne": ("--batch", "16"),
