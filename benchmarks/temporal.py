@@ -23,7 +23,7 @@ from torch import nn
 
 from lidarpose.skeleton import BODY26, HUMAN15
 from lidarpose.synth.bodies import CLIP_HZ
-from lidarpose.tracking.bones import keep_lengths, lengths_of, measured, rigid_bones
+from lidarpose.tracking.bones import keep_lengths, length_statistics, lengths_of, rigid_bones
 from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.smoothing import known_spread, smooth, with_facing_corrected
 
@@ -218,7 +218,7 @@ def corrected(net: SplineNet, clips: dict[str, np.ndarray]) -> np.ndarray:
     bones = rigid_bones(BODY26)
     for clip, is_seen, spread in zip(joints, clips["known"], clips["steady_spread"], strict=True):
         variance = known_spread(spread, is_seen, len(BODY26))[is_seen] ** 2
-        bone_sums = measured(clip[is_seen], np.full_like(variance, 1e-6), bones)
+        bone_sums = length_statistics(clip[is_seen], np.full_like(variance, 1e-6), bones)
         lengths = lengths_of(bone_sums.sum(0), bones, BODY26.flip)
         clip[is_seen] = keep_lengths(clip[is_seen], variance, bones, lengths)
     return joints

@@ -13,6 +13,7 @@ from lidarpose.body.smpl import load_body
 from lidarpose.data.clips import MARGIN, MOST, consecutive, static_points, window_points, without_person
 from lidarpose.data.prepare import reader
 from lidarpose.data.readers import base
+from lidarpose.data.readers.base import SceneClouds
 from lidarpose.data.rows import person_row, sample_of
 from lidarpose.data.shards import read_rows
 from lidarpose.errors import InputError
@@ -202,6 +203,9 @@ def test_consecutive_splits_at_gaps_and_tracks():
     frames = [5, 7, 10, 8, 15, 9, 20, 10, 45, 11, 50, 30]
     runs = [run.tolist() for run in consecutive(tracks, frames)]
     assert runs == [[0, 2, 4, 6], [8, 10], [1, 3, 5, 7, 9], [11]]
+    # most of the frames of a sparse track are missing
+    assert [run.tolist() for run in consecutive(["a"] * 6, [0, 5, 6, 11, 12, 20])] == [[0], [1, 2], [3, 4], [5]]
+    assert [run.tolist() for run in consecutive(["a"], [7])] == [[0]]
     order = np.random.default_rng(0).permutation(12)
     shuffled = consecutive([tracks[k] for k in order], [frames[k] for k in order])
     assert sorted([order[run].tolist() for run in shuffled]) == sorted(runs)
@@ -217,3 +221,13 @@ def test_clip_windows_repeat_last_frame_at_end(count):
     longer = clip_windows(rows, following=3)
     np.testing.assert_array_equal(longer[:, :CLIP_FRAMES], clips)
     np.testing.assert_array_equal(longer[:, CLIP_FRAMES:], np.minimum(clips[:, -1:] + [1, 2, 3], rows[-1]))
+
+
+def test_map_of_a_sequence_uses_scans_with_a_person(tmp_path):
+    still = np.random.default_rng(0).uniform(-20, 20, (200, 3))
+    np.save(tmp_path / "scan.npy", still)
+    paths = dict.fromkeys(range(240), tmp_path / "scan.npy")
+    read = []
+    clouds = SceneClouds(paths, lambda frame: read.append(frame) or still[:3], range(0, 240, 12))
+    assert len(clouds._static) > 150 and sorted(set(read)) == list(range(0, 240, 12))
+    assert not len(SceneClouds(paths, lambda frame: still[:3], ())._static)

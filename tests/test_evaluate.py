@@ -443,8 +443,10 @@ def test_triples_are_consecutive_and_evenly_spaced(sets):
     # the step of the sequence is one frame, not two
     assert sorted(triples_of([3, 1, 2, 5, 6, 7, 9, 11, 13])) == [[1, 2, 3], [5, 6, 7]]
     assert not triples_of([1, 2]) and not triples_of([1, 2, 3], time=np.full(3, np.nan))
-    # frames of another track do not remove triples
-    assert len(triples_of([0, 2, 4, 6, 8, 9, 10], track=np.array(["a"] * 5 + ["b"] * 2))) == 3
+    # every second frame is none of successive ones, if another track of the sequence has those between
+    frames, two_tracks = [0, 2, 4, 6, 8, 9, 10], np.array(["a"] * 5 + ["b"] * 2)
+    assert not triples_of(frames, track=two_tracks)
+    assert len(triples_of(frames, track=two_tracks, sequence=two_tracks)) == 3
 
 
 def test_facing_flipped_beyond_right_angle(sets):

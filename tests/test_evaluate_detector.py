@@ -466,3 +466,18 @@ def test_score_detector_groups_by_mount_with_unknown_origin():
     # the mount of synthesized scenes is known
     made = synthetic_scan(0, 3)
     assert made.height.endswith(("m", "more")) and "degrees" in made.tilt
+
+
+def test_run_detector_rejects_unused_file_and_repeated_names(tmp_path):
+    with pytest.raises(InputError, match="a detector's file is for the methods detector and scorer, got candidates"):
+        run_module.run_detector("candidates", weights=tmp_path / "x.onnx")
+    with pytest.raises(InputError, match="two sets of scans are called heldout"):
+        run_module.run_detector("candidates", heldout=True, folders=[_scans_called(tmp_path / "heldout")])
+
+
+def _scans_called(folder):
+    """A folder with one scan without people."""
+    folder.mkdir()
+    np.save(folder / "0.npy", np.random.default_rng(0).uniform(-9, 9, (50, 3)))
+    (folder / "0.json").write_text('{"people": []}')
+    return folder

@@ -285,6 +285,18 @@ def test_displaced_crop_includes_surrounding_points(humanm3):
     assert gained > 0
 
 
+def test_frame_out_of_level_turns_surroundings_of_clips(humanm3):
+    setup = set_up(humanm3)
+    person = module.people_to_perturb(setup)[0]
+    around = {name: person.shown.points[:20].astype(np.float32) for name in ("background", "neighbors")}
+    shown = replace(person.shown, sample=replace(person.shown.sample, **around))
+    name = next(name for name, one in PERTURBATIONS.items() if one.rigid)
+    turned = module._perturbed(setup, replace(person, shown=shown), name, PERTURBATIONS[name].amounts[-1])
+    for cloud in (turned.sample.background, turned.sample.neighbors):
+        np.testing.assert_allclose(cloud, turned.points[:20], atol=1e-3)
+    assert np.abs(turned.points[:20] - shown.points[:20]).max() > 0.05
+
+
 @pytest.mark.parametrize("protocol", ["clean", "dapt"])
 def test_crop_displaced_by_zero_is_unchanged(humanm3, protocol):
     """Also in the protocol dapt, which uses another box."""

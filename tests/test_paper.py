@@ -442,8 +442,8 @@ def test_paper_dry_run_runs_nothing(tmp_path, monkeypatch, capsys):
         (["table1", "--data", "wymo=x"], "unknown dataset 'wymo'"),
         (["table1", "--data", "waymo=nowhere"], "is not a prepared dataset"),
         (["table1", "--data", "freemotion-poses=x"], "needs a dataset to score on"),
-        (["fig6", "--rows", "dapt"], "omit --rows and --data"),
-        (["fig6", "--data", "waymo=x"], "omit --rows and --data"),
+        (["fig6", "--rows", "dapt"], "omit --rows, --data, --held-out and --table-only"),
+        (["fig6", "--data", "waymo=x"], "omit --rows, --data, --held-out and --table-only"),
         (["table1", "--held-out", "2"], "--motion"),
         (["table1", "--out", "file"], "give another by --out"),
     ],
@@ -770,6 +770,10 @@ def test_fig6_draws_one_body_at_all_distances(tmp_path, monkeypatch, capsys):
     bodies = np.array([panel.truth.joints - panel.truth.joints[0] for panel in drawn])
     # the same body and rotation: masks and distances change only the points
     np.testing.assert_allclose(bodies, np.broadcast_to(bodies[0], bodies.shape), atol=1e-4)
+    assert main(["paper", "fig6", "--held-out", "006", "--out", str(tmp_path / "out")]) == 2
+    assert "fig6 shows a synthesized body and has no rows: omit" in capsys.readouterr().err
+    assert main(["paper", "table1", "--data", "waymo=a,waymo=b", "--out", str(tmp_path / "out")]) == 2
+    assert "expected each name of --data once, got waymo twice" in capsys.readouterr().err
     counts = np.array([len(panel.points) for panel in drawn]).reshape(len(figures._DISTANCES), -1)
     assert (np.diff(counts[:, 0]) < 0).all() and (counts[:, -1] < counts[:, 0]).all()
 

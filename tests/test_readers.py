@@ -430,9 +430,10 @@ def test_corpus_entry_in_other_format_is_skipped(tmp_path, smpl):
     del entries[0]["shape"], entries[1]["T_2"], entries[2]["pc_3"]
     entries[3] = 5
     entries[4]["gt"] = np.zeros(71)
+    entries.append({name: value for name, value in entries[0].items() if not name.startswith("pc")})
     path.write_bytes(pickle.dumps(entries))
     items, skipped = everything("freemotion", tmp_path, smpl)
-    assert reasons(skipped) == {"no T_2": 1, "entry in another format": 2} and len(items) == 7
+    assert reasons(skipped) == {"no T_2": 1, "entry in another format": 2, "no pc": 1} and len(items) == 7
     assert [item.source for item in items] == ["freemotion/mean shape"] * 3 + ["freemotion"] * 4
     path.unlink()
     files.write_lipd(tmp_path, smpl)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from motion_files import a_clip, joints_of
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
@@ -40,6 +41,56 @@ def test_pages_match_scores(results):
         page = path.read_text()
         assert results.written(page) == page, f"{path.name}: run python benchmarks/results.py"
         assert "<!-- table" in page
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", sorted(path.stem for path in BENCHMARKS.glob("*.py")))
+def test_benchmark_can_be_imported(name):
+    if name == "tracks":
+        pytest.importorskip("trackeval")
+    assert benchmark(name)
+
+
+@pytest.mark.long
+def test_heldout_benchmark_runs(tmp_path, monkeypatch):
+    clips = {"clip": np.array(["s_1"]), "clip_start": np.array([0]), "clip_length": np.array([40]), "fps": 10.0}
+    np.savez(tmp_path / "m.npz", joints=joints_of(*a_clip(40)), **clips)
+    words = [
+        "heldout",
+        "--motion",
+        "m.npz",
+        "--subjects",
+        "s",
+        "--people",
+        "6",
+        "--weights",
+        "tiny",
+        "--json",
+        "o.json",
+    ]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", words)
+    benchmark("heldout").main()
+    scores = json.loads((tmp_path / "o.json").read_text())
+    assert scores["people"] == 6 and scores["mean pose, true facing"]["mpjpe"] > 0
+
+
+def test_readme_has_the_detectors_scores():
+    scores = json.loads((BENCHMARKS.parent / "docs" / "scores" / "detector.json").read_text())
+    (heldout,) = [result for result in scores["results"] if result["dataset"] == "heldout"]
+
+    def value(figure, **group):
+        keys = {"figure": figure, "at": "default"} | group
+        return next(row["value"] for row in heldout["rows"] if keys.items() <= row.items())
+
+    everyone, near = value("recall", of="all", group="all"), value("recall", group="points", of="50 and more")
+    text = " ".join((BENCHMARKS.parent / "README.md").read_text("utf-8").split())
+    assert (
+        f"finds {everyone:.0f} % of the people of 10 points and more within 40 m, {near:.0f} % of those of 50" in text
+    )
+    numbers = {5: "five", 6: "six", 7: "seven", 8: "eight", 9: "nine", 10: "ten"}
+    false = value("false_people", of="all", group="all")
+    assert f"with one false person in {numbers[round(1 / false)]} scans" in text
 
 
 def test_every_bundled_model_has_a_card(results):

@@ -204,7 +204,8 @@ def test_corpus_poses_are_loaded_as_motion(tmp_path, which, up):
         place = files.UP_AXES[up].T @ way[k]
         entries.append({"motion_id": "a" if k < 6 else "b", "gt": gt, "T_1": place, "shape": np.zeros(10), "pc": None})
     motion = load_motion(_written(tmp_path, [*entries[:3], {"motion_id": "a"}, *entries[3:]]))
-    assert motion.names == ("a", "b") and motion.length.tolist() == [6, 4] and motion.fps == 10
+    # clips are cut at entries that are skipped
+    assert motion.names == ("a", "a#2", "b") and motion.length.tolist() == [3, 3, 4] and motion.fps == 10
     np.testing.assert_allclose(motion.rotations, rotations, atol=1e-4)
     np.testing.assert_allclose(motion.translation, way, atol=1e-4)
 
@@ -217,6 +218,8 @@ def test_lipd_joints_without_poses_are_loaded_as_motion(tmp_path):
     assert motion.names == ("s",) and len(motion.rotations) == 6
     again = files.joints_of(motion.rotations)
     assert np.linalg.norm(again - joints, axis=-1)[:, files.MAIN].max() < 0.03
+    cut = load_motion(_written(tmp_path, [*entries[:3], {"seq_path": "s", "gt_joint": 5}, *entries[3:]]))
+    assert cut.names == ("s", "s#2") and cut.length.tolist() == [3, 3]
 
 
 def test_load_motion_skips_joints_among_poses(tmp_path):

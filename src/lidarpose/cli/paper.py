@@ -56,8 +56,10 @@ def _paper(commands, execute: Callable[[list[str]], int], options: argparse.Name
     from lidarpose.paper.tables import TABLES
 
     check_name("table or figure", options.name, _NAMES)
-    if options.name == "fig6" and (options.rows or options.data):
-        raise InputError("fig6 shows a synthesized body and has no rows: omit --rows and --data")
+    if options.name == "fig6" and (options.rows or options.data or options.held_out or options.table_only):
+        raise InputError(
+            "fig6 shows a synthesized body and has no rows: omit --rows, --data, --held-out and --table-only"
+        )
     budget = {name: getattr(options, name) for name in ("people", "hours", "seeds", "workers", "size")}
     budget |= {"subjects": options.subjects or "", "held_out": options.held_out or ""}
     paper_options = Options(data=_data(options.data), motion=names(options.motion or ""), **budget)
@@ -69,7 +71,8 @@ def _paper(commands, execute: Callable[[list[str]], int], options: argparse.Name
             return
         begin_out(out)
         motion = paper_options.motion[0] if paper_options.motion else None
-        print(figures.draw_one_body(out, motion=motion))
+        subjects = names(options.subjects) if options.subjects else None
+        print(figures.draw_one_body(out, motion=motion, subjects=subjects))
         return
     table, row_keys = TABLES[options.name], names(options.rows or "")
     selected_cells = cells(table, paper_options, row_keys)
@@ -95,6 +98,8 @@ def _data(text: str | None) -> dict[str, str]:
         name, equals, folder = part.partition("=")
         if not equals or not folder:
             raise InputError(f"expected --data NAME=DIR,..., got {part}")
+        if name in folders:
+            raise InputError(f"expected each name of --data once, got {name} twice: give it one folder")
         folders[name] = folder
     return folders
 

@@ -12,7 +12,7 @@ from lidarpose.geometry import to_spherical
 
 # margin of the angular window about a person, rad, and maximum number of its points that are kept. Source: NE
 MARGIN, MOST = np.radians(1.0), 512
-# a step between frames that exceeds the median step by more than this factor ends a run
+# a step between frames that exceeds the smallest step by more than this factor ends a run
 _GAP = 1.5
 # cell size of a map, m; a cell is static if it is occupied in at least this many scans; number of scans used
 _CELL, _LEAST, SCANS = 0.1, 3, 24
@@ -26,7 +26,8 @@ _OWN = 0.05
 def consecutive(tracks: Sequence[Hashable], frames: Sequence[int]) -> list[np.ndarray]:
     """Runs of samples of one track with consecutive frames, as rows (n,) in order of time.
 
-    tracks, frames (N,): each sample's track and frame number; the step between numbers may be any, a gap ends a run.
+    tracks, frames (N,): each sample's track and frame number; the usual step is the smallest one of a track; a gap ends
+    a run.
     """
     rows = defaultdict(list)
     for row, track in enumerate(tracks):
@@ -34,12 +35,9 @@ def consecutive(tracks: Sequence[Hashable], frames: Sequence[int]) -> list[np.nd
     runs = []
     for track_rows in rows.values():
         ordered_rows = np.array(sorted(track_rows, key=lambda row: frames[row]))
-        steps = np.diff([frames[row] for row in ordered_rows])
-        runs += (
-            np.split(ordered_rows, np.flatnonzero(steps > _GAP * np.median(steps)) + 1)
-            if len(steps)
-            else [ordered_rows]
-        )
+        steps = np.diff(np.array([frames[row] for row in ordered_rows], float))
+        usual_step = steps[steps > 0].min(initial=np.inf)
+        runs += np.split(ordered_rows, np.flatnonzero(steps > _GAP * usual_step) + 1)
     return runs
 
 

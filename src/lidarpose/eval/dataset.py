@@ -365,9 +365,9 @@ def _bench_sample(bench: Bench, row: int) -> EvalSample:
     return EvalSample(sample=sample, points=bench.points[row], shard=0, row=row, moving=clip >= 0, **categories)
 
 
-def facing(joints: np.ndarray) -> np.ndarray:
-    """joints (N, 26, 3) m -> (N,) rad: the yaw of the direction that hips and shoulders face, seen from above."""
-    joint_index = BODY26.index
+def facing(joints: np.ndarray, skeleton: Skeleton = BODY26) -> np.ndarray:
+    """joints (N, J, 3) m -> (N,) rad: the yaw of the direction that hips and shoulders face, seen from above."""
+    joint_index = skeleton.index
     left = joints[:, joint_index("left_hip")] - joints[:, joint_index("right_hip")]
     left = left + joints[:, joint_index("left_shoulder")] - joints[:, joint_index("right_shoulder")]
     return np.arctan2(-left[:, 0], left[:, 1])

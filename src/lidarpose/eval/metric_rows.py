@@ -347,10 +347,14 @@ def triples(p: Predictions) -> np.ndarray:
             & (first_step > 0)
             & (np.abs(second_step - first_step) < _EVEN * first_step)
         )
-        # the step must be the shortest one of the track, so that no frame is skipped
-        step = np.full(int(owner.max()) + 1, np.inf)
-        np.minimum.at(step, owner[rows[is_even, 0]], first_step[is_even])
-        is_even &= first_step < (1 + _EVEN) * step[owner[rows[:, 0]]]
+        # the step must be the shortest one of the sequence, so that no frame is skipped
+        _, sequence = np.unique(p.sequence, return_inverse=True)
+        pairs = np.stack([order[:-1], order[1:]], 1)
+        pair_step = np.diff(p.time[pairs], axis=1)[:, 0]
+        is_step = (owner[pairs[:, 0]] == owner[pairs[:, 1]]) & (pair_step > 0)
+        step = np.full(int(sequence.max()) + 1, np.inf)
+        np.minimum.at(step, sequence[pairs[is_step, 0]], pair_step[is_step])
+        is_even &= first_step < (1 + _EVEN) * step[sequence[rows[:, 0]]]
     return rows[is_even & p.posed[rows].all(1)]
 
 

@@ -335,6 +335,8 @@ def _perturbed(setup: EvalSetup, person: CroppedPerson, name: str, amount: float
             pose=Pose(joints=apply(sample.joints), skeleton=sample.skeleton),
             box=sample.box and replace(sample.box, center=apply(sample.box.center)),
             centers={name: apply(center) for name, center in sample.centers.items()},
+            background=None if sample.background is None else apply(sample.background).astype(np.float32),
+            neighbors=None if sample.neighbors is None else apply(sample.neighbors).astype(np.float32),
         )
         box = box and replace(box, center=apply(box.center))
     elif name == "crop" and box is not None:

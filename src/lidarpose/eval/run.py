@@ -154,7 +154,8 @@ def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iter
         if setup.dataset.settings.get("level"):
             yield "sequences out of level were turned; for the released code's frame, prepare with --no-level"
     if setting.kind == "waymo" and not (predictions.labels == UNLABELED).all():
-        yield "joints that are labeled as hidden count, except in PEM; people are predicted in their labeled boxes"
+        boxes = "labeled" if setting.protocol == "dapt" else "displaced labeled"
+        yield f"joints that are labeled as hidden count, except in PEM; people are predicted in their {boxes} boxes"
     sequences = len(np.unique(predictions.sequence[~predictions.moving]))
     if setting.clusters and sequences < aggregate.LEAST_UNITS:
         sequence_count = "only one sequence" if sequences == 1 else f"only {sequences} sequences"

@@ -94,9 +94,10 @@ def _side_by_side(cells: dict[str, Cell], out: Path) -> bytes:
     return draw_people(panels, title=f"{target.title}: the hardest people", per_row=len(predictions))
 
 
-def draw_one_body(out: Path, *, motion: str | None = None) -> Path:
-    """Figure 6: one synthesized body at several distances (rows) under several laser masks (columns)."""
-    bank = PoseBank.from_clips(motion) if motion else None
+def draw_one_body(out: Path, *, motion: str | None = None, subjects: tuple[str, ...] | None = None) -> Path:
+    """Figure 6: one synthesized body at several distances (rows) under several laser masks (columns). subjects: of the
+    motion, None for all."""
+    bank = PoseBank.from_clips(motion, subjects) if motion else None
     panels, index = [], -1
     for distance in _DISTANCES:
         for keep in _KEPT:

@@ -42,7 +42,7 @@ class RandomStream(IntEnum):
 
 
 # maximum standard deviation of the ground's tilt, rad; a larger value was probably meant in degrees
-_STEEPEST = pi / 4
+STEEPEST = pi / 4
 # ways of scanning single people other than by one scan of an upright sensor
 ACQUISITIONS = ("merged", "accumulated", "inverted", "integration", "sparse", "crowded")
 # fields with values between 0 and 1
@@ -64,11 +64,11 @@ def _check_fields(config: Any) -> None:
         if not is_pair and field.type not in (float, int):
             continue
         numbers = value if is_pair else (value,)
-        most = 1 if field.name in _SHARES else _STEEPEST if field.name == "slope" else inf
+        most = 1 if field.name in _SHARES else STEEPEST if field.name == "slope" else inf
         is_valid = isinstance(numbers, tuple) and len(numbers) == 1 + is_pair
         if not (is_valid and all(isinstance(n, Real) and 0 <= float(n) <= most and n != inf for n in numbers)):
             bounds = "of at least 0" if most == inf else f"from 0 to {most:.3g}"
-            expected = f"{'two numbers' if is_pair else 'a number'} {bounds}{' rad' if most == _STEEPEST else ''}"
+            expected = f"{'two numbers' if is_pair else 'a number'} {bounds}{' rad' if most == STEEPEST else ''}"
             raise InputError(f"{type(config).__name__}.{field.name} must be {expected}, got {value!r}")
         if numbers[0] > numbers[-1]:
             raise InputError(f"{type(config).__name__}.{field.name} must be (low, high), got {value!r}")
@@ -149,7 +149,8 @@ class SceneConfig:
             two scans of half as many columns, half a period apart.
         accumulated: 2 to 5 frames of a moving person in one cloud.
         inverted: sensors mounted upside down, 2 to 5 m above the ground.
-        integration: rosettes that integrate 0.1, 0.2 or 0.5 s, with equal probability.
+        integration: rosettes that integrate 0.2 or 0.5 s, a third of the share each; for the last third, the sensor is
+            drawn again for a single scan.
         sparse: sensors of 16 and 32 rings at a uniform distance of up to 25 m.
         crowded: crops with a second person; the box's center is nearer to the person meant.
         noise: errors of returns.

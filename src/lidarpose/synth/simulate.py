@@ -91,7 +91,7 @@ class Scene:
         """All triangles, level frame: body `row`, whose pose is that of the frame's middle, then its props, then the
         background. lag: time by which the body has moved on, as a share of `FRAME_TIME`."""
         place = self.body_place
-        states = [bodies.between(row, lag + time) for time in looks(self.sensor, self.place.feet)]
+        states = [bodies.between(row, lag + time) for time in looks(self.sensor, self.place.to_sensor(self.place.feet))]
         body_vertices = [place.of_body(vertices) for vertices, _ in states]
         meshes = [Mesh(body_vertices[0], bodies.faces, bodies.face_part, *body_vertices[1:])]
         for prop in self.props:
@@ -144,8 +144,9 @@ class SimulatedScan:
 
 
 def looks(device: Sensor | RayPattern, feet: np.ndarray) -> tuple[float, ...]:
-    """Times at which a sensor scans a person at `feet` (3,) m, in units of `FRAME_TIME` relative to the frame's middle:
-    start and end of a rosette's frame; or when the first and the last ring of a laser stack pass. (0,): at one time."""
+    """Times at which a sensor scans a person at `feet` (3,) m in its frame, in units of `FRAME_TIME` relative to the
+    middle of the scan: start and end of a rosette's frame; or when the first and the last ring of a laser stack pass.
+    (0,): at one time."""
     if isinstance(device, RayPattern):
         half = device.duration / FRAME_TIME / 2
     else:

@@ -25,6 +25,7 @@ with the same `seq_path` or `motion_id`, in order, form a clip.
 
 import os
 import reprlib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -172,10 +173,14 @@ def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: fl
     """One clip for each sequence of a corpus's entries. Malformed entries are skipped, and entries with only joints if
     any entry has a pose. Raises InputError if no entry remains."""
     clips: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
+    # by clip: the number of each entry in its sequence, and the number of entries so far
+    numbers: dict[str, list[int]] = {}
+    counts: Counter[str] = Counter()
     entries = [entry for entry in entries if isinstance(entry, dict)]
     key = "gt" if any(entry.get("gt") is not None for entry in entries) else "gt_joint"
     for entry in entries:
         name = str(entry.get("seq_path", entry.get("motion_id", Path(path).stem)))
+        counts[name] += 1
         try:
             pose = np.asarray(entry[key], float)
             position = next((entry[name] for name in ("T_1", "trans") if entry.get(name) is not None), np.zeros(3))
@@ -185,20 +190,29 @@ def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: fl
         except (KeyError, TypeError, ValueError, OverflowError, IndexError):
             continue
         clips.setdefault(name, []).append((pose, trans))
+        numbers.setdefault(name, []).append(counts[name])
     if not clips:
         raise file_error(path, "expected LIPD's, FreeMotion's or NoiseMotion's dicts with gt (72) or gt_joint (24, 3)")
     rate, length = fps or LIDARHUMAN26M_FPS, [len(frames) for frames in clips.values()]
     poses, positions = map(np.array, zip(*(frame for frames in clips.values() for frame in frames), strict=True))
     if key == "gt_joint":
-        joints = poses.reshape(-1, 24, 3) + positions[:, None]
+        # skipped entries have no joints, so that clips are cut there
+        ends = np.cumsum([clip_numbers[-1] - clip_numbers[0] + 1 for clip_numbers in numbers.values()])
+        length = np.diff(ends, prepend=0).tolist()
+        joints = np.full((ends[-1], 24, 3), np.nan)
+        rows = [end - n[-1] - 1 + k for end, n in zip(ends.tolist(), numbers.values(), strict=True) for k in n]
+        joints[rows] = poses.reshape(-1, 24, 3) + positions[:, None]
         return motion_from_joints(path, joints, list(clips), length, fps=rate, up=up, kind="LIPD", unit_m=1.0)
     # the published loaders do not define the up axis
     up = up or standing_axis(axis_angle_to_matrix(poses[:, :3])[..., 1]) or "z"
     ends = np.cumsum(length)
     motions = [
-        motion_from_smpl(path, poses[e - n : e], positions[e - n : e], name=name, fps=rate, up=up, kind="a corpus")
+        motion_from_smpl(
+            path, poses[e - n : e], positions[e - n : e],
+            name=name, fps=rate, up=up, kind="a corpus", number=np.array(numbers[name]),
+        )
         for name, n, e in zip(clips, length, ends, strict=True)
-    ]
+    ]  # fmt: skip
     return join(motions, source=f"corpus: {path}")
 
 

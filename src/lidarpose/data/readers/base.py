@@ -8,7 +8,7 @@ import json
 import os
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -257,11 +257,12 @@ def turned_pose(pose: np.ndarray, R_to_world: np.ndarray) -> np.ndarray:
 class SceneClouds:
     """The whole scans of a sequence, if available, and the map of their static points.
 
-    paths: frame -> its file; people: frame -> points (n, 3) m of the person, in the frame of the scans.
+    paths: frame -> its file; people: frame -> points (n, 3) m of the person, in the frame of the scans; people_frames:
+    those for which `people` has points.
     """
 
-    def __init__(self, paths: dict[int, Path], people: Callable[[int], np.ndarray]):
-        self._paths, self._people = paths, people
+    def __init__(self, paths: dict[int, Path], people: Callable[[int], np.ndarray], people_frames: Iterable[int]):
+        self._paths, self._people, self._people_frames = paths, people, people_frames
 
     def _others(self, frame: int, person: np.ndarray | None = None) -> np.ndarray | None:
         """The scan without the person; None if it cannot be read. person: its points, None to obtain them."""
@@ -272,7 +273,9 @@ class SceneClouds:
 
     @cached_property
     def _static(self) -> np.ndarray:
-        frames = sorted(self._paths)
+        frames = sorted(set(self._paths) & set(self._people_frames))
+        if not frames:
+            return static_points(())
         indices = np.unique(np.linspace(0, len(frames) - 1, SCANS).astype(int)).tolist()
         return static_points(scan for k in indices if (scan := self._others(frames[k])) is not None)
 

@@ -140,6 +140,8 @@ class FreeMotion(_Corpus):
         betas = entry.numbers("shape", (self._poses, 10))[self._which] if has_shape else np.zeros(10)
         source = self.name if has_shape else f"{self.name}/mean shape"
         joints = self._smpl(betas[None], pose[None], np.zeros((1, 3)))[0]
+        if all(entry.content.get(name) is None for name in ("pc", "pc_1", "pc_2", "pc_3")):
+            yield Skipped("no pc", entry.where)
         for view in (1, 2, 3):
             cloud = "pc" if view == 1 and "pc_1" not in entry.content else f"pc_{view}"
             if entry.content.get(cloud) is None:

@@ -70,7 +70,7 @@ class LidarHuman26M(Reader):
             turn = leveling(people[within_reach(people).all(-1)]) if self._level else None
         segments = base.numbered(root / _SEGMENT / part, ".ply")
         scans = {frame: paths[0] for frame, paths in base.numbered(root / _SCANS / part, ".pcd").items()}
-        clouds = base.SceneClouds(scans, lambda frame: base.read_cloud(segments[frame][0]))
+        clouds = base.SceneClouds(scans, lambda frame: base.read_cloud(segments[frame][0]), segments)
         for pair in base.paired(poses, segments, f"{part}/{{:06d}}"):
             if isinstance(pair, Skipped):
                 yield pair

@@ -84,7 +84,7 @@ class Sloper4D(Reader):
         joints = self._smpl(betas, pose, trans, gender)
         paths = _scans(path.parent, dict(zip(frames, trajectory[:, 8].tolist(), strict=False)))
         people = {frame: cloud for frame, cloud in clouds.items() if not isinstance(cloud, str)}
-        scans = SceneClouds(paths, people.__getitem__)
+        scans = SceneClouds(paths, people.__getitem__, people)
         for index, frame in enumerate(frames):
             where, cloud = f"{part}/{frame}", clouds.get(frame)
             if index >= total:

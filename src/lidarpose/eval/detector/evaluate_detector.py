@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose._version import __version__
-from lidarpose.errors import check_int, check_name
+from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.eval.detector.detection_pictures import draw_false, draw_missed
 from lidarpose.eval.detector.detection_scores import Detect, DetectorResult, score_detector
 from lidarpose.eval.detector.labeled_scans import ScanSet, heldout_scans, labeled_scans
@@ -103,8 +103,13 @@ def run_detector(
     check_name("method", method, METHODS)
     if limit is not None:
         check_int("limit", limit, least=1)
+    if weights is not None and (detect is not None or method not in ("detector", "scorer")):
+        raise InputError(f"a detector's file is for the methods detector and scorer, got {method}: omit it")
     sets = [heldout_scans(limit)] if heldout else []
     sets += [labeled_scans(folder, limit) for folder in folders]
+    set_names = [scans.name for scans in sets]
+    if duplicate := next((name for name in set_names if set_names.count(name) > 1), None):
+        raise InputError(f"two sets of scans are called {duplicate}: evaluate them one by one, or rename a folder")
     default_score = None
     if detect is None:
         detector = Detector(weights) if method in ("detector", "scorer") else None

@@ -12,7 +12,7 @@ import numpy as np
 
 from lidarpose.synth.environment import mesh as shapes
 from lidarpose.synth.environment.mesh import Mesh, shape
-from lidarpose.synth.scene import SceneConfig
+from lidarpose.synth.scene import STEEPEST, SceneConfig
 
 # Paper: a square of ground of half width 1 m; other scenes have one that extends beyond any crop
 _PAPER_HALF = 1.0
@@ -216,7 +216,7 @@ def ground(config: SceneConfig, feet: np.ndarray, rng: np.random.Generator) -> M
     u, v, kind, heading_draw, a, b, c = rng.random(7).tolist()
     # a standard normal from two uniform numbers: Box and Muller 1958
     normal, heading = sqrt(-2 * log(1 - u)) * cos(2 * pi * v), (2 * heading_draw - 1) * pi
-    tilt = tan(config.slope * normal)
+    tilt = tan(min(max(config.slope * normal, -STEEPEST), STEEPEST))
     slope = (tilt * cos(heading), tilt * sin(heading))
     if config.follows_paper:
         return shapes.quad(_PAPER_HALF, slope).moved(feet)

@@ -188,7 +188,7 @@ def scan_example(seed: int, number: int, *, family: str = "train") -> DetectorEx
 def scene_to_search(seed: int, number: int, family: str) -> tuple[DetectionScene, np.ndarray | None]:
     """A scene as the detector receives it, and its sensor position (3,) m, None if unknown."""
     scene = detection_scene(seed, number, family=family)
-    rng = np.random.default_rng([seed, RandomStream.CANDIDATES, number, 0])
+    rng = np.random.default_rng([seed, RandomStream.CANDIDATES, number, 1])
     is_blind = rng.random() < BLIND
     scene = as_detected(scene, None if is_blind else scene.origin)
     return scene, None if is_blind else scene.origin
