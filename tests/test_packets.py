@@ -22,8 +22,8 @@ from velodyne_packets import vlp16
 
 from lidarpose.errors import InputError
 from lidarpose.io.sources import DamagedFrame, open_source, pcap
-from lidarpose.io.sources.ouster import OusterFormat
-from lidarpose.io.sources.pcap import Capture
+from lidarpose.io.sources.ouster import OusterFormat, OusterRecording
+from lidarpose.io.sources.pcap import Capture, Datagram
 
 RECORDINGS = sorted((Path(__file__).parents[2] / "shared" / "data" / "ouster").glob("*.pcap"))
 
@@ -155,6 +155,32 @@ def test_capture_joins_fragments_and_counts_incomplete_ones(tmp_path):
     assert [datagram.payload for datagram in capture] == [payload] and capture.num_cut == 200
 
 
+def test_capture_does_not_join_fragments_of_datagrams_with_repeated_number(tmp_path):
+    payloads = [bytes([k]) * 2500 for k in range(3)]
+    first, *others = [ip4(payload, mtu=1000) for payload in payloads]
+    path = write(tmp_path / "a.pcap", [*first[:1], *first[2:], *(part for parts in others for part in parts)])
+    data = bytearray(path.read_bytes())
+    # the first datagram, of which a fragment is lost, is a minute older
+    for start in (24, 24 + 16 + int.from_bytes(data[32:36], "little")):
+        data[start : start + 4] = (940).to_bytes(4, "little")
+    path.write_bytes(data)
+    capture = Capture(path)
+    assert [datagram.payload for datagram in capture] == payloads[1:] and capture.num_cut == 1
+
+
+def test_pcapng_skips_large_blocks_without_packets(tmp_path):
+    path = write_ng(tmp_path / "a.pcapng", [ip4(b"payload")[0]])
+    data, name = path.read_bytes(), b"what is this"
+    start = data.index(name) - 8
+    large = bytes(2**20 + 100)
+    block = struct.pack("<II", 4, len(large) + 12) + large + struct.pack("<I", len(large) + 12)
+    path.write_bytes(data[:start] + block + data[start:])
+    assert [datagram.payload for datagram in Capture(path)] == [b"payload"]
+    path.write_bytes(data[:start] + block[:999])
+    with pytest.raises(InputError, match="is cut off"):
+        list(Capture(path))
+
+
 def test_capture_joins_fragments_whose_length_is_that_of_the_first(tmp_path):
     payload = bytes(range(256)) * 20
     first, *others = ip4(payload, mtu=1000)
@@ -217,6 +243,24 @@ def test_ouster_handles_lost_late_and_duplicate_packets(tmp_path):
     for k in (0, 2):
         assert np.allclose(decoded(frames[k]), expected_points(ranges_of(65534 + k)), rtol=0, atol=1e-9)
     assert source.warnings == ("1 of 8 lidar packets were lost",)
+
+
+def test_ouster_messages_may_have_a_spare_byte(tmp_path):
+    """Drivers of 2022 and before make the buffer one byte longer than the packet."""
+    packets = packets_of([1, 2])
+    (tmp_path / "m.json").write_text(json.dumps(metadata()))
+    frames = []
+    for spare in (b"", b"\0"):
+        datagrams = Messages(Datagram(k / 100, (b"t", 0), packet + spare) for k, packet in enumerate(packets))
+        recording = OusterRecording(tmp_path / "a.bag", tmp_path / "m.json", datagrams=datagrams)
+        frames.append([decode().points for _, decode in recording.sweeps()])
+    assert len(frames[0]) == len(frames[1]) == 2
+    for exact, spared in zip(*frames, strict=True):
+        np.testing.assert_array_equal(exact, spared)
+
+
+class Messages(list):
+    num_cut = 0
 
 
 def test_ouster_skips_packets_of_other_sensors(tmp_path):

@@ -17,7 +17,7 @@ import numpy as np
 from lidarpose.errors import InputError
 from lidarpose.io.files import FormatError, file_error, read_bytes, shorten
 from lidarpose.io.sources.frame import Sweep
-from lidarpose.io.sources.pcap import Datagrams, PacketRecording
+from lidarpose.io.sources.pcap import Datagram, Datagrams, PacketRecording
 
 # bytes of a pixel, by profile. The range comes first: for RNG15 in 15 bits and steps of 8 mm, for others in 19 bits
 # (LEGACY 20) and mm
@@ -174,6 +174,22 @@ class OusterFormat:
         return Sweep(points=points, origin=self.origin, ring=beam, warnings=warnings)
 
 
+class _Trimmed:
+    """Packets in messages without the spare byte that older drivers leave behind them."""
+
+    def __init__(self, datagrams: Datagrams, packet_bytes: int):
+        self._datagrams, self._packet_bytes = datagrams, packet_bytes
+
+    @property
+    def num_cut(self) -> int:
+        return self._datagrams.num_cut
+
+    def __iter__(self) -> Iterator[Datagram]:
+        for datagram in self._datagrams:
+            has_spare = len(datagram.payload) == self._packet_bytes + 1
+            yield datagram._replace(payload=datagram.payload[:-1]) if has_spare else datagram
+
+
 class OusterRecording(PacketRecording):
     """A capture of an Ouster sensor's packets, decoded with the sensor's metadata.
 
@@ -187,7 +203,8 @@ class OusterRecording(PacketRecording):
     def __init__(self, path: Path, metadata: Path, *, content: str | None = None, datagrams: Datagrams | None = None):
         self.metadata = metadata
         self.format = OusterFormat(metadata, content)
-        super().__init__(path, self.format.packet.itemsize, datagrams)
+        size = self.format.packet.itemsize
+        super().__init__(path, size, None if datagrams is None else _Trimmed(datagrams, size))
         self.flow = self._find_flow()
         self._num_lost = self._num_sent = 0
         self._serial: int | None = None

@@ -3,6 +3,7 @@
 Formats: draft-ietf-opsawg-pcap, draft-ietf-opsawg-pcapng, RFC 791 and 8200 (fragments), RFC 768.
 """
 
+import os
 import struct
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
@@ -21,10 +22,14 @@ _MAGIC = {
     b"\xa1\xb2\x3c\x4d": (">", 1e9),
 }
 _PCAPNG = b"\x0a\x0d\x0d\x0a"
+# descriptions of interfaces and packets; other blocks hold names, keys and notes
+_READ_BLOCKS = (1, 6)
 # bytes; captures have no larger packets
 _MAX_PACKET = 2**20
 # maximum number of incomplete datagrams that wait for fragments, and maximum bytes of a datagram
 _MAX_PENDING, _MAX_DATAGRAM = 64, 65535
+# fragments further apart, s, are of two datagrams, whose numbers repeat after a minute or less. Source: RFC 791
+_MAX_AGE = 15.0
 _VLAN = (0x8100, 0x88A8, 0x9100)
 # link type: offset of the EtherType in its header, and the header's length; raw IP has no header
 _ETHERNET = 1
@@ -67,7 +72,8 @@ class Capture:
 
     def __iter__(self) -> Iterator[Datagram]:
         self.num_cut = 0
-        pending: dict[tuple, dict[int, tuple[bytes, bool]]] = {}
+        # time of the first fragment, and by offset the fragments and whether others follow
+        pending: dict[tuple, tuple[float, dict[int, tuple[bytes, bool]]]] = {}
         damage = None
         with self._open() as file:
             try:
@@ -89,7 +95,7 @@ class Capture:
         source, key, offset, has_more, data, length = part
         if len(data) >= length:
             if offset or has_more:
-                data = self._reassembled(key, offset, has_more, bytes(data), pending)
+                data = self._reassembled(time, key, offset, has_more, bytes(data), pending)
             if len(data) < 8:
                 return None
             _, port, size = struct.unpack_from(">HHH", data)
@@ -100,9 +106,14 @@ class Capture:
         self.num_cut += 1
         return None
 
-    def _reassembled(self, key: tuple, offset: int, has_more: bool, data: bytes, pending: dict) -> bytes:
+    def _reassembled(self, time: float, key: tuple, offset: int, has_more: bool, data: bytes, pending: dict) -> bytes:
         """The whole datagram if this fragment was the last missing one, else empty bytes."""
-        parts = pending.setdefault(key, {})
+        first_time, parts = pending.setdefault(key, (time, {}))
+        if abs(time - first_time) > _MAX_AGE:
+            # another datagram with the same number, after a fragment of the first one was lost
+            self.num_cut += 1
+            parts = {}
+            pending[key] = time, parts
         parts[offset] = data, has_more
         size = sum(len(part) for part, _ in parts.values())
         if size > _MAX_DATAGRAM or len(pending) > _MAX_PENDING:
@@ -120,7 +131,8 @@ class Datagrams(Protocol):
     """Recorded datagrams. num_cut: number of those that cannot be read, after iteration. Iteration raises InputError
     behind the last readable datagram of a damaged recording."""
 
-    num_cut: int
+    @property
+    def num_cut(self) -> int: ...
 
     def __iter__(self) -> Iterator[Datagram]: ...
 
@@ -187,6 +199,15 @@ def _take(file: BinaryIO, size: int) -> bytes:
     return data
 
 
+def _skip(file: BinaryIO, size: int) -> None:
+    start = file.tell()
+    if size < 0:
+        raise FormatError(f"is damaged at byte {start}: a block of {size} bytes")
+    if start + size > file.seek(0, os.SEEK_END):
+        raise FormatError("is cut off: the part before the cut is read")
+    file.seek(start + size)
+
+
 def _read_pcap(file: BinaryIO) -> Iterator[tuple[float, int, bytes]]:
     """(time, link type, packet) of each record."""
     order, ticks = _MAGIC[_take(file, 4)]
@@ -210,8 +231,11 @@ def _read_pcapng(file: BinaryIO) -> Iterator[tuple[float, int, bytes]]:
             _take(file, struct.unpack(order + "I", size)[0] - 12)
             continue
         (size,) = struct.unpack(order + "I", _take(file, 4))
-        body = _take(file, size - 8)[:-4]
         (number,) = struct.unpack(order + "I", kind)
+        if number not in _READ_BLOCKS:
+            _skip(file, size - 8)
+            continue
+        body = _take(file, size - 8)[:-4]
         if number == 1 and len(body) >= 8:
             link = struct.unpack_from(order + "H", body)[0]
             interfaces.append((link, _ticks(body[8:], order)))
