@@ -245,9 +245,8 @@ class FramePredictor:
         self.up, self.name, self.skeleton = up_text(up), name, skeleton
         self._origin = sensor_origin if sensor_origin is None else (as_origin(sensor_origin),)
         # whether the frames are crops; None until the first frame with points decides
-        self._is_crop = True if crop else False if is_searched or boxes is not None else None
-        if find is False and boxes is None:
-            self._is_crop = True
+        is_crop = crop or (find is False and boxes is None)
+        self._is_crop = True if is_crop else False if is_searched or boxes is not None else None
         # whether any frame was searched
         self._was_searched = False
         self._search = search_options(*search_arguments, columns, topic, meta, up=up if self._has_up else None)

@@ -59,36 +59,32 @@ def smoothed_lines(
         }
         swapped = {id for id, (_, _, is_swapped) in people.items() if is_swapped}
         people.clear()
-        line_people = [_unswapped(p, skeleton) if p["track"] in swapped else p for p in line["people"]]
-        if not are_boxes_given:
-            R_boxes_sensor = rotation_of_boxes(line["up"])
-            line_people = [
-                _with_box_facing(person, entries[person["track"]]["facing"], R_boxes_sensor)
-                if person["track"] in swapped
-                else person
-                for person in line_people
-            ]
+        R_boxes_sensor = None if are_boxes_given else rotation_of_boxes(line["up"])
+        line_people = [
+            _unswapped(person, skeleton, entries[person["track"]]["facing"], R_boxes_sensor)
+            if person["track"] in swapped
+            else person
+            for person in line["people"]
+        ]
         yield line | {"people": list(_with_steady(line_people, entries))}
 
 
-def _unswapped(person: dict[str, Any], skeleton: Skeleton) -> dict[str, Any]:
-    """A person whose left and right were exchanged, with the other side's joints out of range."""
-    joints = skeleton.joints
+def _unswapped(
+    person: dict[str, Any], skeleton: Skeleton, facing: list | None, R_boxes_sensor: np.ndarray | None
+) -> dict[str, Any]:
+    """A person whose left and right were exchanged: with the other side's joints out of range, and the box, if it was
+    fitted to the pose, turned by half a turn if it is opposite to `facing` (3,), the smoothed one.
+
+    R_boxes_sensor: `rotation_of_boxes` of the sensor frame, None for boxes that were not fitted to poses.
+    """
+    joints, box = skeleton.joints, person["box"]
     others = {name: joints[skeleton.flip[k]] for k, name in enumerate(joints)}
-    return person | {"out_of_range": [others.get(name, name) for name in person["out_of_range"]]}
-
-
-def _with_box_facing(person: dict[str, Any], facing: list | None, R_boxes_sensor: np.ndarray) -> dict[str, Any]:
-    """A person whose box was fitted to a pose with left and right exchanged: turned by half a turn if it is opposite to
-    `facing` (3,), the smoothed one."""
-    box = person["box"]
-    if box is None or facing is None:
-        return person
-    x, y, _ = R_boxes_sensor @ facing
-    if x * np.cos(box["yaw"]) + y * np.sin(box["yaw"]) > 0:
-        return person
-    yaw = (box["yaw"] + 2 * np.pi) % (2 * np.pi) - np.pi
-    return person | {"box": box | {"yaw": round(float(yaw), 4)}}
+    if box is not None and facing is not None and R_boxes_sensor is not None:
+        x, y, _ = R_boxes_sensor @ facing
+        if x * np.cos(box["yaw"]) + y * np.sin(box["yaw"]) <= 0:
+            yaw = (box["yaw"] + 2 * np.pi) % (2 * np.pi) - np.pi
+            box = box | {"yaw": round(float(yaw), 4)}
+    return person | {"box": box, "out_of_range": [others.get(name, name) for name in person["out_of_range"]]}
 
 
 def _steady(poses: dict[int, Pose], times: np.ndarray) -> Iterator[tuple[int, Pose, bool, bool]]:

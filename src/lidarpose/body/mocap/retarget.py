@@ -63,6 +63,7 @@ def motion_from_joints(
     up: str | None,
     kind: str,
     unit_m: float | None = None,
+    number: np.ndarray | None = None,
 ) -> Motion:
     """The body's motion from joint positions. The middle of the hips is matched, not the pelvis: the pelvis's position
     relative to the hips differs between skeletons.
@@ -73,6 +74,7 @@ def motion_from_joints(
         names, length: Names and lengths of the clips, which follow each other in `joints`.
         up: The up axis, by default the axis along which people stand, or y if they do not stand.
         unit_m: Meters per unit of the file, by default the unit that gives the most typical body size.
+        number: (F,) frame numbers in the recording, by default without gaps.
 
     Raises:
         InputError: For implausible sizes or speeds, upside-down people, or too many unusable frames.
@@ -86,7 +88,7 @@ def motion_from_joints(
         raise file_error(path, "joints lie farther than 100 km from the origin; expected one unit throughout")
     joints = joints @ rotation_from_up(up or _up_axis(path, joints[is_usable])).T
     is_usable[is_usable] = _shortest_bone(joints[is_usable]) > _SHORTEST_BONE
-    clips = usable_clips(path, names, length, is_usable, fps)
+    clips = usable_clips(path, names, length, is_usable, fps, number)
     joints = joints[is_usable]
     _check_speed(path, joints, clips["length"], fps)
     rotations = retarget_positions(joints)

@@ -172,9 +172,8 @@ def load_pkl(path: str | os.PathLike, *, up: str | None = None, fps: float | Non
 def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: float | None) -> Motion:
     """One clip for each sequence of a corpus's entries. Malformed entries are skipped, and entries with only joints if
     any entry has a pose. Raises InputError if no entry remains."""
-    clips: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
-    # by clip: the number of each entry in its sequence, and the number of entries so far
-    numbers: dict[str, list[int]] = {}
+    # of each clip's entries: pose, position, and number in the sequence, which skipped entries have, too
+    clips: dict[str, list[tuple[np.ndarray, np.ndarray, int]]] = {}
     counts: Counter[str] = Counter()
     entries = [entry for entry in entries if isinstance(entry, dict)]
     key = "gt" if any(entry.get("gt") is not None for entry in entries) else "gt_joint"
@@ -189,30 +188,27 @@ def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: fl
             pose = pose.reshape(-1, _SMPL)[pose.size // _SMPL // 2]
         except (KeyError, TypeError, ValueError, OverflowError, IndexError):
             continue
-        clips.setdefault(name, []).append((pose, trans))
-        numbers.setdefault(name, []).append(counts[name])
+        clips.setdefault(name, []).append((pose, trans, counts[name]))
     if not clips:
         raise file_error(path, "expected LIPD's, FreeMotion's or NoiseMotion's dicts with gt (72) or gt_joint (24, 3)")
     rate, length = fps or LIDARHUMAN26M_FPS, [len(frames) for frames in clips.values()]
-    poses, positions = map(np.array, zip(*(frame for frames in clips.values() for frame in frames), strict=True))
+    poses, positions, numbers = map(
+        np.array, zip(*(frame for frames in clips.values() for frame in frames), strict=True)
+    )
     if key == "gt_joint":
-        # skipped entries have no joints, so that clips are cut there
-        ends = np.cumsum([clip_numbers[-1] - clip_numbers[0] + 1 for clip_numbers in numbers.values()])
-        length = np.diff(ends, prepend=0).tolist()
-        joints = np.full((ends[-1], 24, 3), np.nan)
-        rows = [end - n[-1] - 1 + k for end, n in zip(ends.tolist(), numbers.values(), strict=True) for k in n]
-        joints[rows] = poses.reshape(-1, 24, 3) + positions[:, None]
-        return motion_from_joints(path, joints, list(clips), length, fps=rate, up=up, kind="LIPD", unit_m=1.0)
+        joints = poses.reshape(-1, 24, 3) + positions[:, None]
+        about: dict[str, Any] = {"fps": rate, "up": up, "kind": "LIPD", "unit_m": 1.0, "number": numbers}
+        return motion_from_joints(path, joints, list(clips), length, **about)
     # the published loaders do not define the up axis
     up = up or standing_axis(axis_angle_to_matrix(poses[:, :3])[..., 1]) or "z"
     ends = np.cumsum(length)
+    spans = [slice(end - count, end) for end, count in zip(ends, length, strict=True)]
     motions = [
         motion_from_smpl(
-            path, poses[e - n : e], positions[e - n : e],
-            name=name, fps=rate, up=up, kind="a corpus", number=np.array(numbers[name]),
+            path, poses[span], positions[span], name=name, fps=rate, up=up, kind="a corpus", number=numbers[span]
         )
-        for name, n, e in zip(clips, length, ends, strict=True)
-    ]  # fmt: skip
+        for name, span in zip(clips, spans, strict=True)
+    ]
     return join(motions, source=f"corpus: {path}")
 
 
