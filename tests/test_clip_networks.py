@@ -151,6 +151,27 @@ def test_clip_example_is_centered_per_frame(clips):
                 assert 0 < np.abs(frame.joints[0]).max() < 0.3
 
 
+def test_clip_example_normalized_as_published(clips):
+    """Points alone: each frame about its mean, in height about the clip's, divided by 1.2. Validation does not."""
+    clip = [thinned(sample, 5 + k) for k, sample in enumerate(clips[0])]
+    settings = {"trans_center": True, "pelvis_centered": 0.0}
+    plain = clip_example(clip, np.random.default_rng(2), **settings)
+    normalized = clip_example(clip, np.random.default_rng(2), **settings, normalize=True)
+    height = np.concatenate([sample.points for sample in clip])[:, 2].mean()
+    for before, after, cloud, sample in zip(
+        plain.frames, normalized.frames, normalized.clouds["person"], clip, strict=True
+    ):
+        np.testing.assert_array_equal(after.joints, before.joints)
+        np.testing.assert_allclose(after.points[:, :2].mean(0), 0, atol=1e-4)
+        np.testing.assert_allclose(1.2 * after.points[:, 2], sample.points[:, 2] - height, atol=1e-4)
+        np.testing.assert_allclose(cloud, after.points, atol=1e-5)
+    dataset = SimpleNamespace(sample=lambda row: clip[row])
+    source = ClipSource(clips=np.arange(16)[None], dataset=dataset, seed=3, trans_center=True, normalize=True)
+    shown = source.example(0).points
+    np.testing.assert_allclose(shown, normalized.points, atol=1e-5)
+    np.testing.assert_allclose(source.validation_clips(1)[0].points, plain.points, atol=1e-5)
+
+
 # ---- losses
 
 
@@ -299,6 +320,10 @@ def test_setup_rejects_settings_that_clip_networks_lack(folder, tmp_path):
         make_setup(recipe(Finetune, "ne", data=(str(folder),), split="all", mix=0.25))
     with refused("shift_windows is for clip networks, tiny reads single frames"):
         make_setup(recipe(Finetune, data=(str(folder),), init="tiny", split="all", mix=0.0, shift_windows=True))
+    with refused("normalize_in_training is an option of lidarcap"):
+        make_setup(recipe(Pretrain, "ne", shards=(str(folder),), options=("normalize_in_training",)))
+    wanted = recipe(Pretrain, "lidarcap", shards=(str(folder),), options=("normalize_in_training",))
+    assert make_setup(wanted).source.normalize
     with refused("the joints of lidarcap are SMPL's 24"):
         replace(LidarcapConfig(), joints=BODY26.joints)
     with refused("option of lidarcap"):

@@ -400,9 +400,28 @@ def test_notes_report_training_on_evaluated_people(sets, trained, words):
     card = {"data": ["waymo"], "recipe": {"split": trained}, "validation_mm": 60.0}
     other = {"data": ["another"], "recipe": {"split": trained}}
     assert noted(card, words) == 1 and noted(other, words) == 0
+    # validated on another split, by `finetune --validation-split`
+    elsewhere = card | {"recipe": {"split": "train", "validation_split": "test"}}
+    assert noted(elsewhere, "validated on this split") == 0
     # people of an earlier run count as well; pre-training on shards uses all splits
     assert noted(other | {"init_card": card}, words) == 1
     assert noted({"recipe": {"shards": ["waymo"], "seed": 0, "scene": "wild"}}, "trained on split all") == 1
+
+
+def test_notes_report_weights_chosen_on_the_test_split(sets):
+    recipe = {"split": "train", "validation_split": "test"}
+    card = {"data": ["humanm3"], "recipe": recipe, "validation_mm": 60.0}
+    for changes, count in (({}, 1), ({"recipe": {"split": "train"}}, 0)):
+        notes = evaluated(sets, "humanm3", Fake(standing, card=card | changes)).result.notes
+        assert sum("selected on these people" in note for note in notes) == count
+
+
+def test_notes_report_training_about_labels(sets):
+    model = Fake(standing, card={})
+    model.header.config = SimpleNamespace(trans_center=True)
+    for protocol, count in (("clean", 1), ("dapt", 0)):
+        notes = evaluated(sets, "lidarhuman26m", model, protocol=protocol).result.notes
+        assert sum("trained about the labels' trans" in note for note in notes) == count
 
 
 def test_scored_joints_are_common_to_network_and_dataset(sets):

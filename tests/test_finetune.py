@@ -378,6 +378,22 @@ def test_finetune_holds_out_sequences_without_val_split(datasets, name, settings
     assert setup.warnings == (() if watched else (f"no validation people: {reason}",))
 
 
+@pytest.mark.parametrize("name, hold_out, watched", [("humanm3", 0.0, 6), ("waymo", 0.1, 4)])
+def test_finetune_validates_on_the_named_split(datasets, name, hold_out, watched):
+    """As methods whose weights were chosen by test error; no sequence of training is held out then."""
+    changes = {"data": (str(datasets[name]),), "mix": 0.0, "hold_out": hold_out}
+    split = "test" if name == "humanm3" else "val"
+    setup = make_setup(Finetune(**changes, validation_split=split))
+    assert not setup.warnings and not setup.card["held_out_sequences"]
+    shown = setup.validation()
+    dataset = InMemoryDataset.load(changes["data"], split=split)
+    assert len(shown) == len(dataset) == watched
+    with pytest.raises(InputError, match="validation_split 'train' is trained on: give another --split"):
+        make_setup(Finetune(**changes, validation_split="train"))
+    with pytest.raises(InputError, match="labeled people in the split 'nothing', got none"):
+        make_setup(Finetune(**changes, validation_split="nothing"))
+
+
 def test_finetune_people_follow_epochs_and_mix(datasets):
     for mix, people in ((0.0, 72), (0.25, 96)):
         setup = make_setup(Finetune(data=(str(datasets["humanm3"]),), epochs=6, mix=mix, hold_out=0.34))

@@ -179,6 +179,12 @@ def test_paper_table_only_lists_finished_cells(finished, capsys):
     assert [cell["state"] for cell in _chosen(_content(out))] == ["done", "not run"] * 2
     assert "1 of 2 seeds" in (out / "table4.md").read_text()
     assert main([*_TABLE, str(out), "--table-only"]) == 0
+    # with other options none of them is a cell of the table: its page is not replaced by an empty one
+    page = (out / "table4.md").read_text()
+    assert main(["paper", "table4", "--out", str(out), "--table-only"]) == 2
+    error = capsys.readouterr().err
+    assert "table4.json has 3 finished cells, none of them run with these options" in error and error.count("\n") == 1
+    assert (out / "table4.md").read_text() == page
 
 
 def test_fig5_draws_hardest_people_of_all_methods(finished, monkeypatch):
@@ -496,6 +502,39 @@ def test_run_table_marks_failed_cells_and_continues(tmp_path):
     assert "failed: unrecognized arguments" in (tmp_path / "out" / "table4.md").read_text()
 
 
+def test_paper_command_fails_if_a_cell_failed(tmp_path, monkeypatch, capsys):
+    content = {"cells": [_entry(), _entry(state="failed", reason="x")]}
+    monkeypatch.setattr(report, "run_table", lambda *_: content)
+    assert main(["paper", "table4", "--out", str(tmp_path / "p")]) == 2
+    assert "1 cell failed, the others are done" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("dry", [["--dry-run"], []])
+def test_paper_checks_files_before_it_trains(tmp_path, monkeypatch, capsys, dry):
+    monkeypatch.setattr(report, "run_steps", lambda *_: pytest.fail("runs a step"))
+    monkeypatch.chdir(tmp_path)
+    assert main(["paper", "table4", "--motion", "nowhere.npz", *dry]) == 2
+    assert "nowhere.npz: no such file or folder, for --motion" in capsys.readouterr().err
+    # of the chosen rows alone
+    (tmp_path / "first.npz").touch()
+    words = ["paper", "table2", "--motion", "first.npz,nowhere.npz", "--dry-run", "--rows"]
+    assert main([*words, "poses-of-first"]) == 0 and main([*words, "poses-of-nowhere"]) == 2
+
+
+def test_options_need_poses_for_a_body(data):
+    with pytest.raises(InputError, match="smpl=FILE is the body of people with given poses: give freemotion-poses"):
+        Options(data={"waymo": data["waymo"], "smpl": "SMPL.npz"})
+
+
+def test_paper_needs_people_to_train_on(tmp_path, smpl):
+    raw, folder = tmp_path / "raw", tmp_path / "test"
+    write_lidarhuman26m(raw, smpl, sequences=("5", "7"), frames=2)
+    prepare("lidarhuman26m", raw, folder, smpl=smpl, split="test", progress=False)
+    selected = cells(TABLES["table1"], Options(data={"lidarhuman26m": str(folder)}), ["lidarcap"])
+    with pytest.raises(InputError, match="has no people in the split 'train'; there are test"):
+        report.check_targets(selected)
+
+
 def test_copied_cells_are_done_for_tables_but_not_for_figures(tmp_path):
     asked = []
     for name in ("table1", "fig5"):
@@ -510,7 +549,7 @@ def test_copied_cells_are_done_for_tables_but_not_for_figures(tmp_path):
 
 def test_run_steps_raises_if_step_is_stopped_or_fails(tmp_path):
     step = Step(("synth", "-n", "3"))
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt, match="^the same lidarpose paper command goes on here$"):
         run_steps(step, tmp_path, lambda words: 143, print)
     with pytest.raises(StepFailed, match="status 1"):
         run_steps(step, tmp_path, lambda words: 1, print)

@@ -722,6 +722,60 @@ def test_recording_page_contains_all_frames(drive, tmp_path):
     assert "<th scope=col>track</th>" in text.replace(' class="number"', "")
 
 
+def test_recording_page_of_crops_moves_points_with_the_person():
+    """A crop is one person without a box: all of its points are the person's, none are surroundings."""
+    view = page.RecordingPage("z")
+    frames = [np.full((5, 3), k + 1.0) for k in range(3)]
+    for k in range(3):
+        joints = (np.zeros((24, 3)) + k + 1).tolist()
+        person = {"id": 0, "track": 7, "joints": joints, "box": None, "confidence": None}
+        # times of a clock
+        pose = {"T_world_sensor": None, "time": 1.7e9 + k / 10}
+        view.add(pose | {"error": None, "frame": k, "people": [person]})
+    text = view.render(FrameSource(Crops(frames)), SMPL24, title="").decode()
+    (scan,) = json.loads(text.split('id="data">')[1].split("</script>")[0])["scans"]
+    assert not scan["points"] and [len(frame["points"]) for frame in scan["frames"]] == [15] * 3
+    assert [frame["points"][:3] for frame in scan["frames"]] == [f["poses"][0]["joints"][0] for f in scan["frames"]]
+    # the page counts from the first frame
+    assert [frame["label"].split(",")[0] for frame in scan["frames"]] == ["0.00 s", "0.10 s", "0.20 s"]
+    assert "1700000000" not in text and ">0.2<" in text
+
+
+class Crops:
+    """A recording of clouds at 10 Hz."""
+
+    name, warnings = "crops", ()
+
+    def __init__(self, clouds):
+        self.clouds, self.count = clouds, len(clouds)
+
+    def lazy_frames(self, first=0):
+        for k in range(first, self.count):
+            yield LazyFrame(str(k), k / 10, lambda k=k: Sweep(points=self.clouds[k], T_world_sensor=None))
+
+
+def test_picture_of_recordings_names_axes_and_counts_poses(monkeypatch):
+    """As the picture of one scan; the distance of a crop is not known."""
+    drawn = []
+    monkeypatch.setattr(picture, "draw_scan_and_people", lambda scan, people, **_: drawn.append((scan, people)) or b"")
+    frames = [np.random.default_rng(0).normal(size=(9, 3))] * 3
+    for up, pose, count in (("-y", None, 3), ("-y", np.eye(4), 1)):
+        view = picture.TrajectoryPicture(up)
+        for k in range(count):
+            box = {"center": [1.0, 0, 9], "size": [1, 1, 2], "yaw": 0.0} if pose is not None else None
+            person = {"id": 0, "track": None, "joints": np.ones((24, 3)).tolist(), "box": box, "score": None}
+            view.add({"T_world_sensor": pose, "error": None, "frame": k, "people": [person | {"confidence": None}]})
+        view.draw(FrameSource(Crops(frames)), SMPL24, title="")
+    (moving, _), (in_world, _) = drawn
+    assert moving.axes == ("z", "-x") and moving.label == "3 poses in 3 frames"
+    assert in_world.axes == ("x", "y") and in_world.label == "1 person in 1 frame"
+    view = picture.TrajectoryPicture("z")
+    person = {"id": 0, "track": None, "joints": np.ones((24, 3)).tolist(), "box": None, "score": None}
+    view.add({"T_world_sensor": None, "error": None, "frame": 0, "people": [person | {"confidence": None}]})
+    view.draw(FrameSource(Crops(frames)), SMPL24, title="")
+    assert drawn[-1][0].sensor is None and np.isnan(drawn[-1][1][0].distance)
+
+
 def test_recording_page_limits_number_of_frames(drive, tmp_path, monkeypatch):
     monkeypatch.setattr(page, "_MOST_FRAMES", 2)
     assert main(["predict", str(drive), "--html", "--out", str(tmp_path / "a.jsonl")]) == 0

@@ -97,3 +97,17 @@ def test_students_learn_the_same_batches(tool, objective, examples, tmp_path):
     student.save(tmp_path / "tiny.safetensors", {"command": "x"})
     assert (tmp_path / "tiny.safetensors").stat().st_size < 1.1e6
     assert rate_factor(0.01, recipe) == 0.5 and rate_factor(1.0, recipe) == 0 and rate_factor(0.09, recipe) == 1
+
+
+def test_card_has_whole_command_without_paths(tool, tmp_path, monkeypatch, capsys):
+    words = ["--sizes", "tiny", "--motion=/home/me/wide.npz", "--device", "cpu", "--minutes", "2"]
+    with pytest.raises(SystemExit, match="2"):
+        tool.options_of([str(tmp_path), *words, "--rates", "1e-3", "2e-3"])
+    assert "--rates needs one number for each of 1 sizes, got 2" in capsys.readouterr().err
+    options = tool.options_of([*words, str(tmp_path)])
+    assert options.rates == [8e-4]
+    command = tool.command_of(options)
+    assert command.startswith("python tools/train_on_gpu.py OUT --minutes 2.0 --sizes tiny --rates 0.0008 ")
+    assert "--motion wide.npz" in command and "/" not in command.removeprefix("python tools/")
+    again = tool.options_of([str(tmp_path), *command.split()[3:]])
+    assert {**vars(again), "motion": options.motion} == vars(options)

@@ -345,6 +345,20 @@ def test_report_scan_keeps_points_near_people():
     assert "canvas" in Reader(render_report([], title="", summary=[], scans=[nobody])).tags
 
 
+def test_report_scan_states_points_drawn_and_controls_in_use():
+    """Nothing promises more than the page has: a scan of few points is drawn whole, labels are no predictions."""
+    few, many = (np.random.default_rng(0).normal(0, 5, (n, 3)) for n in (300, 60_000))
+    poses = Pose(joints=t_pose().joints[None], skeleton=BODY26)
+    for scan, caption, predicted in (
+        (ScanPanel(points=few, boxes=[], poses=poses), "<span>300 points</span>", True),
+        (ScanPanel(points=many, boxes=[], poses=poses, labeled=True), " of 60,000 points drawn</span>", False),
+    ):
+        text = render_report([], title="t", summary=[], scans=[scan])
+        assert caption in text and Reader(text).data()["scans"][0]["predicted"] is predicted
+    assert Reader(render_report([person()], title="t", summary=[])).data()["people"][0]["spins"]
+    assert 'data-if="spins"' in text and 'data-if="pose predicted"' in text
+
+
 def test_report_is_small_and_subsamples_points():
     people = [person(count=1000, label=str(i), yaw=i) for i in range(12)]
     text, data = report(*people)

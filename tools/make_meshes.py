@@ -2,9 +2,9 @@
 
     python tools/make_meshes.py [--out src/lidarpose/synth/assets/meshes.npz]
 
-All are closed, with few triangles, each in its own frame: x forward, y left, z up; in meters, or of unit size if they
-are scaled when used (see `lidarpose.synth.environment.mesh.shape`). The file is the same on any machine with the same
-numpy.
+All have few triangles and are closed, but for those that stand on a `prism`; each is in its own frame: x forward, y
+left, z up; in meters, or of unit size if they are scaled when used (see `lidarpose.synth.environment.mesh.shape`). The
+file is the same on any machine with the same numpy.
 """
 
 import argparse

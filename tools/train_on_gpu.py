@@ -48,6 +48,8 @@ SHAPES = (
     *((64, 32, 24), (104, 48, 32), (152, 64, 40), (216, 88, 56), (224, 104, 56), (224, 128, 72), (224, 160, 88)),
     *((224, 208, 128), (224, 224, 224)),
 )
+# peak rates of AdamW by size
+RATES = {"base": 1e-3, "small": 8e-4, "tiny": 8e-4}
 # batches of a chunk, whose people are sorted by size; the uses of a whole scan; whole scans that a worker keeps
 CHUNK, SCAN_USES, SCANS_KEPT = 8, 24, 64
 # batches kept on the GPU, and how many must be there before one is shown again
@@ -278,13 +280,13 @@ class Feeder(threading.Thread):
             self.ready.put((index, copied))
 
 
-def main() -> None:
+def options_of(words: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--minutes", type=float, default=9.0, help="time of training, the recording of graphs included")
-    parser.add_argument("--sizes", nargs="+", default=["base", "small"])
+    parser.add_argument("--sizes", nargs="+", default=["base", "small"], choices=RATES)
     parser.add_argument(
-        "--rates", nargs="+", type=float, default=[1e-3, 8e-4], help="of AdamW; Muon has ten times them"
+        "--rates", nargs="+", type=float, help=f"of AdamW, for each size (default: {RATES}); Muon has ten times them"
     )
     parser.add_argument("--init", default="small")
     parser.add_argument("--motion")
@@ -295,7 +297,29 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=15)
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--check", action="store_true")
-    options = parser.parse_args()
+    options = parser.parse_args(words)
+    if options.rates is None:
+        options.rates = [RATES[size] for size in options.sizes]
+    if len(options.rates) != len(options.sizes):
+        parser.error(f"--rates needs one number for each of {len(options.sizes)} sizes, got {len(options.rates)}")
+    return options
+
+
+def command_of(options: argparse.Namespace) -> str:
+    """The command of a run, without paths of this machine."""
+    values = {
+        name: value for name, value in vars(options).items() if name not in ("out", "check") and value is not None
+    }
+    values |= {name: Path(values[name]).name for name in ("motion", "init") if name in values}
+    words = [
+        f"--{name.replace('_', '-')} {' '.join(map(str, value)) if isinstance(value, list) else value}"
+        for name, value in values.items()
+    ]
+    return " ".join(["python tools/train_on_gpu.py OUT", *words])
+
+
+def main() -> None:
+    options = options_of()
     began = time.monotonic()
     options.out.mkdir(parents=True, exist_ok=True)
     device = torch.device(options.device)
@@ -399,10 +423,8 @@ def train(
 def save(
     students: list[Student], options: argparse.Namespace, step: int, fresh: int, seconds: float, init_card: dict
 ) -> None:
-    words = [Path(word).name if word == options.motion else word for word in sys.argv[2:]]
-    command = " ".join(["python tools/train_on_gpu.py OUT", *words])
     recipe = {"seed": options.seed, "batch": options.batch}
-    card = {"command": command, "recipe": recipe, "people_seen": fresh * options.batch}
+    card = {"command": command_of(options), "recipe": recipe, "people_seen": fresh * options.batch}
     card |= {
         "shown": step * options.batch,
         "hours": round(seconds / 3600, 3),

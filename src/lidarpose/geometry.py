@@ -184,6 +184,16 @@ def rotation_of_boxes(up: str | Sequence[float]) -> np.ndarray:
     return UP_AXES[upright_axis(up)]
 
 
+def axes_from_above(up: str | Sequence[float]) -> tuple[str, str]:
+    """Names of the input's axes that point right and up in a picture from above."""
+    right, upward = map(nearest_axis, rotation_from_up(up)[:2])
+    if up in UP_AXES:
+        return right, upward
+    # turned far, both are nearest to one axis, which then names neither
+    is_named = right[-1] != upward[-1]
+    return (f"{right} turned level", f"{upward} turned level") if is_named else ("across", "along")
+
+
 def vector_of(given: Any) -> np.ndarray | None:
     """Three finite numbers or the text "x,y,z" as (3,) float64; None for anything else."""
     try:

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from lidarpose.cli.terminal import add_command, names, tell
-from lidarpose.errors import InputError, check_name
+from lidarpose.errors import InputError, check_name, counted
 
 _NAMES = ("table1", "table2", "table3", "table4", "fig5", "fig6", "fig7", "fig8")
 _PAPER = """
@@ -83,12 +83,16 @@ def _paper(commands, execute: Callable[[list[str]], int], options: argparse.Name
         return
     if options.table_only:
         begin_out(out)
-        write_table(table, paper_options, out, chosen=row_keys)
+        content = write_table(table, paper_options, out, chosen=row_keys, update=True)
     else:
-        run_table(table, paper_options, out, row_keys, execute, tell)
+        content = run_table(table, paper_options, out, row_keys, execute, tell)
     print(out / f"{table.name}.md")
     for path in figures.draw(table.name, selected_cells, out) if table.name.startswith("fig") else ():
         print(path)
+    if failed := sum(entry["state"] == "failed" for entry in content["cells"]):
+        raise InputError(
+            f"{counted(failed, 'cell')} failed, the others are done: {out / table.name}.md has the reasons"
+        )
 
 
 def _data(text: str | None) -> dict[str, str]:

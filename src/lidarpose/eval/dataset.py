@@ -187,7 +187,10 @@ def _open_folder(folder: Path, split: str | None, limit: int | None) -> EvalData
             problem = f"{entry['count']} of its {card.shards} shards cannot be read, perhaps those of the split test"
             raise file_error(folder, f"{problem}; the first: {entry['first']}; or give split NAME")
         if split == EVERYBODY and splits:
-            raise file_error(folder, f"has no people in test or val, only in {', '.join(splits)}: give split NAME")
+            raise file_error(
+                folder,
+                f"has no people in test or val, only in {', '.join(splits)}: give split NAME, or prepare all splits",
+            )
     people = rows if split == EVERYBODY else rows[rows["split"] == split]
     total = len(people)
     if not total:

@@ -128,7 +128,8 @@ def _pem(p: Predictions, setting: Setting) -> Score | None:
     pred = [p.pred[rows][p.posed[rows]] for rows in frame_rows]
     result = keypoints.pem(pred, *([column[rows] for rows in frame_rows] for column in columns))
     joints = result.matched + result.missed + result.extra
-    return Score(result.pem, people=result.people, joints=joints, skipped=result.people_excused)
+    people = result.people + result.people_missed
+    return Score(result.pem, people=people, joints=joints, skipped=result.people_excused)
 
 
 def _of_confidence(p: Predictions, setting: Setting, metric: Callable) -> Score | None:

@@ -143,8 +143,11 @@ def _person_rows(setup: EvalSetup, bench: Bench, predictions: Predictions, setti
 
 def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iterator[str]:
     """Notes for the reader; setting: the setup's, with `sensor` updated to what the dataset knows."""
-    runs = runs_of(getattr(getattr(setup.model, "header", None), "card", {}))
+    header = getattr(setup.model, "header", None)
+    runs = runs_of(getattr(header, "card", {}))
     yield from dict.fromkeys(note for run in runs for note in _notes_of_run(run, setup.dataset))
+    if getattr(getattr(header, "config", None), "trans_center", False) and setting.protocol != "dapt":
+        yield "the network was trained about the labels' trans (trans_center): score it by the protocol dapt"
     if setting.not_judged:
         yield f"scored joints: {', '.join(setting.joints)}; {setting.not_judged}"
     if setting.leaks:
@@ -177,7 +180,7 @@ def _notes_of_run(run: dict, dataset: EvalDataset) -> Iterator[str]:
     if isinstance(data, list) and dataset.name in data:
         if split == dataset.split or "all" in (split, dataset.split):
             yield f"the network was trained on split {split} of {dataset.name}: it has seen the people it is scored on"
-        elif dataset.split == "val" and "validation_mm" in run:
+        elif dataset.split == (recipe.get("validation_split") or "val") and "validation_mm" in run:
             yield "the network's run was validated on this split: its best.safetensors was selected on these people"
     settings = dataset.settings if dataset.kind == "synth" else {}
     is_synthetic = recipe["mix"] if "mix" in recipe else not recipe.get("shards")

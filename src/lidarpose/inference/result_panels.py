@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidarpose.errors import counted
-from lidarpose.geometry import UP_AXES, nearest_axis, rotation_about, rotation_from_up
+from lidarpose.geometry import UP_AXES, axes_from_above, rotation_about, rotation_from_up
 from lidarpose.io.files import shorten
 from lidarpose.sample import Box, Pose, facing_yaw
 from lidarpose.viz.bird_eye import LONGEST_NAME, ScanPanel
@@ -43,11 +43,6 @@ def _from_above(poses: "Poses", people: "list[PersonPose]") -> ScanPanel:
     """The scan with `people`, which are in the level frame (z up)."""
     assert poses.scan is not None
     R_level_input = rotation_from_up(poses.up)
-    across, along = map(nearest_axis, R_level_input[:2])
-    if poses.up not in UP_AXES:
-        # turned far, both are nearest to one axis, which then names neither
-        is_named = across[-1] != along[-1]
-        across, along = (f"{axis} turned level" for axis in (across, along)) if is_named else ("across", "along")
     posed = [person for person in people if person.has_pose]
     label = counted(len(people), "person", "people") if people else "no people"
     if len(posed) < len(people):
@@ -59,7 +54,7 @@ def _from_above(poses: "Poses", people: "list[PersonPose]") -> ScanPanel:
         names=[shorten(str(person.id), LONGEST_NAME) for person in posed],
         label=label,
         sensor=None if poses.origin is None else tuple((R_level_input @ poses.origin)[:2].tolist()),
-        axes=(across, along),
+        axes=axes_from_above(poses.up),
     )
 
 

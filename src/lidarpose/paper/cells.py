@@ -62,6 +62,10 @@ class Options:
             raise InputError("--subjects and --held-out select captured motion: give its file by --motion")
         if self.data and not self.real:
             raise InputError(f"--data needs a dataset to score on, one of {', '.join(REAL)}")
+        if SMPL in self.data and not set(POSES) & set(self.data):
+            raise InputError(
+                f"--data {SMPL}=FILE is the body of people with given poses: give {' or '.join(POSES)} too"
+            )
 
     @property
     def real(self) -> tuple[str, ...]:

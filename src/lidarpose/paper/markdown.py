@@ -17,7 +17,7 @@ _LEGEND = (
 # appended if the paper's printed values are shown
 _PRINTED = (
     " In parentheses the paper's values, not run here: those of LiDARCap and NE are relative to the root, "
-    "without shapes; those of LPFormer are for detected boxes."
+    "without shapes; that of LPFormer on Waymo is for detected boxes."
 )
 # a metric of newer cells, and the rows whose printed values are in it
 ROOT, _ROOT_ROWS = "root_mpjpe", ("LiDARCap", "NE")

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from lidarpose._version import __version__
 from lidarpose.data.dataset_card import CARD
-from lidarpose.errors import LidarPoseError
+from lidarpose.errors import InputError, LidarPoseError, counted
 from lidarpose.eval.dataset import EvalSample, open_eval_dataset
 from lidarpose.eval.metrics import aggregate
 from lidarpose.eval.predictions import read_poses
@@ -41,6 +42,8 @@ SCHEMA = "lidarpose.paper/1"
 _UNDERTRAINED = 0.2
 # maximum number of people that the mean pose is computed from
 _MEAN_POSE = 5_000
+# options of steps whose values are files or folders of the user
+_FILES = ("--motion", "--body", "--shards")
 # the file of an evaluation's studies of perturbed points
 _STUDIES = "stability.json"
 
@@ -75,8 +78,16 @@ def run_table(
 
 def check_targets(selected: Sequence[Cell]) -> list[str]:
     """Warnings, a line each, about real sets; before hours of training. Raises InputError, one line, if one cannot be
-    scored under the protocol."""
+    trained on, or scored under the protocol, or if a file that a step reads is missing."""
     warnings = []
+    words = [step.words for cell in selected if cell.evaluation for step in cell.evaluation.all()]
+    files = {str(value): option for step in words for option, value in pairwise(step) if option in _FILES}
+    for file, option in files.items():
+        if not Path(file).exists():
+            raise InputError(f"{file}: no such file or folder, for {option}")
+    for train in dict.fromkeys(cell.target.train for cell in selected if cell.evaluation is not None):
+        if isinstance(train, str):
+            open_eval_dataset(train, split="train", limit=1)
     for test in dict.fromkeys(cell.target.test for cell in selected if cell.evaluation is not None):
         if isinstance(test, str):
             dataset = open_eval_dataset(test)
@@ -105,12 +116,14 @@ def write_table(
     failed: dict[int, str] | None = None,
     *,
     chosen: Sequence[str] = (),
+    update: bool = False,
 ) -> dict[str, Any]:
     """Writes OUT/TABLE.json and OUT/TABLE.md from the existing results, and the JSON of each finished cell.
 
     Args:
         failed: number of a cell -> its error.
         chosen: rows that are meant to have all seeds, by default all; others have the first, and what was run.
+        update: raise InputError instead of replacing a table with finished cells, if with these options none is.
     """
     failed, all_cells, chosen_cells = failed or {}, cells(table, options), cells(table, options, chosen)
     entries = [_entry(cell, out, failed.get(k, "")) for k, cell in enumerate(all_cells)]
@@ -131,9 +144,19 @@ def write_table(
         "reference": table.reference,
         "cells": entries,
     }
-    write_atomic(out / f"{table.name}.json", json.dumps(content, indent=1) + "\n")
+    path = out / f"{table.name}.json"
+    if update and not _finished(entries) and path.is_file():
+        count = _finished(read_json(path, expected="a table")["cells"])
+        if count:
+            problem = f"{path} has {counted(count, 'finished cell')}, none of them run with these options"
+            raise InputError(f"{problem}: repeat --data, --people, --size and the others of the command that ran them")
+    write_atomic(path, json.dumps(content, indent=1) + "\n")
     write_atomic(out / f"{table.name}.md", markdown(content))
     return content
+
+
+def _finished(entries: Sequence[dict[str, Any]]) -> int:
+    return sum(entry["state"] == "done" for entry in entries)
 
 
 def _entry(cell: Cell, out: Path, failure: str) -> dict[str, Any]:

@@ -133,7 +133,7 @@ def run_steps(step: Step, out: Path, execute: Execute, tell: Callable[[str], Non
         with exclusive_lock(out / RUNS / f".{part.name}.lock", partial(tell, waiting)):
             if not is_done(part, out):
                 tell(part.line(out))
-                _run(part, out, execute)
+                _run(part, out, execute, tell)
                 _note(part, out, done=True, command=part.line(out))
 
 
@@ -147,7 +147,7 @@ def _note(step: Step, out: Path, **entries: Any) -> None:
     write_atomic(out / RUNS / f"{step.name}.json", json.dumps(content, indent=1) + "\n")
 
 
-def _run(step: Step, out: Path, execute: Execute) -> None:
+def _run(step: Step, out: Path, execute: Execute, tell: Callable[[str], None]) -> None:
     folder = step.folder(out)
     if step.kind == "evaluate":
         if (folder / POSES).is_file():
@@ -169,8 +169,10 @@ def _run(step: Step, out: Path, execute: Execute) -> None:
             if not watch.fit:
                 raise
     if watch.fit:
-        _note(step, out, length=_shortened(step, folder, watch.fit))
-        _run(step, out, execute)
+        length = _shortened(step, folder, watch.fit)
+        _note(step, out, length=length)
+        tell(f"shortened to fit {step.hours:.3g} hours: goes on with {' '.join(length)}")
+        _run(step, out, execute, tell)
 
 
 def _execute(words: list[str], execute: Execute) -> None:
@@ -182,7 +184,8 @@ def _execute(words: list[str], execute: Execute) -> None:
             # raised by the parser for an invalid command line
             status = exit_error.code if isinstance(exit_error.code, int) else 2
     if status >= 128:
-        raise KeyboardInterrupt(last_line.line)
+        # the command has told what it did
+        raise KeyboardInterrupt("the same lidarpose paper command goes on here")
     if status:
         raise StepFailed(last_line.line.removeprefix("lidarpose: error: ") or f"ended with status {status}")
 

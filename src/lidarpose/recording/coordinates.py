@@ -5,7 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.geometry import inverse_transform, rigid_transform, rotation_of_boxes, transform_points
+from lidarpose.geometry import (
+    axes_from_above,
+    inverse_transform,
+    rigid_transform,
+    rotation_of_boxes,
+    transform_points,
+    upright_axis,
+)
 
 
 class FixedFrame:
@@ -16,6 +23,7 @@ class FixedFrame:
     """
 
     def __init__(self, up: str):
+        self._up = upright_axis(up)
         self.R_upright = rotation_of_boxes(up)
         self.T_world_sensor: np.ndarray | None = None
         self.T_fixed_world: np.ndarray | None = None
@@ -35,6 +43,12 @@ class FixedFrame:
         if self.T_world_sensor is None or self.T_fixed_world is None:
             return T_upright_sensor
         return self.T_fixed_world @ self.T_world_sensor
+
+    @property
+    def axes(self) -> tuple[str, str]:
+        """Names of the fixed frame's x and y in the input: axes of the sensor's frame, or of the world's."""
+        is_world = self.T_fixed_world is not None and np.array_equal(self.T_fixed_world, np.eye(4))
+        return ("x", "y") if is_world else axes_from_above(self._up)
 
     def state(self) -> list:
         """The state after the frames so far, as JSON values."""

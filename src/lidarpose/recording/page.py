@@ -87,17 +87,20 @@ class RecordingPage:
             step=self._step(),
             label=f"{counted(len(panels), 'frame')} of {self._count:,}",
         )
+        start = self._start()
         rows = [
-            {"track": id, "frames": track.frames, "from": track.first, "to": track.last, "way, m": track.way}
-            for id, track in sorted(self._tracks.items())
+            {"track": id, "frames": x.frames, "from": x.first - start, "to": x.last - start, "way, m": x.way}
+            for id, x in sorted(self._tracks.items())
         ]
         return render_report([], title=title, summary=rows, scans=[panel]).encode("utf-8", "replace")
 
     def _of_people(self, points: np.ndarray, people: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
         """A subsample (m, 3) m of the points inside the boxes of people, and (n,) bool: which of the points (n, 3) are
-        outside all boxes and their margins."""
+        outside all boxes and their margins. All points of a crop, whose person has no box, are the person's."""
+        if any(person["box"] is None for person in people):
+            return points[evenly_spaced(len(points), _PERSON_POINTS)], np.zeros(len(points), bool)
         is_far, clouds = np.ones(len(points), bool), [np.zeros((0, 3))]
-        for box in (person["box"] for person in people if person["box"] is not None):
+        for box in (person["box"] for person in people):
             is_far &= ~box.contains(points, margin=_NEAR)
             own_points = points[box.contains(points)]
             clouds.append(own_points[evenly_spaced(len(own_points), _PERSON_POINTS)])
@@ -108,7 +111,7 @@ class RecordingPage:
     ) -> ScanPanel:
         posed = [person for person in people if person["joints"] is not None]
         joints = np.stack([person["joints"] for person in posed]) if posed else None
-        time = f"frame {about['frame']}" if about["time"] is None else f"{about['time']:.2f} s"
+        time = f"frame {about['frame']}" if about["time"] is None else f"{about['time'] - self._start():.2f} s"
         return ScanPanel(
             points=points,
             boxes=[person["box"] for person in people if person["box"] is not None],
@@ -116,6 +119,10 @@ class RecordingPage:
             names=[str(person["id"] if person["track"] is None else person["track"]) for person in posed],
             label=f"{time}, {counted(len(people), 'person', 'people')}",
         )
+
+    def _start(self) -> float:
+        """Time of the first frame shown, which the page counts from, s: times may be those of a clock; 0 if unknown."""
+        return next((about["time"] for about, _, _ in self._lines if about["time"] is not None), 0.0)
 
     def _step(self) -> float:
         """Time between two shown frames, ms."""

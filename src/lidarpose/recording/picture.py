@@ -84,7 +84,7 @@ class TrajectoryPicture:
             ]
             count_text = counted(len(boxes), "track")
             if not boxes and None in paths:
-                count_text = counted(len(paths[None]), "person", "people")
+                count_text = counted(len(paths[None]), "pose")
         panel = ScanPanel(
             points=points,
             boxes=boxes,
@@ -93,6 +93,7 @@ class TrajectoryPicture:
             places=None if is_single else paths.get(None),
             label=f"{count_text} in {counted(len(self._frames), 'frame')}",
             # the sensor position of crops, people without boxes, is unknown
+            axes=self._fixed.axes,
             sensor=None if not self._to_fixed or self._ways and not self._yaws else self._to_fixed[-1][:2, 3].tolist(),
         )
         return draw_scan_and_people(panel, list(self._cards(points, skeleton)) if is_single else [], title=title)
@@ -106,10 +107,11 @@ class TrajectoryPicture:
             if joints is not None:
                 pose = Pose(joints=joints, skeleton=skeleton, confidence=person["confidence"] or None)
             label = person_label(person["id"], person["score"], person.get("mounted"))
-            distance = (
-                np.linalg.norm(np.median(person_points, 0) - self._to_fixed[0][:3, 3]) if len(person_points) else np.nan
-            )
-            yield Panel(points=person_points, pose=pose, label=label, box=box, distance=float(distance))
+            distance = float("nan")
+            # the sensor position of a crop, a person without a box, is unknown
+            if box is not None and len(person_points):
+                distance = float(np.linalg.norm(np.median(person_points, 0) - self._to_fixed[0][:3, 3]))
+            yield Panel(points=person_points, pose=pose, label=label, box=box, distance=distance)
 
     def _points(self, source: FrameSource) -> np.ndarray:
         """Points (n, 3) m of evenly spaced frames; only of the last frame if the sensor is stationary."""

@@ -30,6 +30,8 @@ VISIBLE_RADIUS = 0.18
 UNKNOWN_PART = -1
 # a sample that would have fewer points after the crop is not cropped
 LEAST_POINTS = 5
+# by what LiDARCap's training script divides points
+NORMALIZED_SCALE = 1.2
 # maximum number of clutter points per cluster
 _CLUTTER = 60
 # the same for synthetic samples, and the range of the standard deviation of their noise, m
@@ -220,15 +222,18 @@ def clip_example(
     trans_center: bool = False,
     pelvis_centered: float = PELVIS_CENTERED,
     turn: bool = False,
+    normalize: bool = False,
 ) -> ClipExample:
     """A training example of a clip: frames of one person, with rotations and the joints of body26.
 
     The centers are those of the points, or with probability `pelvis_centered` estimated pelvises; trans_center: they
-    are SMPL's trans, if known; turn: all frames are turned about z by one random angle.
+    are SMPL's trans, if known; turn: all frames are turned about z by one random angle; normalize: points of people are
+    then shifted and scaled, see `LidarcapConfig.normalize_in_training`, and joints are not.
     """
     is_about_pelvis = rng.random() < pelvis_centered
     R = rotation_about("z", rng.uniform(-np.pi, np.pi)) if turn else np.eye(3)
     frames, clouds = [], []
+    clip_height = np.concatenate([sample.points[:, 2] for sample in samples]).mean() if normalize else 0.0
     for sample in samples:
         assert sample.pose is not None
         joints, center = sample.pose.joints, sample.center
@@ -237,6 +242,9 @@ def clip_example(
         elif is_about_pelvis:
             center = joints[_PELVIS] + rng.normal(0, PELVIS_ERROR, 3)
         points = (sample.points - center) @ R.T
+        if normalize:
+            origin = np.append(sample.points[:, :2].mean(0), clip_height)
+            points = (sample.points - origin) @ R.T / NORMALIZED_SCALE
         part, visible = np.full(len(points), UNKNOWN_PART), np.full(len(joints), np.nan, np.float32)
         view = view_features(center, None)
         frames.append(make_example(rng, points, (joints - center) @ R.T, part=part, visible=visible, view=view))

@@ -176,13 +176,14 @@ class StoredSource(DatasetSource):
 
 @dataclass(frozen=True, kw_only=True)
 class ClipSource(DatasetSource):
-    """The clips of datasets. clips, skipped: see `InMemoryDataset.clips`; trans_center, turn: see `clip_example`. If
-    the clips have following rows, all clips of an epoch are shifted by the same random number of frames, limited so
-    that each stays within its run."""
+    """The clips of datasets. clips, skipped: see `InMemoryDataset.clips`; trans_center, turn, normalize: see
+    `clip_example`. If the clips have following rows, all clips of an epoch are shifted by the same random number of
+    frames, limited so that each stays within its run."""
 
     clips: np.ndarray
     trans_center: bool
     turn: bool = False
+    normalize: bool = False
     skipped: Counter[str] = field(default_factory=Counter)
 
     def example(self, index: int) -> ClipExample:
@@ -194,10 +195,11 @@ class ClipSource(DatasetSource):
             start = min(int(epoch_rng.integers(following + 1)), max(len(np.unique(rows)) - CLIP_FRAMES, 0))
             rows = rows[start : start + CLIP_FRAMES]
         samples = [self._sample(row, rng) for row in rows]
-        return clip_example(samples, rng, trans_center=self.trans_center, turn=self.turn)
+        return clip_example(samples, rng, trans_center=self.trans_center, turn=self.turn, normalize=self.normalize)
 
     def validation_clips(self, count: int) -> list[ClipExample]:
-        """At most `count` clips, evenly spread, for validation: centered on their points."""
+        """At most `count` clips, evenly spread, for validation: centered on their points, or as `trans_center`
+        says."""
         rng = np.random.default_rng(self.seed)
         clip_rows = self.clips[evenly_spaced(len(self.clips), count), :CLIP_FRAMES]
         clips = [[self.dataset.sample(row) for row in rows] for rows in clip_rows]

@@ -225,6 +225,9 @@ class Finetune(PoseRecipe):
     hold_out: float = _setting(
         0.1, "share of sequences held out for validation if the dataset has no split val", "SHARE"
     )
+    validation_split: str = _setting(
+        "", "split to validate on (default: val, or held-out sequences); test: chooses best.safetensors by it"
+    )
     shift_windows: bool = _setting(False, "clips: shift windows by a random 0 to 15 frames each epoch")
     keep_anchors: bool = _setting(
         True, "paper's network: keep pre-trained anchors and heads of joints of the same name"

@@ -364,6 +364,7 @@ def _clips(dataset: InMemoryDataset, config: LidarcapConfig, recipe: Pretrain | 
         seed=recipe.seed,
         trans_center=config.trans_center,
         turn=isinstance(recipe, Finetune) and recipe.augment == "turn",
+        normalize=config.normalize_in_training,
     )
 
 
@@ -381,8 +382,13 @@ def _of_clips(setup: TrainSetup, source: ClipSource) -> TrainSetup:
 def _held_out(
     recipe: Finetune, split: str | None, dataset: InMemoryDataset
 ) -> tuple[tuple[str, ...], InMemoryDataset | None]:
-    """Held-out sequences, and the validation dataset: the split val if it exists, else those sequences; none if
-    `hold_out` is 0."""
+    """Held-out sequences, and the validation dataset: `validation_split`, else the split val if it exists, else those
+    sequences; none if `hold_out` is 0."""
+    if recipe.validation_split:
+        if split in (None, recipe.validation_split):
+            problem = f"validation_split {recipe.validation_split!r} is trained on: give another --split, or omit it"
+            raise InputError(problem)
+        return (), InMemoryDataset.load(recipe.data, split=recipe.validation_split, interval=recipe.interval)
     if not recipe.hold_out:
         return (), None
     if split not in (None, "val"):

@@ -52,14 +52,18 @@ def render_report(people: list[Panel], *, title: str, summary: list[dict], scans
     skeletons |= {panel.poses.skeleton.name: panel.poses.skeleton for panel in panels if panel.poses is not None}
     limit = max(_FEWEST_POINTS, MAX_POINTS // max(len(people), 1))
     people_data = [_person_data(p, limit) for p in people]
+    scans_data = [_scan_data(scan, max(_FEWEST_SCAN_POINTS, _SCAN_POINTS // len(scans))) for scan in scans]
     data = {
         "skeletons": {name: _skeleton_data(s) for name, s in skeletons.items()},
         "people": people_data,
-        "scans": [_scan_data(scan, max(_FEWEST_SCAN_POINTS, _SCAN_POINTS // len(scans))) for scan in scans],
+        "scans": scans_data,
     }
     # inside a script element, only "<" could end the element early
     json_text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    cards = [_scan_card(f"scan{i}", scan) for i, scan in enumerate(scans)]
+    cards = [
+        _scan_card(f"scan{i}", scan, len(d["points"]) // 3)
+        for i, (scan, d) in enumerate(zip(scans, scans_data, strict=True))
+    ]
     cards += [_card(i, p, len(d["points"]) // 3) for i, (p, d) in enumerate(zip(people, people_data, strict=True))]
     fields = {
         "TITLE": escape(title),
@@ -94,6 +98,7 @@ def _person_data(person: Panel, limit: int) -> dict:
     forward = facing_of(person)
     data: dict[str, object] = {
         "points": _millimeters(person.points[rows], center),
+        "spins": True,
         "facing": None if forward is None else round(math.atan2(forward[1], forward[0]), 4),
         "pose": _pose_data(person.pose, center),
         "truth": _pose_data(person.truth, center),
@@ -122,7 +127,9 @@ def _scan_data(scan: ScanPanel, limit: int) -> dict:
     center = np.median(centers, axis=0)
     entry = {"facing": None, "pose": None, "truth": None, "labeled": scan.labeled}
     frames = [_frame_data(panel, panel.points, center) | {"label": panel.label} for panel in scan.frames]
-    return entry | _frame_data(scan, points, center) | ({"frames": frames, "step": scan.step} if frames else {})
+    entry |= _frame_data(scan, points, center) | ({"frames": frames, "step": scan.step} if frames else {})
+    has_poses = any(one["poses"] for one in (entry, *frames))
+    return entry | {"predicted": has_poses and not scan.labeled}
 
 
 def _frame_data(panel: ScanPanel, points: np.ndarray, center: np.ndarray) -> dict:
@@ -162,8 +169,10 @@ def _card(i: int, person: Panel, num_drawn: int) -> str:
     return _figure(str(i), "card", person.label, describe(person), [note for note in notes if note])
 
 
-def _scan_card(key: str, scan: ScanPanel) -> str:
-    caption = f"{len(scan.points):,} points, not all are drawn"
+def _scan_card(key: str, scan: ScanPanel, num_drawn: int) -> str:
+    caption = f"{len(scan.points):,} points{' of the surroundings' if scan.frames else ''}"
+    if num_drawn < len(scan.points):
+        caption = f"{num_drawn:,} of {caption} drawn"
     return _figure(
         key, "card scan", scan.label, caption, [], _PLAYER.format(len(scan.frames) - 1) if scan.frames else ""
     )

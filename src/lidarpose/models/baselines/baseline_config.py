@@ -153,7 +153,9 @@ class LidarcapConfig(BaselineConfig):
     are drawn from with replacement, as published; else each point is used once; order_dependent_neighbors:
     neighborhoods depend on the order of the points, as in its CUDA kernels; trans_center: in training, frames are
     centered on SMPL's true trans, as published, so that the network need not learn where the pelvis is; else on the
-    points, or on an estimate of the pelvis; stock_initialization: weights are initialized as by PyTorch's layers, as
+    points, or on an estimate of the pelvis; normalize_in_training: in training, the points of a frame are centered
+    horizontally on their mean, vertically on that of the clip, and divided by 1.2, as in the published training code;
+    evaluation does none of this, as published; stock_initialization: weights are initialized as by PyTorch's layers, as
     published; else rotations start near the identity, and the layers of NE's encoders start as copies of their inputs.
     """
 
@@ -167,6 +169,7 @@ class LidarcapConfig(BaselineConfig):
     resample_with_replacement: bool = False
     order_dependent_neighbors: bool = False
     trans_center: bool = False
+    normalize_in_training: bool = False
     stock_initialization: bool = False
 
     def __post_init__(self):
@@ -187,6 +190,11 @@ class NeConfig(LidarcapConfig):
     clouds: ClassVar[tuple[str, ...]] = CLOUDS
 
     exchange_across_batch: bool = False
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.normalize_in_training:
+            raise InputError("normalize_in_training is an option of lidarcap, whose one cloud has no others about it")
 
 
 def pad_frames(

@@ -84,7 +84,7 @@ def _draw_thing(
     if kind < 0.76:
         length = 1.2 + 2 * a
         if b < 0.5:
-            return shapes.rail_fence(length, 0.8 + 0.4 * c, 2 + int(2 * b)), 0.03, length, 0.05
+            return shapes.rail_fence(length, 0.8 + 0.4 * c, 2), 0.03, length, 0.05
         return shapes.lattice_fence(length, 0.8 + 1.0 * c, 0.10 + 0.10 * b, 0.02 + 0.04 * c), 0.03, length, 0.05
     if kind < 0.88:
         bush = (0.4 + 0.6 * a, 0.5 + 1.5 * b, 0.4 + 1.4 * c)

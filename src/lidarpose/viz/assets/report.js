@@ -38,10 +38,11 @@
     for (const pose of [person.pose, person.truth]) for (const joint of pose ? pose.joints : []) {
       if (joint) for (let k = 0; k < 3; k++) { low[k] = Math.min(low[k], joint[k]); high[k] = Math.max(high[k], joint[k]); }
     }
-    if (!isFinite(low[0])) return null;
-    if (person.poses) {   // of a scan the people, all of it where there are none
-      const poses = [person, ...(person.frames || [])].flatMap((one) => one.poses);
-      const joints = poses.flatMap((pose) => pose.joints.filter((joint) => joint));
+    // of a scan the people, all of it where there are none
+    const panels = person.poses ? [person, ...(person.frames || [])] : [];
+    const joints = panels.flatMap((one) => one.poses).flatMap((pose) => pose.joints.filter((joint) => joint));
+    if (!isFinite(low[0]) && !joints.length) return null;
+    if (person.poses) {
       const end = (of, k) => joints.reduce((best, joint) => of(best, joint[k]), joints[0][k]);
       const a = joints.length ? low.map((_, k) => end(Math.min, k)) : low;
       const b = joints.length ? high.map((_, k) => end(Math.max, k)) : high;
