@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
+from lidarpose.models.baselines import prn
 from lidarpose.models.baselines.baseline_config import CLOUDS, LidarcapConfig, LpformerConfig, NeConfig, PrnConfig
 from lidarpose.models.baselines.lidarcap import (
     Lidarcap,
@@ -215,6 +216,18 @@ def test_bare_attention_equals_masked_attention():
     torch.testing.assert_close(found[valid], expected[valid], atol=1e-6, rtol=1e-5)
     assert torch.equal(found[~valid], x[~valid])
     torch.testing.assert_close(layer(x, valid, queries=2)[:2], expected[:2, :2], atol=1e-6, rtol=1e-5)
+
+
+@torch.no_grad()
+def test_bare_attention_takes_rows_of_lower_precision(monkeypatch):
+    """As under autocast on a GPU, where attention stays in bfloat16."""
+    torch.manual_seed(0)
+    layer, x, valid = BareAttention(12, heads=3).eval(), torch.randn(2, 9, 12), torch.ones(2, 9, dtype=torch.bool)
+    monkeypatch.setattr(prn, "attend", lambda *rows, dropout: F.scaled_dot_product_attention(*rows))
+    with torch.autocast("cpu", torch.bfloat16):
+        found = layer(x, valid)
+    assert found.dtype == torch.float32
+    torch.testing.assert_close(found, layer(x, valid), atol=0.02, rtol=0.02)
 
 
 @torch.no_grad()

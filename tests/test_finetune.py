@@ -378,6 +378,21 @@ def test_finetune_holds_out_sequences_without_val_split(datasets, name, settings
     assert setup.warnings == (() if watched else (f"no validation people: {reason}",))
 
 
+def test_scene_of_mixed_people_needs_mixed_people(datasets):
+    for changes in ({"scene": "paper"}, {"scene": "nonsense"}, {"set": ("keep=0.5",)}):
+        with pytest.raises(InputError, match="--scene, --set and --keep change the people that are mixed in"):
+            Finetune(data=(str(datasets["humanm3"]),), mix=0.0, **changes)
+
+
+def test_setups_of_trained_weights_can_be_used_twice(datasets):
+    """Training changes the network in place: each run of a setup starts from the same weights."""
+    setup = make_setup(Finetune(data=(str(datasets["humanm3"]),), init="tiny", mix=0.0))
+    first, second = setup.network(), setup.network()
+    assert first is not second
+    for a, b in zip(first.parameters(), second.parameters(), strict=True):
+        assert a is not b and torch.equal(a, b)
+
+
 @pytest.mark.parametrize("name, hold_out, watched", [("humanm3", 0.0, 6), ("waymo", 0.1, 4)])
 def test_finetune_validates_on_the_named_split(datasets, name, hold_out, watched):
     """As methods whose weights were chosen by test error; no sequence of training is held out then."""

@@ -32,7 +32,9 @@ from lidarpose.train.data_loader import SyntheticSource, lanes_of
 from lidarpose.train.loop import Interrupted, StopRequest
 from lidarpose.train.objectives.posenet_objective import PoseNetObjective
 from lidarpose.train.optim import optimizers, rate_factor
-from lidarpose.train.recipes import Pretrain, recipe
+from lidarpose.train.recipes import Finetune, Pretrain, TrainVerifier
+from lidarpose.train.recipes import recipe as recipe_of
+from lidarpose.train.setup import make_setup
 
 # people per chunk; a run has three chunks
 CHUNK = BATCHES * 2
@@ -189,13 +191,14 @@ def test_longer_run_sees_all_people(monkeypatch, tmp_path):
     assert people_of(folder) == [CHUNK, 2 * CHUNK]
 
 
-def started(recipe, folder, environment=None, **options):
-    """Starts a training process that saves after every chunk."""
+def started(recipe, folder, environment=None, *, first="", **options):
+    """Starts a training process that saves after every chunk; first: a statement before."""
     code = (
         "import sys, json, torch; torch.set_num_threads(1)\n"
-        "from lidarpose.train import data_loader, loop, setup; from lidarpose.train.recipes import Pretrain\n"
+        "from lidarpose.train import data_loader, loop, recipes, setup\n"
         f"loop.SAVE_EVERY, setup.VALIDATION = -1.0, {FEW}; loop.BATCHES = data_loader.BATCHES = {BATCHES}\n"
-        "loop.train(Pretrain(**json.loads(sys.argv[1])), sys.argv[2])"
+        f"{first}\n"
+        f"loop.train(recipes.{type(recipe).__name__}(**json.loads(sys.argv[1])), sys.argv[2])"
     )
     words = [sys.executable, "-c", code, json.dumps(recipe.to_dict()), str(folder)]
     environment = os.environ | {"OMP_NUM_THREADS": "1"} | (environment or {})
@@ -255,6 +258,33 @@ def test_killed_worker_raises_input_error(tmp_path, monkeypatch, where, name):
     monkeypatch.setattr(where, name, lost)
     with refused("a data loader process was killed"):
         loop.train(RECIPE, tmp_path / "run")
+
+
+def test_errors_in_workers_keep_their_message(tmp_path, monkeypatch):
+    def broken(*_, **__):
+        raise RuntimeError("Caught RuntimeError in DataLoader worker process 0.\nOriginal Traceback: a bug")
+
+    monkeypatch.setattr(loop, "loader", broken)
+    with pytest.raises(RuntimeError, match="a bug"):
+        loop.train(RECIPE, tmp_path / "run")
+
+
+def test_another_precision_needs_another_process(monkeypatch):
+    def initialized(**_):
+        raise ValueError("AcceleratorState has already been initialized and cannot be changed, restart")
+
+    monkeypatch.setattr(loop, "Accelerator", initialized)
+    with refused("this Python process has trained in another precision.: start another one"):
+        loop._accelerator(RECIPE, True, None)
+
+
+def test_plateau_schedule_needs_epochs_and_a_rate(tmp_path):
+    with refused("lowers the rate: give a --rate above 0"):
+        recipe_of(Finetune, "lidarcap", data=("x",), rate=0.0)
+    wanted = recipe_of(Finetune, "lidarcap", data=("x",), size="lidarcap-tiny")
+    with refused("reduce-on-plateau needs epochs"):
+        loop.train(wanted, tmp_path / "run", setup=replace(make_setup(RECIPE), epoch=0))
+    assert not (tmp_path / "run").exists()
 
 
 def test_run_folder_is_locked_for_other_processes(monkeypatch, copy):
@@ -556,10 +586,24 @@ def test_two_processes_match_single_process(tmp_path):
     assert people_of(tmp_path / "two") == [2 * CHUNK, 4 * CHUNK]
 
 
+@pytest.mark.slow
+def test_processes_of_the_verifier_may_take_different_numbers_of_passes(tmp_path):
+    """Passes are of 3 detections, and scans have up to 60."""
+    recipe = TrainVerifier(scenes=16, uses=1, batch=4, workers=0, seed=3, validate=1000)
+    port = str(29000 + os.getpid() % 3000)
+    common = {"MASTER_ADDR": "127.0.0.1", "WORLD_SIZE": "2", "MASTER_PORT": port, "ACCELERATE_USE_CPU": "true"}
+    few = "from lidarpose.train.objectives import verifier_objective; verifier_objective._GROUP = 3"
+    processes = [started(recipe, tmp_path / "two", common | {"RANK": k, "LOCAL_RANK": k}, first=few) for k in "01"]
+    for process in processes:
+        _, error = process.communicate(timeout=240)
+        assert process.returncode == 0, error
+    assert run_dir.read_log(tmp_path / "two")[-1]["people"] == 16
+
+
 def test_prn_needs_two_people_in_each_process(tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "_accelerator", lambda *_: SimpleNamespace(num_processes=8))
     with pytest.raises(InputError, match="batch must be at least 2 for prn"):
-        loop.train(recipe(Pretrain, "prn", model="prn", size="prn-tiny", batch=8, people=64), tmp_path / "run")
+        loop.train(recipe_of(Pretrain, "prn", model="prn", size="prn-tiny", batch=8, people=64), tmp_path / "run")
 
 
 def test_lanes_of_rejects_batch_not_divisible_by_processes():

@@ -89,10 +89,11 @@ class Outputs:
     """Raw results in the person's frame.
 
     vote (B, J, 3) m; heatmap (B, J, 3, W) logits centered on the vote, or on the origin if the network has no votes
-    (vote is then zero), W = 0 without heatmaps; part (B, N, P) logits of each fine voxel, 0 = background; confidence
-    (B, J) logit of an error under 10 cm; log_spread (B, J) log of the expected error in m; visible (B, J) logit of the
-    joint being visible; level_joints: one (B, J, 3) m per coarser level, predicted from its anchors; has_votes: whether
-    the network votes; person (B, 2) logits of a person and of a second one in the crop, if the network predicts them.
+    (vote is then zero), (B, J, 1, 0) without heatmaps; part (B, N, P) logits of each fine voxel, 0 = background;
+    confidence (B, J) logit of an error under 10 cm; log_spread (B, J) log of the expected error in m; visible (B, J)
+    logit of the joint being visible; level_joints: one (B, J, 3) m per coarser level, predicted from its anchors;
+    has_votes: whether the network votes; person (B, 2) logits of a person and of a second one in the crop, if the
+    network predicts them.
     """
 
     vote: Tensor

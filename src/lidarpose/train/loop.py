@@ -1,7 +1,8 @@
 """The training loop: examples in, a run folder out (see `run_dir`), in one process or several.
 
 A run that is killed at any moment can be resumed and reaches the same losses. Processes are started by Accelerate's or
-torch's launcher; each makes its share of every batch, and together they take the same steps as a single one.
+torch's launcher; each makes its share of every batch, and together they take the same steps as a single one, except
+for batch norms, dropout, and the detector's candidates of high score, which each process picks among its own.
 """
 
 import json
@@ -24,6 +25,7 @@ import numpy as np
 import torch
 from accelerate import Accelerator
 from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 
 from lidarpose.arrays import evenly_spaced
 from lidarpose.errors import InputError, check_name
@@ -115,6 +117,8 @@ def train(
         raise InputError("several processes need the run's folder: give it")
     on_cpu = device == "cpu" or not torch.cuda.is_available()
     setup = setup or job or make_setup(recipe, on_cpu=on_cpu)
+    if recipe.schedule == "reduce-on-plateau" and not setup.epoch:
+        raise InputError("reduce-on-plateau needs epochs, and this setup has none (epoch = 0): choose another schedule")
     accelerator = _accelerator(recipe, on_cpu, tracker)
     if recipe.batch % setup.frames:
         raise InputError(f"batch counts frames, and a clip has {setup.frames}: give a multiple, got {recipe.batch}")
@@ -154,8 +158,11 @@ def _accelerator(recipe: Recipe, on_cpu: bool, tracker: str | None) -> Accelerat
         return Accelerator(cpu=on_cpu, mixed_precision="bf16" if is_bf16 else "no", log_with=tracker)
     except ValueError as error:
         # the machine has no bf16, or the launcher asks for something that is not available
-        reason = str(error).partition("\n")[0]
-        raise InputError(f"cannot train like this ({reason}): choose another --precision or --device") from None
+        reason, remedy = str(error).partition("\n")[0], "choose another --precision or --device"
+        if "already been initialized" in reason:
+            # Accelerate's settings are those of the process
+            reason, remedy = "this Python process has trained in another precision", "start another one"
+        raise InputError(f"cannot train like this ({reason}): {remedy}") from None
 
 
 def _check(device: str | None, tracker: str | None) -> None:
@@ -186,6 +193,10 @@ class _Run:
         self.mean = {name: value.detach().clone() for name, value in self.network.named_parameters()}
         self.optimizers = optimizers(self.network, recipe)
         self.wrapped = accelerator.prepare(self.network) if accelerator.num_processes > 1 else self.network
+        if isinstance(self.wrapped, DistributedDataParallel):
+            # in every forward pass it would send the buffers of process 0, and the verifier's passes differ in number;
+            # statistics of batch norms, the only buffers that change, are re-estimated before they are used
+            self.wrapped.broadcast_buffers = False
         self.steps = -(-setup.people // recipe.batch)
         self.chunks = chunks_of(self.steps)
         self.chunk, self.seconds = 0, 0.0
@@ -423,7 +434,8 @@ def _dead_worker_named() -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        if "DataLoader worker" not in str(error):
+        # errors raised in a worker are "in DataLoader worker process N"
+        if "DataLoader worker (pid" not in str(error):
             raise
         raise InputError(
             "a data loader process was killed, perhaps because memory ran out: go on with --resume and fewer --workers"

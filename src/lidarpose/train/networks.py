@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from contextlib import suppress
+from copy import deepcopy
 from dataclasses import fields, replace
 from functools import partial
 from typing import Any
@@ -151,7 +152,7 @@ def finetuned_network(
                 "keep_anchors=false is for the paper's network, and --init gives one of the package's own: give a "
                 "checkpoint of pretrain --recipe paper, or omit --recipe paper and --keep-anchors"
             )
-        return base_config, partial(PoseNet, base_config) if trained is None else lambda: trained
+        return base_config, partial(PoseNet, base_config) if trained is None else partial(deepcopy, trained)
     if not dataset:
         # synthesized people have every joint; the paper's network keeps the joints of its pre-training
         joints = HUMAN15
@@ -167,7 +168,7 @@ def finetuned_network(
     is_same = (base_config.joints, base_config.bins, base_config.ranges) == (template.joints, bins, ranges)
     if trained is not None and recipe.keep_anchors and is_same and not (coordinates and base_config.parts):
         # the network already fits this dataset, as released ones do
-        return base_config, lambda: trained
+        return base_config, partial(deepcopy, trained)
     heads: dict[str, Any] = {"parts": 0, "coordinates": coordinates, "auxiliary": base_config.auxiliary_loss}
     config = replace(base_config, name=template.name, joints=template.joints, bins=bins, ranges=ranges, **heads)
     if trained is None:

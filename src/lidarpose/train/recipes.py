@@ -120,6 +120,8 @@ class Recipe:
             raise InputError(
                 f"{self.schedule} needs epochs, and only fine-tuning has epochs: choose another --schedule"
             )
+        if self.schedule == "reduce-on-plateau" and not self.rate:
+            raise InputError(f"{self.schedule} lowers the rate: give a --rate above 0")
         check_name("precision", self.precision, PRECISIONS)
 
     def to_dict(self) -> dict:
@@ -241,8 +243,10 @@ class Finetune(PoseRecipe):
             object.__setattr__(self, "size", _size_of(self.model, self.size))
         elif self.model:
             check_name("model", self.model, MODELS)
-        if self.set and not self.mix:
-            raise InputError("--set and --keep change the people that are mixed in: give --mix X, or omit them")
+        if not self.mix and (self.set or self.scene != type(self).scene):
+            raise InputError(
+                "--scene, --set and --keep change the people that are mixed in: give --mix X, or omit them"
+            )
         if any(change.startswith("recorded=") for change in self.set):
             raise InputError("recorded needs captured motion, and fine-tuning mixes in people without it: omit it")
         if not self.data:

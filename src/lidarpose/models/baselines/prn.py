@@ -129,7 +129,9 @@ class BareAttention(nn.Module):
             attend(*(rows.transpose(0, 1)[None] for rows in person), dropout=dropout)[0].transpose(0, 1).flatten(1)
             for person in zip(*projected, strict=True)
         ]
-        output = torch.zeros_like(query_rows).masked_scatter(is_query[..., None], torch.cat(attended))
+        # under autocast rows may have a lower precision than x
+        rows = torch.cat(attended).to(query_rows.dtype)
+        output = torch.zeros_like(query_rows).masked_scatter(is_query[..., None], rows)
         return query_rows + output
 
 
