@@ -695,7 +695,8 @@ def test_new_folder_numbers_folders(tmp_path):
     (tmp_path / "tiny").mkdir()
     (tmp_path / "tiny-2").mkdir()
     assert evaluation.new_folder("tiny", tmp_path) == tmp_path / "tiny-3"
-    assert evaluation.new_folder("x/best.safetensors", tmp_path) == tmp_path / "best"
+    assert evaluation.new_folder("runs/x/best.safetensors", tmp_path) == tmp_path / "x-best"
+    assert evaluation.new_folder("runs/x/model.safetensors", tmp_path) == tmp_path / "x"
 
 
 @pytest.mark.slow

@@ -26,7 +26,7 @@ from lidarpose.eval.scores import BASELINE, FILE, MetricRow, Result, Scores, Set
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.io.atomic import check_writable, write_all_atomic
 from lidarpose.io.files import content_digest, file_error, listed
-from lidarpose.models import weights_path
+from lidarpose.models import weights_name, weights_path
 from lidarpose.models.checkpoint import runs_of
 from lidarpose.sample import UNLABELED
 from lidarpose.skeleton import BODY26, Skeleton, as_skeleton
@@ -330,7 +330,7 @@ def _described(model: Any) -> Model:
 
 def new_folder(checkpoint: str | os.PathLike, folder: str | os.PathLike = FOLDER) -> Path:
     """FOLDER/NAME of the checkpoint, or the first of FOLDER/NAME-2, FOLDER/NAME-3, ... that does not exist."""
-    name = weights_path(checkpoint).stem
+    name = weights_name(weights_path(checkpoint))
     path, number = Path(folder) / name, 2
     while path.exists():
         path, number = Path(folder) / f"{name}-{number}", number + 1

@@ -38,7 +38,7 @@ from lidarpose.inference.scan import Scan, pose_scan
 from lidarpose.inference.tta import tta_transforms
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.files import file_error
-from lidarpose.models import BUNDLED, DEFAULT, weights_path
+from lidarpose.models import BUNDLED, DEFAULT, weights_name, weights_path
 from lidarpose.models.checkpoint import read_header
 from lidarpose.models.decode import decoder
 from lidarpose.models.voxelize import WINDOW
@@ -116,7 +116,7 @@ def load(
         network_backend = exported_beside(path, threads=threads)
     if not network_backend.header.config.poses:
         raise file_error(path, "contains a detection network: give the weights of a pose network")
-    return Predictor(network_backend, name=path.stem, decode=decode, tta=tta)
+    return Predictor(network_backend, name=weights_name(path), decode=decode, tta=tta)
 
 
 def check_settings(weights: str | os.PathLike, *, backend: str | None, decode: str, tta: int) -> Path:

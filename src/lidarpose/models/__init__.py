@@ -85,6 +85,13 @@ def weights_file(name: str) -> Path:
     return Path(str(resources.files("lidarpose.models") / "weights" / name))
 
 
+def weights_name(path: Path) -> str:
+    """The name of weights in results: that of the file, or of the run whose model.safetensors or best.safetensors it
+    is."""
+    run = path.resolve().parent.name
+    return {"model": run, "best": f"{run}-best"}.get(path.stem, path.stem) or path.stem
+
+
 def weights_path(weights: str | os.PathLike) -> Path:
     """The path for a name of bundled weights, or the given path. Raises InputError for an unknown name."""
     try:

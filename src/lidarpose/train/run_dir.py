@@ -127,7 +127,8 @@ def check_resumable(folder: Path, stored: Recipe, wanted: Recipe) -> None:
             continue
         if name not in (*LENGTHS, *FREE) and value != settings[name]:
             raise InputError(
-                f"{folder / CONFIG}: the run has {name} = {settings[name]!r}, got {value!r}: a run keeps its recipe"
+                f"{folder / CONFIG}: the run has {name} = {settings[name]!r}, got {value!r}: a run keeps its recipe; "
+                "another run is continued by its folder (of finetune: --out)"
             )
 
 
