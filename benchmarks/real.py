@@ -1,12 +1,12 @@
 """Poses of people in real sweeps with labeled boxes but without labeled joints.
 
-    python benchmarks/real.py FOLDER --json docs/scores/real.json
+    python benchmarks/real.py FOLDER --least 5 --json docs/scores/real.json
 
 FOLDER holds sweep_N.pcd, .bin or .ply, each with a sweep_N.json of boxes in the format of `lidarpose predict`. Prints
 for each person: points, distance, the angle between the pose's facing and the box's heading (also with `--tta 4`), the
-share of points within 15 cm of the skeleton's bones, lean of the trunk, confidence, and the mean joint distance to the
-pose of the same person if nobody gives boxes. For tracks in two sweeps it also prints the mean joint distance between
-the two poses after their pelvises are aligned.
+share of points within 15 cm of the skeleton's bones, lean of the trunk, confidence, `person`, and the mean joint
+distance to the pose of the same person if nobody gives boxes. For tracks in two sweeps it also prints the mean joint
+distance between the two poses after their pelvises are aligned.
 """
 
 import argparse
@@ -57,6 +57,7 @@ def rows_of(model: Predictor, four: Predictor, folder: Path, least: int) -> Iter
                 "near": float((distance_to_bones(person.points, person.joints) < NEAR).mean()),
                 "lean": float(np.degrees(np.arccos(trunk[2] / np.linalg.norm(trunk)))),
                 "confidence": float(person.confidence.mean()),
+                "is_person": float(person.pose.person),
                 "to_detected": detected_distance(person, detected),
             }
             yield {key: round(value, 3) if isinstance(value, float) else value for key, value in row.items()}, person
@@ -82,12 +83,16 @@ def turn(person: PersonPose) -> float:
 def moved(people: list[tuple[dict, PersonPose]]) -> Iterator[dict]:
     """The mean joint distance between a person's poses in consecutive sweeps, with aligned pelvises, mm."""
     tracks: dict[str, list[np.ndarray]] = {}
+    points: dict[str, int] = {}
     pelvis = SMPL24.index("pelvis")
     for row, person in people:
         tracks.setdefault(row["person"], []).append(person.joints - person.joints[pelvis])
+        points[row["person"]] = min(row["points"], points.get(row["person"], row["points"]))
     for name, poses in tracks.items():
         for first, second in pairwise(poses):
-            yield {"person": name, "mm": round(float(np.linalg.norm(second - first, axis=-1).mean() * 1e3), 1)}
+            yield {"person": name, "mm": round(float(np.linalg.norm(second - first, axis=-1).mean() * 1e3), 1)} | {
+                "points": points[name]
+            }
 
 
 def main() -> None:
@@ -105,6 +110,7 @@ def main() -> None:
             f"{row['sweep']} {row['person']}  {row['points']:4d} points {row['distance']:5.1f} m"
             f"  facing {row['turn']:5.0f} deg off the box, with --tta 4 {row['turn_of_four']:5.0f}"
             f"  {row['near']:4.0%} near bones  lean {row['lean']:3.0f} deg  confidence {row['confidence']:.2f}"
+            f"  person {row['is_person']:.2f}"
             + (
                 "  not detected"
                 if row["to_detected"] is None

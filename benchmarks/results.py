@@ -342,8 +342,12 @@ def visibility() -> str:
     return table(("", "condition", "MPJPE mm", "clean, equally hidden: mm", "ratio", "people"), rows)
 
 
-def real() -> str:
-    """Figures of real people; see real.py."""
+# fewest points of the people of the first table of real ones
+_REAL = 50
+
+
+def real(*, is_few: bool = False) -> str:
+    """Figures of real people of `_REAL` points and more, or of fewer; see real.py."""
     rows = [
         (
             entry["sweep"].removeprefix("sweep_"),
@@ -355,12 +359,15 @@ def real() -> str:
             f"{100 * entry['near']:.0f} %",
             f"{entry['lean']:.0f} deg",
             f"{entry['confidence']:.2f}",
+            f"{entry['is_person']:.2f}",
             "not detected" if entry["to_detected"] is None else f"{entry['to_detected']:.0f}",
         )
         for entry in _read("real")["people"]
+        if (entry["points"] < _REAL) == is_few
     ]
     header = ("sweep", "person", "points", "distance m", "facing relative to the box", "the same, `--tta 4`")
-    return table((*header, "points within 15 cm of a bone", "trunk lean", "confidence", "detected pose, mm away"), rows)
+    header += ("points within 15 cm of a bone", "trunk lean", "confidence", "`person`", "detected pose, mm away")
+    return table(header, rows)
 
 
 def clips() -> str:
@@ -382,7 +389,8 @@ def clips() -> str:
 
 def moved() -> str:
     """Joint distances of real people between two sweeps; see real.py."""
-    rows = [(entry["person"], f"{entry['mm']:.0f}") for entry in _read("real")["tracks"]]
+    tracks = [entry for entry in _read("real")["tracks"] if entry["points"] >= _REAL]
+    rows = [(entry["person"], f"{entry['mm']:.0f}") for entry in tracks]
     return table(("person", "mean over joints, mm"), rows)
 
 
@@ -535,7 +543,13 @@ def tables() -> dict[str, Callable[[], str]]:
         makers |= {
             f"detector {name} by {group}": partial(detector, name, *recall_groups) for name in ("heldout", "real")
         }
-    makers |= {"visibility": visibility, "real": real, "tracks": tracks, "detected boxes": detected_boxes}
+    makers |= {
+        "visibility": visibility,
+        "real": real,
+        "real few": partial(real, is_few=True),
+        "tracks": tracks,
+        "detected boxes": detected_boxes,
+    }
     makers |= {"background": background, "tilted": tilted, "detector seeds": detector_seeds} | {
         f"{name} card": partial(finding_card, name) for name in FINDING
     }

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from motion_files import a_clip, joints_of
 
+from lidarpose import evaluation
+
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 
@@ -34,6 +36,26 @@ def run(variant, seed, value, people=100, **more):
     shown = ("all", "plain", "clean", "cluttered", "company", "occluded", "turned round")
     figures = {name: {"value": value} for name in shown}
     return {"variant": variant, "seed": seed, "people": people, "what": variant, "figures": figures} | more
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["paper, heatmaps", "paper, one stage", "ours"])
+def test_against_paper_benchmark_runs(tmp_path, monkeypatch, name):
+    clips = {"clip": np.array(["s_1"]), "clip_start": np.array([0]), "clip_length": np.array([40]), "fps": 10.0}
+    np.savez(tmp_path / "m.npz", joints=joints_of(*a_clip(40)), **clips)
+    module, run = benchmark("against_paper"), evaluation.run
+    monkeypatch.setattr(evaluation, "run", lambda model, sets: run(model, sets, limit=4))
+    monkeypatch.setattr(module, "OWN_PEOPLE", 4)
+    words = [name, "--motion", "m.npz", "--subjects", "s", "--held-out", "s", "--people", "16", "--out", "o"]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["against_paper", *words])
+    module.main()
+    (path,) = Path("o").glob("*/scores.json")
+    scores = json.loads(path.read_text())
+    assert scores["variant"] == name and scores["figures"]["the paper's scene"]["value"] > 0
+    monkeypatch.setattr("sys.argv", ["against_paper", "nothing", "--motion", "m.npz"])
+    with pytest.raises(SystemExit, match="2"):
+        module.main()
 
 
 def test_pages_match_scores(results):

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
-from lidarpose.inference.results import PersonPose
+from lidarpose.inference.result_panels import panels_of
+from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.sample import Box, Pose, facing
 from lidarpose.skeleton import BODY26, HUMAN15, SMPL24, WAYMO14, Skeleton
 from lidarpose.viz import draw
@@ -194,6 +195,22 @@ def test_describe_gives_points_distance_and_confidence():
     )
     assert describe(Panel(points=np.zeros((1, 3)), distance=12.34)) == "1 point · 12.3 m"
     assert describe(EMPTY) == "0 points"
+    assert describe(Panel(points=np.zeros((1, 3)), distance=2.0, note="two people?")) == "1 point · 2.0 m · two people?"
+
+
+def test_pictures_say_what_is_doubtful_about_a_person():
+    """As the warnings do; a scored box is a person already."""
+    for person, second, score, note in (
+        (0.99, 0.1, None, None),
+        (0.99, 0.9, None, "two people?"),
+        (0.01, 0.9, None, "unlike a person"),
+        (0.01, 0.1, 0.9, None),
+    ):
+        pose = replace(t_pose(), person=np.array(person), second_person=np.array(second))
+        box = None if score is None else Box(center=np.zeros(3), size=np.ones(3), score=score)
+        shown = PersonPose(pose=pose, skeleton=BODY26, points=cloud(pose), box=box)
+        (panel,), _ = panels_of(Poses(people=(shown,), skeleton=BODY26))
+        assert panel.note == note and ("unlike" in describe(panel)) == (note == "unlike a person")
 
 
 def test_labels_and_titles_of_any_length_and_script(recwarn):

@@ -46,6 +46,7 @@ _CLEARLY_SURER = 0.6
 _WIDEST_CROP = 20.0
 # probability of a person below which a crop shows none; probability of a second person above which it shows two
 _NOBODY, _TWO = 0.05, 0.5
+_UNLIKE = "unlike a person"
 # rotation by 180 degrees about x, as a factor per axis
 UPSIDE_DOWN = np.array([1.0, -1.0, -1.0])
 # joints that all skeletons have
@@ -109,13 +110,21 @@ def person_count_warning(pose: Pose, *, in_box: bool = False, is_scored: bool = 
     in_box: whether the crop comes from a box, which selects the person; is_scored: whether the box has a score, so that
     the existence of the person is not questioned.
     """
+    note = person_note(pose, is_scored=is_scored)
+    if note == _UNLIKE:
+        return f"the points look unlike a person (person {float(pose.person or 0):.2f}): perhaps there is no person"
+    if note and in_box:
+        return "the points look like two people: the pose is of the one nearer to the center of the box"
+    return note and "the points look like two people, and the pose is of one of them: give a box to choose one"
+
+
+def person_note(pose: Pose | None, *, is_scored: bool = False) -> str | None:
+    """`person_count_warning` in three words, for pictures."""
+    if pose is None:
+        return None
     if not is_scored and pose.person is not None and pose.person < _NOBODY:
-        return f"the points look unlike a person (person {float(pose.person):.2f}): perhaps there is no person"
-    if pose.second_person is not None and pose.second_person > _TWO:
-        if in_box:
-            return "the points look like two people: the pose is of the one nearer to the center of the box"
-        return "the points look like two people, and the pose is of one of them: give a box to choose one"
-    return None
+        return _UNLIKE
+    return "two people?" if pose.second_person is not None and pose.second_person > _TWO else None
 
 
 def looks_unsure(pose: Pose, points: np.ndarray) -> bool:

@@ -7,6 +7,7 @@ import numpy as np
 
 from lidarpose.errors import counted
 from lidarpose.geometry import UP_AXES, axes_from_above, rotation_about, rotation_from_up
+from lidarpose.inference.checks import person_note
 from lidarpose.io.files import shorten
 from lidarpose.sample import Box, Pose, facing_yaw
 from lidarpose.viz.bird_eye import LONGEST_NAME, ScanPanel
@@ -26,6 +27,7 @@ def panels_of(poses: "Poses") -> tuple[list[Panel], ScanPanel | None]:
             label=person_label(person.id, person.score, person.mounted),
             box=p.box,
             distance=_distance(person, poses.origin),
+            note=person_note(person.pose, is_scored=person.score is not None),
         )
         for p, person in zip(upright_people, poses.people, strict=True)
     ]

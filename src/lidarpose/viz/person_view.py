@@ -26,6 +26,7 @@ class Panel:
         caption: the line under the person, by default the number of points, the distance and the mean confidence.
         forward: (3,) facing of the person, see `facing`; the views are aligned with it. By default that of the pose,
             else of the truth.
+        note: what is doubtful, printed after the caption.
     """
 
     points: np.ndarray
@@ -37,6 +38,7 @@ class Panel:
     distance: float | None = None
     caption: str = ""
     forward: np.ndarray | None = None
+    note: str | None = None
 
     def __post_init__(self):
         if self.points.ndim != 2 or self.points.shape[1] != 3:
@@ -122,7 +124,7 @@ def describe(person: Panel) -> str:
         words.append(f"{distance:.1f} m")
     if is_known(person.pose) and person.pose.confidence is not None:
         words.append(f"confidence {confidences(person.pose).mean():.2f}")
-    return " · ".join(words)
+    return " · ".join(filter(None, (*words, person.note)))
 
 
 def missing_pose(person: Panel) -> str:
