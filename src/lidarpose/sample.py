@@ -22,6 +22,9 @@ CONFIDENCE_RADIUS = 0.1
 MIN_POINTS = 5
 # minimum number of points of a second person for a crop to count as showing two people
 FEWEST_OF_SECOND = 15
+# probability of a person below which a crop shows none; probability of a second person above which it shows two
+_NOBODY, _TWO = 0.05, 0.5
+UNLIKE_A_PERSON = "unlike a person"
 # frames per clip. Source: LiDARCap; NE, whose layers have this size
 CLIP_FRAMES = 16
 # optional values of a pose per joint
@@ -135,6 +138,18 @@ def facing(pose: Pose | None, up: str = "z") -> np.ndarray | None:
     if length < 0.3 * np.linalg.norm(axis) or length < 0.02:
         return None
     return R_level_pose.T @ np.array([axis[1], -axis[0], 0.0]) / length
+
+
+def person_note(pose: Pose | None, *, is_scored: bool = False) -> str | None:
+    """What is doubtful about the person of a pose, in a few words for pictures, None for nothing.
+
+    is_scored: whether the box has a score, so that the existence of the person is not questioned.
+    """
+    if pose is None:
+        return None
+    if not is_scored and pose.person is not None and pose.person < _NOBODY:
+        return UNLIKE_A_PERSON
+    return "two people?" if pose.second_person is not None and pose.second_person > _TWO else None
 
 
 def facing_yaw(pose: Pose | None) -> float:

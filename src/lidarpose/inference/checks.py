@@ -15,7 +15,7 @@ import numpy as np
 from lidarpose.errors import first_names
 from lidarpose.geometry import rows_near
 from lidarpose.inference.results import Poses
-from lidarpose.sample import MIN_POINTS, Box, Pose
+from lidarpose.sample import MIN_POINTS, UNLIKE_A_PERSON, Box, Pose, person_note
 
 if TYPE_CHECKING:
     from lidarpose.inference.scan import Scan
@@ -44,9 +44,6 @@ _TALLEST, _GIANT, _TRIMMED = 2.2, 3.0, (3, 97)
 _CLEARLY_SURER = 0.6
 # a wider crop is not a crop of one person, m
 _WIDEST_CROP = 20.0
-# probability of a person below which a crop shows none; probability of a second person above which it shows two
-_NOBODY, _TWO = 0.05, 0.5
-_UNLIKE = "unlike a person"
 # rotation by 180 degrees about x, as a factor per axis
 UPSIDE_DOWN = np.array([1.0, -1.0, -1.0])
 # joints that all skeletons have
@@ -111,20 +108,11 @@ def person_count_warning(pose: Pose, *, in_box: bool = False, is_scored: bool = 
     the existence of the person is not questioned.
     """
     note = person_note(pose, is_scored=is_scored)
-    if note == _UNLIKE:
+    if note == UNLIKE_A_PERSON:
         return f"the points look unlike a person (person {float(pose.person or 0):.2f}): perhaps there is no person"
     if note and in_box:
         return "the points look like two people: the pose is of the one nearer to the center of the box"
     return note and "the points look like two people, and the pose is of one of them: give a box to choose one"
-
-
-def person_note(pose: Pose | None, *, is_scored: bool = False) -> str | None:
-    """`person_count_warning` in three words, for pictures."""
-    if pose is None:
-        return None
-    if not is_scored and pose.person is not None and pose.person < _NOBODY:
-        return _UNLIKE
-    return "two people?" if pose.second_person is not None and pose.second_person > _TWO else None
 
 
 def looks_unsure(pose: Pose, points: np.ndarray) -> bool:

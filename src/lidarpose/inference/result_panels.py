@@ -7,9 +7,8 @@ import numpy as np
 
 from lidarpose.errors import counted
 from lidarpose.geometry import UP_AXES, axes_from_above, rotation_about, rotation_from_up
-from lidarpose.inference.checks import person_note
 from lidarpose.io.files import shorten
-from lidarpose.sample import Box, Pose, facing_yaw
+from lidarpose.sample import Box, Pose, facing_yaw, person_note
 from lidarpose.viz.bird_eye import LONGEST_NAME, ScanPanel
 from lidarpose.viz.person_view import Panel
 
