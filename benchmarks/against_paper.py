@@ -11,7 +11,7 @@ on people of the paper's own scene in other poses.
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -55,6 +55,8 @@ class Way:
 
 
 OURS = "ours"
+# of the paper's heatmaps: the released one and ours
+DECODINGS: tuple[str, ...] = ("dark", "window")
 # people of the paper's own scene
 OWN_PEOPLE = 1000
 _FASTER: dict[str, Any] = {"rates": (2e-3, 2e-3), "anchors": True, "recipe": {"ema": 0.99, "clip": 1.0}}
@@ -109,16 +111,18 @@ def run(options: argparse.Namespace, name: str, seed: int, folder: Path) -> dict
     """Trains and evaluates on the bench and on the paper's own scene; returns the `ablations.record`."""
     if name == OURS:
         scores = ablations.run(options, BASE, seed, folder) | {"variant": OURS}
-        model, decodings = folder / MODEL, ["window"]
+        model, decodings = folder / MODEL, ("window",)
     else:
         scores, model = run_paper(options, name, seed, folder)
-        decodings = ["dark", "window"]
-    own = [
-        evaluation.run(load(model, decode=decode, tta=1), [str(own_scene(options))]).scores.results[0]
-        for decode in decodings
-    ]
-    best = min((figures(result)["all"] for result in own), key=lambda figure: figure["value"])
-    return scores | {"figures": scores["figures"] | {OWN_SCENE: best}}
+        decodings = DECODINGS
+    own = best_figures(model, decodings, str(own_scene(options)))["all"]
+    return scores | {"figures": scores["figures"] | {OWN_SCENE: own}}
+
+
+def best_figures(model: Path, decodings: Sequence[str], dataset: str) -> dict[str, dict[str, float]]:
+    """The figures of weights on a dataset by the decoding with the lowest error."""
+    results = [evaluation.run(load(model, decode=decode, tta=1), [dataset]).scores.results[0] for decode in decodings]
+    return min(map(figures, results), key=lambda scores: scores["all"]["value"])
 
 
 def run_paper(options: argparse.Namespace, name: str, seed: int, folder: Path) -> tuple[dict, Path]:
@@ -146,10 +150,6 @@ def run_paper(options: argparse.Namespace, name: str, seed: int, folder: Path) -
     setup = replace(make_setup(settings), objective=finetuning, network=make_network)
     model = train(settings, folder / "finetune", setup=setup)
     durations = {"seconds": time.perf_counter() - start, "processor_seconds": time.process_time() - process_start}
-    results = [
-        evaluation.run(load(model, decode=decode, tta=1), ["bench"]).scores.results[0] for decode in ("dark", "window")
-    ]
-    best_figures = min((figures(result) for result in results), key=lambda scores: scores["all"]["value"])
     scores = record(
         name,
         seed,
@@ -157,7 +157,7 @@ def run_paper(options: argparse.Namespace, name: str, seed: int, folder: Path) -
         begun=0,
         parameters=sum(value.numel() for value in load_checkpoint(model)[0].parameters()),
         **durations,
-        figures=best_figures,
+        figures=best_figures(model, DECODINGS, "bench"),
     )
     return scores, model
 

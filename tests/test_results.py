@@ -38,11 +38,16 @@ def run(variant, seed, value, people=100, **more):
     return {"variant": variant, "seed": seed, "people": people, "what": variant, "figures": figures} | more
 
 
+def write_motion(path):
+    """One clip of a subject "s"."""
+    clips = {"clip": np.array(["s_1"]), "clip_start": np.array([0]), "clip_length": np.array([40]), "fps": 10.0}
+    np.savez(path, joints=joints_of(*a_clip(40)), **clips)
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("name", ["paper, heatmaps", "paper, one stage", "ours"])
 def test_against_paper_benchmark_runs(tmp_path, monkeypatch, name):
-    clips = {"clip": np.array(["s_1"]), "clip_start": np.array([0]), "clip_length": np.array([40]), "fps": 10.0}
-    np.savez(tmp_path / "m.npz", joints=joints_of(*a_clip(40)), **clips)
+    write_motion(tmp_path / "m.npz")
     module, run = benchmark("against_paper"), evaluation.run
     monkeypatch.setattr(evaluation, "run", lambda model, sets: run(model, sets, limit=4))
     monkeypatch.setattr(module, "OWN_PEOPLE", 4)
@@ -75,8 +80,7 @@ def test_benchmark_can_be_imported(name):
 
 @pytest.mark.long
 def test_heldout_benchmark_runs(tmp_path, monkeypatch):
-    clips = {"clip": np.array(["s_1"]), "clip_start": np.array([0]), "clip_length": np.array([40]), "fps": 10.0}
-    np.savez(tmp_path / "m.npz", joints=joints_of(*a_clip(40)), **clips)
+    write_motion(tmp_path / "m.npz")
     words = [
         "heldout",
         "--motion",

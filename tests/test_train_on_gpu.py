@@ -100,7 +100,7 @@ def test_students_learn_the_same_batches(tool, objective, examples, tmp_path):
 
 
 def test_card_has_whole_command_without_paths(tool, tmp_path, monkeypatch, capsys):
-    words = ["--sizes", "tiny", "--motion=/home/me/wide.npz", "--device", "cpu", "--minutes", "2"]
+    words = ["--sizes", "tiny", "--motion=some/folder/wide.npz", "--device", "cpu", "--minutes", "2"]
     with pytest.raises(SystemExit, match="2"):
         tool.options_of([str(tmp_path), *words, "--rates", "1e-3", "2e-3"])
     assert "--rates needs one number for each of 1 sizes, got 2" in capsys.readouterr().err

@@ -184,7 +184,7 @@ def _execute(words: list[str], execute: Execute) -> None:
             # raised by the parser for an invalid command line
             status = exit_error.code if isinstance(exit_error.code, int) else 2
     if status >= 128:
-        # the command has told what it did
+        # the command itself said how far it came
         raise KeyboardInterrupt("the same lidarpose paper command goes on here")
     if status:
         raise StepFailed(last_line.line.removeprefix("lidarpose: error: ") or f"ended with status {status}")

@@ -92,8 +92,8 @@ class TrajectoryPicture:
             tracks=[path for id, path in paths.items() if id is not None],
             places=None if is_single else paths.get(None),
             label=f"{count_text} in {counted(len(self._frames), 'frame')}",
-            # the sensor position of crops, people without boxes, is unknown
             axes=self._fixed.axes,
+            # the sensor position of crops, people without boxes, is unknown
             sensor=None if not self._to_fixed or self._ways and not self._yaws else self._to_fixed[-1][:2, 3].tolist(),
         )
         return draw_scan_and_people(panel, list(self._cards(points, skeleton)) if is_single else [], title=title)

@@ -31,7 +31,7 @@ UNKNOWN_PART = -1
 # a sample that would have fewer points after the crop is not cropped
 LEAST_POINTS = 5
 # by what LiDARCap's training script divides points
-NORMALIZED_SCALE = 1.2
+_NORMALIZED_SCALE = 1.2
 # maximum number of clutter points per cluster
 _CLUTTER = 60
 # the same for synthetic samples, and the range of the standard deviation of their noise, m
@@ -241,10 +241,10 @@ def clip_example(
             center = sample.translation
         elif is_about_pelvis:
             center = joints[_PELVIS] + rng.normal(0, PELVIS_ERROR, 3)
-        points = (sample.points - center) @ R.T
+        origin, scale = center, 1.0
         if normalize:
-            origin = np.append(sample.points[:, :2].mean(0), clip_height)
-            points = (sample.points - origin) @ R.T / NORMALIZED_SCALE
+            origin, scale = np.append(sample.points[:, :2].mean(0), clip_height), _NORMALIZED_SCALE
+        points = (sample.points - origin) @ R.T / scale
         part, visible = np.full(len(points), UNKNOWN_PART), np.full(len(joints), np.nan, np.float32)
         view = view_features(center, None)
         frames.append(make_example(rng, points, (joints - center) @ R.T, part=part, visible=visible, view=view))
