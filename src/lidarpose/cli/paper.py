@@ -90,9 +90,8 @@ def _paper(commands, execute: Callable[[list[str]], int], options: argparse.Name
     for path in figures.draw(table.name, selected_cells, out) if table.name.startswith("fig") else ():
         print(path)
     if failed := sum(entry["state"] == "failed" for entry in content["cells"]):
-        raise InputError(
-            f"{counted(failed, 'cell')} failed, the others are done: {out / table.name}.md has the reasons"
-        )
+        done = "the others are done where they were asked for"
+        raise InputError(f"{counted(failed, 'cell')} failed, {done}: {out / table.name}.md has the reasons")
 
 
 def _data(text: str | None) -> dict[str, str]:
