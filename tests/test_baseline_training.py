@@ -22,7 +22,7 @@ from lidarpose.train.augment import AUGMENTATIONS, Example, augmented
 from lidarpose.train.data_loader import SyntheticSource
 from lidarpose.train.networks import PRETRAINED, _with_options, networks
 from lidarpose.train.objectives.baseline_objective import LABEL_RADIUS, BaselineObjective, point_labels, with_joints
-from lidarpose.train.objectives.dapt_objective import DaptObjective
+from lidarpose.train.objectives.dapt_objective import DaptObjective, deep, pretraining_config
 from lidarpose.train.objectives.objective import total
 from lidarpose.train.recipes import Finetune, Pretrain, recipe
 from lidarpose.train.validation import update_batch_norms, validate
@@ -275,6 +275,8 @@ def test_models_command_lists_all_networks(capsys):
     assert counts["prn-tiny"][2] == 36_348 and counts["lpformer-tiny"][2] == 80_581
     assert counts["lidarcap-small"][2] == 576_798 and counts["ne-small"][2] == 2_072_910
     assert {"ours", "dapt"} < {row["name"] for row in rows} and {"tiny", "paper", "paper-small"} <= counts.keys()
+    # of paper-deep the neck reads as many levels as that of the published size
+    assert len(pretraining_config().decoder_depths) == len(deep(pretraining_config()).decoder_depths) == 4
     assert not main(["models"])
     assert "129,720,766" in capsys.readouterr().out
 

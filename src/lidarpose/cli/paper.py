@@ -30,8 +30,8 @@ $ lidarpose paper table3 --data waymo=prepared/waymo --size paper
 --hours H  training time per row, all stages: longer trainings are shortened with their schedule
 --seeds K = 1  seeds 0 ... K-1 of each cell (default 1)
 --workers N = 1  worker processes of each command (default 1)
---size NAME = paper-small  width of all networks: paper-small (default) or paper-tiny, both reduced; paper: as
- published
+--size NAME = paper-small  size of all networks: paper-small (default), paper-tiny or paper-deep (five levels),
+ reduced; paper: as published
 [data]
 --data NAME=DIR,...  prepared real datasets for fine-tuning and evaluation: waymo, humanm3, lidarhuman26m, sloper4d;
  for pre-training: lipd, freemotion, noisemotion; raw poses: freemotion-poses, lidarhuman26m-poses;

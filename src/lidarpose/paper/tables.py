@@ -7,7 +7,7 @@ from lidarpose.data.readers.lidarhuman26m import POSE_FOLDER
 from lidarpose.data.splits import split_rule
 from lidarpose.errors import InputError
 from lidarpose.paper.cells import CORPORA, NO_HEATMAPS, REAL, SMPL, Options, Row, Table
-from lidarpose.train.recipes import PAPER, TINY_PAPER
+from lidarpose.train.recipes import DEEP_PAPER, PAPER, TINY_PAPER
 
 # the option for the poses of the paper's pre-training
 _POSES_OF_PAPER = "lidarhuman26m-poses=DIR"
@@ -113,7 +113,7 @@ def _published(*values: float | None) -> dict[str, float]:
 
 def _methods(options: Options) -> list[Row]:
     """Table 1."""
-    prn, size = ("--neck", "prn"), "tiny" if options.size == TINY_PAPER else "small"
+    prn, size = ("--neck", "prn"), "tiny" if options.size in (TINY_PAPER, DEEP_PAPER) else "small"
     released_options = _RELEASED if options.real else ()
     # the other recipes neither mix in synthesized people nor hold people out
     equal_people = ("--mix", "0", "--hold-out", "0") if options.real else ()
@@ -138,7 +138,8 @@ def _baseline(options: Options, model: str, *words: str) -> tuple[str, ...]:
     the same learning-rate cycle as the paper's network."""
     wide = () if options.real else _WIDE_BASELINES.get(model, ())
     changes = wide if options.size == PAPER else _ONE_CYCLE
-    return ("--model", model, "--size", model + options.size.removeprefix(PAPER), *changes, *words)
+    width = (TINY_PAPER if options.size == DEEP_PAPER else options.size).removeprefix(PAPER)
+    return ("--model", model, "--size", model + width, *changes, *words)
 
 
 def _of_clips(options: Options, name: str, *published: float) -> Row:

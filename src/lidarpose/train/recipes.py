@@ -16,12 +16,12 @@ from lidarpose.models import DEFAULT
 SCHEDULES = ("plateau", "cosine", "constant", "reduce-on-plateau")
 OPTIMIZERS = ("adamw", "adam")
 PRECISIONS = ("auto", "float32", "bf16")
-# the paper's network, and two smaller ones of the same design for CPUs
-PAPER, SMALL_PAPER, TINY_PAPER = "paper", "paper-small", "paper-tiny"
+# the paper's network, and smaller ones of the same design for CPUs: two of three levels, one of five, as published
+PAPER, SMALL_PAPER, TINY_PAPER, DEEP_PAPER = "paper", "paper-small", "paper-tiny", "paper-deep"
 # the networks of --model and their sizes; the first size is the default
 MODELS: dict[str, tuple[str, ...]] = {
     "ours": ("tiny", "small", "base"),
-    "dapt": (PAPER, SMALL_PAPER, TINY_PAPER),
+    "dapt": (PAPER, SMALL_PAPER, TINY_PAPER, DEEP_PAPER),
     # as published, and narrower ones for CPUs
     **{name: (name, f"{name}-small", f"{name}-tiny") for name in ("prn", "lpformer", "lidarcap", "ne")},
 }

@@ -18,7 +18,7 @@ from lidarpose.models.dapt.voxel_tables import LAYOUTS, Tables, build_tables
 from lidarpose.train.augment import UNKNOWN_PART, Example
 from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, pretraining, prn
 from lidarpose.train.objectives.objective import BuiltNetwork, Share, in_body26, majority_part, one_process
-from lidarpose.train.recipes import SMALL_PAPER, TINY_PAPER
+from lidarpose.train.recipes import DEEP_PAPER, SMALL_PAPER, TINY_PAPER
 
 STAGES = ("pretrain", "finetune")
 # names of the heads' outputs
@@ -175,8 +175,26 @@ def tiny(config: DaptConfig) -> DaptConfig:
     )
 
 
+def deep(config: DaptConfig) -> DaptConfig:
+    """The same width as `tiny` with the published number of levels, 2, 4, 8, 16 and 32 cm: anchors read four of them,
+    by four exchanges, as the finest one is read by four layers without MDE."""
+    return replace(
+        tiny(config),
+        name=f"deep-{config.name}",
+        encoder_depths=(1, 1, 1, 1, 1),
+        encoder_channels=(16, 24, 32, 48, 64),
+        encoder_heads=(1, 2, 2, 3, 4),
+        decoder_depths=(1, 1, 1, 1),
+        decoder_channels=(32, 32, 48, 48),
+        decoder_heads=(2, 2, 3, 3),
+        anchor_channels=(32, 32, 48, 48, 48),
+        strides=(2, 2, 2, 2),
+        grid=0.02,
+    )
+
+
 # reduced sizes by name
-REDUCED = {SMALL_PAPER: small, TINY_PAPER: tiny}
+REDUCED = {SMALL_PAPER: small, TINY_PAPER: tiny, DEEP_PAPER: deep}
 
 
 def nearest_joints(points: np.ndarray, joints: np.ndarray) -> np.ndarray:
