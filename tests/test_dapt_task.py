@@ -617,6 +617,7 @@ def test_released_faults_are_options_of_training():
     recipe = Finetune(data=("a",), init="random", size="paper-tiny", options=options[:1])
     with pytest.raises(InputError, match="trained without these options"):
         finetuned_network(recipe, trained(mended), HUMAN15, "humanm3")
+    assert pretraining_network(Pretrain(size="paper-small", options=("anchor_dropout=0",)))[0].anchor_dropout == 0
     with pytest.raises(InputError, match="unknown option of .* 'grid': "):
         pretraining_network(Pretrain(size="paper-tiny", options=("grid=0.02",)))
     with pytest.raises(InputError, match="small has none: omit --options"):

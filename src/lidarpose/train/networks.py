@@ -33,6 +33,8 @@ from lidarpose.train.objectives.dapt_transfer import transferred
 from lidarpose.train.recipes import MODELS, PAPER, RANDOM, Finetune, Pretrain
 
 Config = NetworkConfig | DaptConfig | BaselineConfig
+# options of the paper's network besides the faults of the released code
+_OPTIONS = ("anchor_dropout",)
 
 # by size: the configuration of a network before fine-tuning, and the skeleton in which validation people are drawn
 PRETRAINED: dict[str, tuple[Any, Skeleton]] = {
@@ -187,19 +189,19 @@ def check_rates(recipe: Pretrain | Finetune, config: Config) -> None:
 def _with_options(config: Any, options: tuple[str, ...]) -> Any:
     """A configuration with options NAME=VALUE (JSON or text), or NAME for true.
 
-    Options are fields of a baseline's configuration, or faults of the released code for the paper's network. Raises
-    InputError for unknown ones.
+    Options are fields of a baseline's configuration; for the paper's network faults of the released code, and the
+    dropout of its neck. Raises InputError for unknown ones.
     """
     if not options:
         return config
     if isinstance(config, NetworkConfig):
         raise InputError(f"options are for the paper's networks, {config.name} has none: omit --options")
     is_baseline = isinstance(config, BaselineConfig)
-    option_names = [field.name for field in fields(config) if field.name != "joints"] if is_baseline else list(FAULTS)
+    names = [field.name for field in fields(config) if field.name != "joints"] if is_baseline else [*FAULTS, *_OPTIONS]
     changes: dict[str, Any] = {}
     for option in options:
         name, _, value = option.partition("=")
-        check_name(f"option of {config.name}", name, option_names)
+        check_name(f"option of {config.name}", name, names)
         changes[name] = value or True
         with suppress(ValueError):
             changes[name] = json.loads(value)
