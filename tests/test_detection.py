@@ -329,6 +329,9 @@ def test_detect_suggests_opposite_up_axis(scene):
     # a maximum number of people limits the result, not the trial
     (*_, warning) = lidarpose.detect(points, max_people=1).warnings
     assert f"{number} people with up -z: try --up -z" in warning
+    # the axis that is suggested may also be positive
+    (*_, warning) = lidarpose.detect(scene[0], up="-z").warnings
+    assert warning.endswith("people with up z: try --up z")
     # not if as many are found as given
     assert single_scan._opposite_up(places, detection.Search(), few * 6) is None
 
@@ -349,6 +352,10 @@ def test_detect_suggests_feet_that_find_people(scene):
     (warning,) = boxes.warnings
     assert not boxes
     assert warning == "no people found in meters, but 5 if the units are feet: multiply all coordinates by 0.3048"
+    # a sensor that is 2.5 above the ground is in meters, at any height of the map
+    low = np.array([0, 0, 2.5 - lidarpose.sensor("os1-64").height / 0.3048])
+    for way in (np.zeros(3), np.array([0, 0, 5000.0])):
+        assert lidarpose.detect(scene[0] / 0.3048 + way, sensor_origin=low + way).warnings == ()
 
 
 def test_detect_reports_range_without_sensor(scene):
@@ -389,7 +396,7 @@ def test_detect_takes_sensor_on_ground_for_another_frame(scene, fake):
 def test_detect_replaces_implausible_sensor_origin_by_unknown(scene, fake):
     points, joints = scene
     height = np.array([0, 0, 1.8])
-    for moved, problem in ((np.array([5e5, 5e6, 0]), "nearest point"), (height, "no ground below it")):
+    for moved, problem in ((np.array([5e5, 5e6, -3e3]), "nearest point"), (height, "no ground below it")):
         boxes = lidarpose.detect(points + moved)
         assert any(problem in warning and "treated as unknown" in warning for warning in boxes.warnings), problem
         assert fake.calls[-1]["origin"] is None
@@ -442,6 +449,9 @@ def test_find_people_thins_large_maps(scene, monkeypatch):
     distance, kept = np.linalg.norm(points, axis=1), np.linalg.norm(searched.points, axis=1)
     assert (kept > 15).sum() == ((distance > 15) & (distance < 55)).sum() > 1000
     assert 0 < (kept < 6).sum() < 0.4 * (distance < 6).sum()
+    # also if the range is far larger than the scan
+    away = detection._thinned(detection.Scan(points=points, origin=np.zeros(3)), detection.Search(max_range=1e6))
+    assert abs(len(away[0].points) - len(points) / 2) < 500 and away[1] == []
     # a sensor far away from all points is not used as the center
     monkeypatch.setattr(detection, "_MOST_POINTS", len(wide))
     away = detection._thinned(detection.Scan(points=points, origin=np.full(3, 1e5)), detection.Search())
@@ -531,6 +541,8 @@ def test_detect_excludes_background(scene, tmp_path, fake):
         ({"min_score": "high"}, "min_score"),
         ({"max_range": 0}, "range: expected meters"),
         ({"max_range": np.nan}, "range: expected meters"),
+        ({"max_range": 1e200}, "range: expected meters, more than 0 and at most 1e\\+09, got 1e\\+200"),
+        ({"max_range": 10**400}, "range: expected meters"),
         ({"max_people": 0}, "max_people must be a whole number"),
         ({"sensor_origin": "here"}, "sensor origin"),
         ({"up": "w"}, "up: expected"),

@@ -129,6 +129,8 @@ def test_detector_finds_people_at_map_heights(points):
     near, far = (Detector(upright).detect(points + way, ORIGIN + way) for way in (np.zeros(3), shift))
     np.testing.assert_allclose(far.centers - shift, near.centers, atol=5e-3)
     people, rows = np.array([[5.0, 0.0]]), np.arange(len(points))
+    height = far.base + far.ground.at(people + shift[:2]) - shift[2]
+    np.testing.assert_allclose(height, near.base + near.ground.at(people), atol=5e-3)
     near, far = (
         Detector(upright).detect_beside(points + way, ORIGIN + way, detections.ground, rows, people + way[:2])
         for way, detections in ((np.zeros(3), near), (shift, far))

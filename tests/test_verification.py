@@ -55,7 +55,14 @@ def detections_at(*places):
     count = len(places)
     sizes, logit = np.full((count, 3), [0.8, 0.8, 1.8]), np.arange(float(count))
     return Detections(
-        centers=np.array(places), sizes=sizes, logit=logit, score=logit, mounted=logit, ground=None, has_ground=True
+        centers=np.array(places),
+        sizes=sizes,
+        logit=logit,
+        score=logit,
+        mounted=logit,
+        ground=None,
+        base=0.0,
+        has_ground=True,
     )
 
 

@@ -5,6 +5,7 @@ Legend: D detections.
 """
 
 import os
+import reprlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -21,7 +22,7 @@ from lidarpose.inference.scan import Scan
 from lidarpose.inference.verification import rounded, verified
 from lidarpose.models.detector.detector import MAX_RANGE, Detections, Detector
 from lidarpose.models.detector.ground import estimate_up
-from lidarpose.sample import MIN_POINTS, Box
+from lidarpose.sample import FARTHEST, MIN_POINTS, Box
 
 # maximum number of detections that are verified and posed
 MOST_POSED = 60
@@ -56,8 +57,9 @@ class Search:
     exact_up: bool = False
 
     def __post_init__(self):
-        if not is_number(self.max_range) or not 0 < self.max_range < np.inf:
-            raise InputError(f"max_range: expected meters, more than 0, got {self.max_range!r}")
+        if not is_number(self.max_range) or not 0 < self.max_range <= FARTHEST:
+            actual = reprlib.repr(self.max_range)
+            raise InputError(f"max_range: expected meters, more than 0 and at most {FARTHEST:g}, got {actual}")
         if self.min_score is not None and not (is_number(self.min_score) and 0 <= self.min_score <= 1):
             raise InputError(f"min_score: expected a probability from 0 to 1, got {self.min_score!r}")
         if self.max_people is not None:
@@ -202,7 +204,7 @@ def _on_ground(detections: Detections, origin: np.ndarray) -> str | None:
     turns = np.arange(_DIRECTIONS) * (2 * np.pi / _DIRECTIONS)
     circle = np.stack([np.cos(turns), np.sin(turns)], 1)
     places = origin[:2] + np.concatenate([radius * circle for radius in _AROUND])
-    height = float(origin[2] - np.median(detections.ground.at(places)))
+    height = float(origin[2] - detections.base - np.median(detections.ground.at(places)))
     if height > _LEAST_HEIGHT:
         return None
     return (
@@ -279,11 +281,11 @@ def _thinned(scan: Scan, search: Search) -> tuple[Scan, list[str]]:
     pieces = [slice(start, start + _CHUNK) for start in range(0, count, _CHUNK)]
     squared_reach, num_searched, squared_dense_range = (search.max_range + _BEYOND) ** 2, count, None
     if origin is not None:
-        histogram = sum(
-            np.histogram(_squared(points[piece], origin), _DISTANCES, (0, squared_reach))[0] for piece in pieces
-        )
+        # geometric, so that a large range does not put all points into the first bins
+        edges = np.append(0.0, np.geomspace(0.01, squared_reach, _DISTANCES))
+        histogram = sum(np.histogram(_squared(points[piece], origin), edges)[0] for piece in pieces)
         if (num_in_range := int(np.sum(histogram))) >= MIN_POINTS:
-            num_searched, squared_dense_range = num_in_range, _dense_below(np.asarray(histogram), squared_reach)
+            num_searched, squared_dense_range = num_in_range, _dense_below(np.asarray(histogram), edges)
     rng, kept_rows = np.random.default_rng(0), []
     for piece in pieces:
         share: np.ndarray | float = _MOST_POINTS / count
@@ -319,13 +321,12 @@ def _squared(points: np.ndarray, origin: np.ndarray) -> np.ndarray:
     return np.einsum("ni,ni->n", offset, offset)
 
 
-def _dense_below(histogram: np.ndarray, squared_reach: float) -> float:
+def _dense_below(histogram: np.ndarray, edges: np.ndarray) -> float:
     """The squared distance, m2, below which points are kept with a probability proportional to their squared distance,
     so that `_MOST_AROUND` points remain.
 
-    histogram: counts of the squared distances of all points up to `squared_reach`, m2.
+    histogram: counts of the squared distances of all points in the bins between `edges`, m2.
     """
-    edges = np.linspace(0, squared_reach, len(histogram) + 1)
     weighted_counts = np.cumsum(histogram * (edges[1:] + edges[:-1]) / 2)
     kept_counts = weighted_counts / edges[1:] + histogram.sum() - np.cumsum(histogram)
     valid_bins = np.flatnonzero(kept_counts <= _MOST_AROUND)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidarpose.errors import counted
-from lidarpose.geometry import UP_AXES, rotation_from_up, up_text
+from lidarpose.geometry import UP_AXES, rotation_from_up, up_text, upright_axis
 from lidarpose.inference.checks import flat_along_another_axis, flat_axis, scan_unit_warning
 from lidarpose.inference.detection import (
     LEAST_STATIC,
@@ -154,7 +154,7 @@ def _opposite_up(places: DetectedScan, search: Search, boxes: Sequence[Box]) -> 
 
 def _opposite(scan: Scan) -> str:
     """The axis that points the other way than the up axis nearest to the scan's."""
-    axis = scan.upright_axis
+    axis = upright_axis(scan.up)
     return axis[1:] if axis.startswith("-") else f"-{axis}"
 
 
@@ -166,7 +166,9 @@ def _feet(places: DetectedScan, search: Search) -> str | None:
     """A warning for the user if people are found with feet as the unit. Only where the sensor is higher above the
     ground than most, since a third of a scan in meters may have something of a person's shape."""
     scan, origin, detections = places.given, places.scan.level_origin, places.detections
-    if detections is None or origin is not None and origin[2] - detections.ground.at(origin[None, :2]) < _LOW_SENSOR:
+    if detections is None:
+        return None
+    if origin is not None and origin[2] - detections.base - detections.ground.at(origin[None, :2]) < _LOW_SENSOR:
         return None
     feet = replace(scan, points=scan.points * _FOOT, origin=None if scan.origin is None else scan.origin * _FOOT)
     background = None if search.background is None else search.background * _FOOT

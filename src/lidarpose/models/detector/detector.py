@@ -51,8 +51,8 @@ class Detections:
     """D detected people, highest-scoring first, in the level frame, meters.
 
     centers (D, 3): of their boxes, which are square, at yaw 0; sizes (D, 3); logit (D,); score (D,): probability of a
-    person; mounted (D,): probability that the person rides or sits in a wheelchair; ground: under the people;
-    has_ground: whether a ground was found.
+    person; mounted (D,): probability that the person rides or sits in a wheelchair; ground: under the people, in a
+    frame that is `base` m higher; has_ground: whether a ground was found.
     """
 
     centers: np.ndarray
@@ -61,6 +61,7 @@ class Detections:
     score: np.ndarray
     mounted: np.ndarray
     ground: Ground
+    base: float
     has_ground: bool
 
     def __len__(self) -> int:
@@ -189,6 +190,7 @@ class Detector:
             score=self.probability(logit[indices]),
             mounted=mounted,
             ground=scene.ground,
+            base=base,
             has_ground=has_ground,
         )
 
