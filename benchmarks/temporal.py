@@ -219,7 +219,7 @@ def corrected(net: SplineNet, clips: dict[str, np.ndarray]) -> np.ndarray:
     for clip, is_seen, spread in zip(joints, clips["known"], clips["steady_spread"], strict=True):
         variance = known_spread(spread, is_seen, len(BODY26))[is_seen] ** 2
         bone_sums = length_statistics(clip[is_seen], np.full_like(variance, 1e-6), bones)
-        lengths = lengths_of(bone_sums.sum(0), bones, BODY26.flip)
+        lengths = lengths_of(bone_sums.sum(0), bones, BODY26)
         clip[is_seen] = keep_lengths(clip[is_seen], variance, bones, lengths)
     return joints
 

@@ -455,6 +455,16 @@ def test_known_people_are_not_verified_again(clouds, model, monkeypatch):
     assert all(line == scores[-1] for line in scores[2:])
 
 
+def test_people_without_hips_are_posed_as_if_untracked(clouds, model):
+    """Their joints do not tell where the pelvis is, on which the network is centered."""
+    ankles = lidarpose.Skeleton(name="ankles", joints=("left_ankle", "right_ankle"), parents=(-1, 0))
+    predict = partial(lidarpose.predict_recording, model=model, skeleton=ankles)
+    frames = (predict(moving_source(clouds[:4]), track=is_tracked) for is_tracked in (True, False))
+    for tracked, alone in zip(*frames, strict=True):
+        assert tracked.error is None and sorted(person.id for person in tracked.poses) == [0, 1]
+        np.testing.assert_array_equal(tracked.poses.to_numpy(), alone.poses.to_numpy())
+
+
 def test_folder_of_crops_gives_one_track(clouds, folder, model):
     crops = folder / "crops"
     crops.mkdir()

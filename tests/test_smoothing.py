@@ -10,7 +10,7 @@ import pytest
 from lidarpose.errors import InputError
 from lidarpose.inference.inputs import clip_times
 from lidarpose.inference.predictor import load
-from lidarpose.skeleton import SKELETONS, SMPL24
+from lidarpose.skeleton import SKELETONS, SMPL24, Skeleton
 from lidarpose.tracking.bones import rigid_bones
 from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.live import LiveFilter, filter_track
@@ -93,7 +93,10 @@ def error(joints, true):
     return [1e3 * np.linalg.norm(v, axis=-1).mean() for v in (off, np.diff(off, 2, axis=0))]
 
 
-@pytest.mark.parametrize("skeleton", SKELETONS.values(), ids=SKELETONS)
+ARM = Skeleton(name="arm", joints=("pelvis", "right_shoulder", "right_elbow", "right_wrist"), parents=(-1, 0, 1, 2))
+
+
+@pytest.mark.parametrize("skeleton", [*SKELETONS.values(), ARM], ids=[*SKELETONS, "arm"])
 def test_smoothing_reduces_error_and_jitter(walker, skeleton):
     true, track = walker(skeleton)
     before, steady = error(track.joints, true), error(smooth(track).joints, true)
@@ -383,7 +386,7 @@ def test_clip_times_defaults_and_rejects_invalid_times():
     assert clip_times(None, 3).tolist() == [0, 0.1, 0.2] and clip_times((0, 0.5, 7), 3).tolist() == [0, 0.5, 7]
     dates = [np.arange(3).astype(kind) for kind in ("M8[ms]", "m8[s]")]
     dates.append(pandas.Series(pandas.date_range("2024", periods=3, tz="UTC")))
-    for times in ([0, 1], [0, 1, 1], [0, 1, np.nan], "abc", *dates):
+    for times in ([0, 1], [0, 1, 1], [0, 1, np.nan], [0, 1, 10**400], "abc", *dates):
         with pytest.raises(InputError, match="3 finite numbers"):
             clip_times(times, 3)
 

@@ -89,9 +89,15 @@ class Skeleton:
         """Pairs (parent, child) of joint indices to draw, followed by `extra_bones`."""
         return tuple((p, j) for j, p in enumerate(self.parents) if p >= 0) + self.extra_bones
 
+    @property
+    def is_two_sided(self) -> bool:
+        """Whether the skeleton has the mirror image of each joint."""
+        return all(_mirrored(name) in self.joints for name in self.joints)
+
     @cached_property
     def flip(self) -> tuple[int, ...]:
-        """`flip[j]` is the index of joint j's mirror image: left and right are swapped by name."""
+        """`flip[j]` is the index of joint j's mirror image: left and right are swapped by name. Raises InputError
+        unless the skeleton `is_two_sided`."""
         return tuple(self.index(_mirrored(name)) for name in self.joints)
 
     def map_to(self, other: "Skeleton") -> np.ndarray:

@@ -46,7 +46,7 @@ _CLEARLY_SURER = 0.6
 _WIDEST_CROP = 20.0
 # rotation by 180 degrees about x, as a factor per axis
 UPSIDE_DOWN = np.array([1.0, -1.0, -1.0])
-# joints that all skeletons have
+# joints from which the direction of the trunk is computed
 _TRUNK = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 # thresholds for lying people: the points are less than `_TIGHT` m across; their level standard deviation is at least
 # `_LONG` m and `_LONG_TO_TALL` times the vertical one. This holds for 97 of 100 synthetic people who were laid down,
@@ -139,6 +139,8 @@ def is_lying(pose: Pose, points: np.ndarray) -> bool:
         spread = points.std(0)
         if spread[:2].max() > max(_LONG, _LONG_TO_TALL * spread[2]):
             return True
+    if not set(_TRUNK) <= set(pose.skeleton.joints):
+        return False
     joints = {name: pose.joints[pose.skeleton.index(name)] for name in _TRUNK}
     trunk = joints["left_shoulder"] + joints["right_shoulder"] - joints["left_hip"] - joints["right_hip"]
     return bool(abs(trunk[2]) < np.sin(np.radians(35)) * np.linalg.norm(trunk))

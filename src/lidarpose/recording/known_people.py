@@ -5,6 +5,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from lidarpose.errors import InputError
 from lidarpose.geometry import inverse_transform, transform_points
 from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.results import PersonPose, Poses
@@ -195,5 +196,9 @@ def _trusted(number: Any) -> Any:
 
 
 def _pelvis(pose: Pose | None) -> np.ndarray | None:
-    """The pelvis (3,) m, or the midpoint of the hips if the skeleton has no pelvis; None without a pose."""
-    return None if pose is None else pose.joints[list(pose.skeleton.middle)].mean(0)
+    """The pelvis (3,) m, or the midpoint of the hips if the skeleton has no pelvis; None without a pose or these
+    joints, so that the person is verified and posed anew in each frame."""
+    try:
+        return None if pose is None else pose.joints[list(pose.skeleton.middle)].mean(0)
+    except InputError:
+        return None

@@ -36,9 +36,10 @@ def length_statistics(joints: np.ndarray, variance: np.ndarray, bones: np.ndarra
     return np.stack([weight * (squared + _SHORT * end_variance), weight], -1)
 
 
-def lengths_of(total: np.ndarray, bones: np.ndarray, flip: tuple[int, ...]) -> np.ndarray:
-    """(E,) m: lengths of bones (E, 2), equal for left and right, from a sum (E, 2) of `length_statistics`. flip: as in
-    `Skeleton`."""
+def lengths_of(total: np.ndarray, bones: np.ndarray, skeleton: Skeleton) -> np.ndarray:
+    """(E,) m: lengths of bones (E, 2), equal for left and right if the skeleton has both, from a sum (E, 2) of
+    `length_statistics`."""
+    flip = skeleton.flip if skeleton.is_two_sided else range(len(skeleton))
     bone_index = {frozenset(bone): i for i, bone in enumerate(bones.tolist())}
     mirror_index = [bone_index[frozenset((flip[a], flip[b]))] for a, b in bones.tolist()]
     squared, weight = (total + total[mirror_index]).T

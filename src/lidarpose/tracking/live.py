@@ -95,7 +95,7 @@ class LiveFilter:
         mean = (probabilities[..., None] * self._state.position).sum(0)
         variance = (probabilities * self._state.variance).sum(0)
         if self._frames >= LEAST_FRAMES and len(self._bones):
-            lengths = lengths_of(self._arrays["bones"], self._bones, self.skeleton.flip)
+            lengths = lengths_of(self._arrays["bones"], self._bones, self.skeleton)
             mean = keep_lengths(mean, variance, self._bones, lengths)
         return mean + self._arrays["origin"], steady_spread(variance, self._arrays["precision_sum"] / self._frames)
 

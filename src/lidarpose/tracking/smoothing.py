@@ -57,9 +57,8 @@ def smooth(track: TrackPoses) -> TrackPoses:
         weight = frame_weights(path - joints, precision)
     bones = rigid_bones(track.skeleton)
     if is_seen.sum() >= LEAST_FRAMES and len(bones):
-        lengths = lengths_of(
-            length_statistics(joints[is_seen], spread[is_seen] ** 2, bones).sum(0), bones, track.skeleton.flip
-        )
+        statistics = length_statistics(joints[is_seen], spread[is_seen] ** 2, bones).sum(0)
+        lengths = lengths_of(statistics, bones, track.skeleton)
         path = keep_lengths(path, variance, bones, lengths)
     return filled_in(track, path + origin, steady_spread(variance, (spread**-2).sum(0) / is_seen.sum()))
 
@@ -85,7 +84,10 @@ def steady_spread(variance: np.ndarray, mean_precision: np.ndarray) -> np.ndarra
 
 
 def with_facing_corrected(track: TrackPoses) -> TrackPoses:
-    """A track with corrected facing: left and right are exchanged in the flipped frames."""
+    """A track with corrected facing: left and right are exchanged in the flipped frames, if the skeleton has
+    both."""
+    if not track.skeleton.is_two_sided:
+        return track
     rows = np.flatnonzero(track.seen)
     variance = known_spread(track.spread, track.seen, len(track.skeleton))[rows] ** 2
     confidence = None if track.confidence is None else track.confidence[rows]
