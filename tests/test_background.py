@@ -44,4 +44,9 @@ def test_learn_background_excludes_person_who_leaves(monkeypatch):
     monkeypatch.setattr("lidarpose.inference.background._MOST_SCANS", 5)
     few = learn_background(scans[8:14] + scans[14:] * 3)
     assert is_static(wall, few).all() and not is_static(person, few).any()
-    assert not len(learn_background([np.zeros((0, 3)), wall])) and not is_static(wall, np.zeros((0, 3))).any()
+    empty, map_origin = np.zeros((0, 3)), np.array([5e5, 5e6, 0])
+    assert not len(learn_background([empty, wall])) and not is_static(wall, empty).any()
+    # an empty first scan does not tell where the others are
+    assert is_static(wall + map_origin, learn_background([empty, *[wall + map_origin] * 8])).all()
+    assert not is_static(person + map_origin, learn_background([empty, *[wall + map_origin] * 8])).any()
+    assert learn_background([empty] * 6).shape == (0, 3)

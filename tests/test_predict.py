@@ -142,6 +142,7 @@ def test_predict_keeps_input(model, points):
         ([[[1, 2, 3], [1, 2]]], "points[0]"),
         ([np.zeros((9, 3)), np.zeros((9, 2))], "points[1]"),
         ([None], "points[0]"),
+        ([[10**400, 0, 0]] * 9, "numbers below 1e+09 m, got a larger one"),
         ({"points": 1}, "dict"),
         (None, "NoneType"),
         (5, "shape ()"),
@@ -371,6 +372,9 @@ def test_is_lying(standing, points):
     laid = replace(pose, joints=pose.joints @ rotation_about("x", np.pi / 2).T)
     assert is_lying(laid, points) and is_lying(laid.to(SKELETONS["waymo14"]), none)
     assert not is_lying(pose.to(SKELETONS["waymo14"]), none)
+    # without the joints of the trunk, the points alone count
+    ankles = laid.to(lidarpose.Skeleton(name="ankles", joints=("left_ankle", "right_ankle"), parents=(-1, 0)))
+    assert not is_lying(ankles, points) and is_lying(ankles, points[:, [2, 1, 0]])
 
 
 def test_flat_axis_of_sweep_is_up_axis(points):

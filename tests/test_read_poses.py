@@ -75,6 +75,14 @@ def test_read_poses_reports_wrong_values(tmp_path):
     document["people"][0]["joints"] = [[0, 0]]
     with pytest.raises(InputError, match=r"damaged document \(Pose.joints of human15"):
         lidarpose.read_poses(document)
+    bones = document["skeleton"] | {"name": "mine", "bones": [[0, 99]]}
+    for changes, reason in (
+        ({"skeleton": bones}, "index out of range"),
+        ({"up": "q"}, "up: expected"),
+        ({"up": 7}, "up:"),
+    ):
+        with pytest.raises(InputError, match=rf"damaged document \(.*{reason}.*write it again"):
+            lidarpose.read_poses(document | {"people": []} | changes)
     lines = tmp_path / "drive.poses.jsonl"
     lines.write_text("{}\n{}\n")
     with pytest.raises(InputError, match=r"one document per line: call it with each line"):

@@ -269,7 +269,17 @@ def test_update_rejects_invalid_boxes_without_change():
 
 
 @pytest.mark.parametrize(
-    "state", [{}, None, {"max_gap": 2.0, "tracks": []}, Tracker().state() | {"tracks": {"id": []}}]
+    "state",
+    [
+        {},
+        None,
+        {"max_gap": 2.0, "tracks": []},
+        Tracker().state() | {"tracks": {"id": []}},
+        Tracker().state() | {"time": "x"},
+        Tracker().state() | {"next_id": None},
+        Tracker().state() | {"tracks": Tracker().state()["tracks"] | {"age": [1.0]}},
+        Tracker().state() | {"tracks": Tracker().state()["tracks"] | {"id": [10**400]}},
+    ],
 )
 def test_from_state_rejects_invalid_state(state):
     with pytest.raises(InputError, match="^expected the state of a tracker, got .*: give what Tracker.state"):

@@ -76,6 +76,10 @@ def learn_background(
                     raise
                 problems.append(problem)
                 continue
+            if not len(points):
+                # no place for the grid, but one more scan in which no voxel is occupied
+                scan_voxels.append(np.zeros(0, np.int64))
+                continue
             grid = grid or _Grid(points)
             scan_eighths = grid.eighths(points)
             eighths = _ascending(np.concatenate([eighths, scan_eighths]))
@@ -89,11 +93,13 @@ def learn_background(
             if static_voxels is None
             else np.intersect1d(static_voxels, frequent_voxels, assume_unique=True)
         )
-    if grid is None or static_voxels is None:
+    if static_voxels is None:
         raise InputError(f"background: none of {counted(len(sources), 'scan')} can be read, the first: {problems[0]}")
     if problems:
         left_out = f"{len(problems)} of {counted(len(sources), 'scan')} left out"
         warnings.warn(f"background: {left_out}, the first: {problems[0]}", stacklevel=2)
+    if grid is None:
+        return np.zeros((0, 3))
     return grid.middles(eighths[np.isin(_packed(_unpacked(eighths) // 2), static_voxels)])
 
 

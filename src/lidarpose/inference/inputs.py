@@ -4,7 +4,7 @@ import os
 import reprlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -48,9 +48,11 @@ class Clips:
     def checked(self, count: int) -> "Clips":
         """The validated clips of `count` clouds. Raises InputError unless each cloud is in exactly one window and
         `background` and `neighbors` have one cloud per frame."""
-        windows = np.asarray(self.windows)
-        rows = [row for window in windows for row in np.unique(window).tolist()]
-        if windows.ndim != 2 or windows.shape[1] != CLIP_FRAMES or sorted(rows) != list(range(count)):
+        windows = np.asarray(self.windows, object)
+        is_table = windows.ndim == 2 and windows.shape[1] == CLIP_FRAMES
+        is_table = is_table and all(isinstance(row, Integral) for row in windows.flat)
+        rows = [row for window in windows for row in set(window)] if is_table else []
+        if not is_table or sorted(rows) != list(range(count)):
             raise InputError(
                 f"clips: expected windows of {CLIP_FRAMES} rows, with each of the {count} clouds in one window, as "
                 f"in Clips.of_run({count}), got {reprlib.repr(windows.tolist())}"
@@ -62,7 +64,7 @@ class Clips:
             if len(clouds) != count:
                 raise InputError(f"clips: expected as many clouds of {name} as clouds, {count}, got {len(clouds)}")
             surroundings[name] = [as_points(cloud, f"{name}[{i}]") for i, cloud in enumerate(clouds)]
-        return replace(self, windows=windows, **surroundings)
+        return replace(self, windows=windows.astype(int), **surroundings)
 
     def around(self, rows: np.ndarray) -> dict[str, list[np.ndarray]]:
         """The clouds `background` and `neighbors` of the given rows, by name; empty clouds where there are none."""
@@ -132,7 +134,12 @@ def as_points(points: Any, what: str = "points") -> np.ndarray:
                 f"{what} must be an (n, 3) array of numbers, got {type(points).__name__} of objects, not all numbers, "
                 f"shape {array.shape}: give columns of numbers only, and many people as a list of arrays"
             )
-        array = array.astype(float)
+        try:
+            array = array.astype(float)
+        except OverflowError as error:
+            raise InputError(
+                f"{what} must be an (n, 3) array of numbers below {FARTHEST:g} m, got a larger one ({error})"
+            ) from None
     if array.dtype.kind not in "fiu":
         raise InputError(f"{what} must be an (n, 3) array of numbers, got {array.dtype} of shape {array.shape}")
     looks_transposed, looks_depth = is_transposed(array.shape), is_image(array.shape)
@@ -172,7 +179,7 @@ def clip_times(times: Any, count: int) -> np.ndarray:
         # reject dates and time differences, which would be read as seconds whatever their unit
         is_date = seconds.dtype.kind in "mM" or not all(isinstance(time, Real) for time in seconds.ravel().tolist())
         seconds = np.full(0, np.nan) if is_date else seconds.astype(float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         seconds = np.full(0, np.nan)
     if seconds.shape != (count,) or not (np.isfinite(seconds).all() and (np.diff(seconds) > 0).all()):
         raise InputError(

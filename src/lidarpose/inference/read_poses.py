@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarpose.geometry import rotation_from_up
 from lidarpose.inference.results import SCHEMA, PersonPose, Poses
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.files import FormatError, file_error, read_bytes
@@ -38,7 +39,7 @@ def read_poses(source: str | os.PathLike | dict[str, Any]) -> Poses:
         return _poses(source if isinstance(source, dict) else _parse(data, source))
     except FormatError as problem:
         raise file_error(name, problem) from None
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
         # also InputError, of values that poses and boxes do not allow
         reason = f"without {error}" if isinstance(error, KeyError) else str(error)
         raise file_error(name, f"expected {_EXPECTED}, got a damaged document ({reason}): write it again") from None
@@ -61,6 +62,7 @@ def _poses(document: Any) -> Poses:
         raise FormatError(f"expected {_EXPECTED}, got {actual}: give a file that lidarpose predict wrote")
     skeleton = _skeleton(document["skeleton"])
     up, model = str(document.get("up", "z")), dict(document["model"])
+    rotation_from_up(up)
     people = [_person(entry, skeleton, up, model) for entry in document["people"]]
     return Poses(
         people=tuple(people),

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.errors import InputError, check_finite
+from lidarpose.errors import InputError, check_finite, check_int
 from lidarpose.sample import Box
 from lidarpose.tracking.assignment import assign
 
@@ -188,7 +188,11 @@ class Tracker:
         """The tracker restored from its `state()`. Raises InputError for anything else."""
         try:
             tracker = cls(max_gap=state["max_gap"])
-            tracker.jumps_back, tracker._time, tracker._next_id = state["jumps_back"], state["time"], state["next_id"]
+            tracker.jumps_back = check_int("jumps_back", state["jumps_back"], least=0)
+            tracker._next_id = check_int("next_id", state["next_id"], least=0)
+            if (time := state["time"]) is not None:
+                check_finite("time", time)
+                tracker._time = float(time)
             empty_tracks = tracker._tracks
             tracker._tracks = _Tracks(
                 **{
@@ -198,7 +202,9 @@ class Tracker:
                     for name, values in state["tracks"].items()
                 }
             )
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            if len({len(getattr(tracker._tracks, field.name)) for field in fields(_Tracks)}) > 1:
+                raise ValueError("tracks: columns of unequal length")
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(
                 f"expected the state of a tracker, got {reprlib.repr(state)} ({type(error).__name__}: {error}): give "
                 "what Tracker.state() returned"
