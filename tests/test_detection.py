@@ -352,7 +352,19 @@ def test_detect_suggests_feet_that_find_people(scene):
     (warning,) = boxes.warnings
     assert not boxes
     assert warning == "no people found in meters, but 5 if the units are feet: multiply all coordinates by 0.3048"
-    # a sensor that is 2.5 above the ground is in meters, at any height of the map
+
+
+def test_detect_with_feet_scales_sensor_position_and_background(scene):
+    at = np.array([20.0, 0, 0])
+    static = scene[0][alone(scene[0]) | (np.linalg.norm(scene[0][:, :2] - PLACES[0], axis=1) < 1)]
+    (warning,) = lidarpose.detect((scene[0] + at) / 0.3048, sensor_origin=at / 0.3048).warnings
+    assert "5 if the units are feet" in warning
+    (warning,) = lidarpose.detect(scene[0] / 0.3048, background=static / 0.3048).warnings
+    assert "4 if the units are feet" in warning
+
+
+def test_detect_does_not_suggest_feet_for_low_sensor(scene):
+    """A sensor that is 2.5 above the ground is in meters, at any height of the map."""
     low = np.array([0, 0, 2.5 - lidarpose.sensor("os1-64").height / 0.3048])
     for way in (np.zeros(3), np.array([0, 0, 5000.0])):
         assert lidarpose.detect(scene[0] / 0.3048 + way, sensor_origin=low + way).warnings == ()

@@ -324,6 +324,9 @@ def test_render_matches_references(scene):
         "scalars": (4,),
     }
     assert all(array.dtype == np.float32 for array in inputs.values())
+    away = chosen.centers - origin
+    scalars = [np.log(np.hypot(*away[:, :2].T)), -away[:, 2] / 4, np.log1p(chosen.count), np.ones(len(away))]
+    np.testing.assert_allclose(inputs["scalars"], np.stack(scalars, 1), atol=1e-5)
     for k, center in enumerate(chosen.centers):
         away = center - origin
         assert chosen.distance[k] == pytest.approx(np.hypot(*away[:2]))
@@ -452,6 +455,9 @@ def test_render_augments_candidates_independently(scene):
     unchanged = render(chosen, CandidateAugmentation())
     for name, values in render(chosen).items():
         np.testing.assert_allclose(unchanged[name], values, atol=0.005)
+    # a shift of 0.2 m to the left moves the view past a candidate by two cells
+    shifted = render(chosen, CandidateAugmentation(shift=(0.5, 0.2)))["range_view"]
+    np.testing.assert_allclose(shifted[..., 2:], unchanged["range_view"][..., :-2], atol=1e-6)
     half = render(chosen, CandidateAugmentation(keep=0.5, seed=np.arange(6)))
     assert 0.3 < (half["fine"] > 0).sum() / (unchanged["fine"] > 0).sum() < 0.9
 

@@ -36,6 +36,10 @@ def test_read_poses_restores_saved_results(tmp_path):
     assert result.skeleton is skeleton and [person.num_points for person in result] == [7, 2]
     assert result["a"].box.score == 0.75 and result["a"].out_of_range == list(skeleton.joints[:3])
     np.testing.assert_array_equal(result.to_numpy(), poses.to_numpy())
+    # lines of recordings have velocities
+    line = poses.to_dict()
+    line["people"][0]["velocity"] = [1.0, 0.5, 0.0]
+    np.testing.assert_array_equal(lidarpose.read_poses(line)["a"].velocity, [1.0, 0.5, 0.0])
     # points are not stored, but results without them can be drawn
     assert result.picture() and not len(result[0].points)
 

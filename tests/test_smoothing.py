@@ -9,9 +9,11 @@ import pytest
 
 from lidarpose.errors import InputError
 from lidarpose.inference.inputs import clip_times
-from lidarpose.inference.predictor import load
+from lidarpose.inference.predictor import _with_frame_values, load
+from lidarpose.inference.results import PersonPose
+from lidarpose.sample import Pose
 from lidarpose.skeleton import SKELETONS, SMPL24, Skeleton
-from lidarpose.tracking.bones import rigid_bones
+from lidarpose.tracking.bones import lengths_of, rigid_bones
 from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.live import LiveFilter, filter_track
 from lidarpose.tracking.motion_model import (
@@ -233,6 +235,17 @@ def test_smoothing_limits_tiny_spread():
         assert all(np.isfinite(pose.joints).all() for pose in filter_track(track))
 
 
+def test_lengths_of_bones_are_equal_for_left_and_right():
+    bones = rigid_bones(SMPL24)
+    total = np.random.default_rng(0).uniform(1, 2, (len(bones), 2))
+    names = [tuple(SMPL24.joints[end] for end in bone) for bone in bones]
+    lengths = dict(zip(names, lengths_of(total, bones, SMPL24), strict=True))
+    for name, length in lengths.items():
+        other = tuple(SMPL24.joints[SMPL24.flip[SMPL24.index(end)]] for end in name)
+        rows = [k for k, ends in enumerate(names) if set(ends) in (set(name), set(other))]
+        assert length == pytest.approx(np.sqrt(total[rows, 0].sum() / total[rows, 1].sum()))
+
+
 def test_live_filter_keeps_bone_lengths(walker):
     _, track = walker(frames=60)
     bones = rigid_bones(track.skeleton)
@@ -380,6 +393,17 @@ def test_predict_clip_keeps_person_probabilities(clouds, live):
     for k, (own, person) in enumerate(zip(each, steady, strict=True)):
         assert (person.person, person.second_person) == (own.person, own.second_person)
         assert (person.person is None) == (k == 3) and person.has_pose
+
+
+def test_frame_values_of_swapped_pose_are_of_other_side():
+    in_range = np.array([not name.startswith("left_") for name in SMPL24.joints])
+    pose = Pose(joints=np.zeros((24, 3)), skeleton=SMPL24, in_range=in_range, person=np.float64(0.25))
+    person = PersonPose(pose=pose, skeleton=SMPL24, points=np.zeros((9, 3)))
+    steady = Pose(joints=np.ones((24, 3)), skeleton=SMPL24)
+    for is_swapped, side in ((False, "left_"), (True, "right_")):
+        values = _with_frame_values(person, steady, is_swapped)
+        assert values.person == 0.25 and (values.joints == 1).all()
+        assert values.in_range.tolist() == [not name.startswith(side) for name in SMPL24.joints]
 
 
 def test_clip_times_defaults_and_rejects_invalid_times():

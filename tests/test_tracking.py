@@ -137,7 +137,8 @@ def test_tracker_counts_times_that_jump_back():
     swapped = Tracker()
     for time in (k ^ 1 for k in range(40)):
         assert swapped.update(time / 10, [person(0.14 * time)]) == [0]
-    assert swapped.predicted(3.95)[0].center[0] == pytest.approx(5.53, abs=0.15)
+    (state,) = swapped.predicted(3.95)
+    assert state.center[0] == pytest.approx(5.53, abs=0.15) and state.velocity[0] == pytest.approx(1.4, abs=0.1)
     # a second recording starts
     assert tracker.update(-60.0, [person(0.3)]) == [1] and tracker.jumps_back == 2
     assert tracker.update(-59.9, [person(0.3)]) == [1]
