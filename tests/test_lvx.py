@@ -115,11 +115,11 @@ def test_poses_of_sensors_apply_if_they_are_used(tmp_path, major):
     alone = recording(major, [package(major, kind, data)], devices=[(1, 1, pose)])
     (frame,) = frames_of(tmp_path, alone)
     np.testing.assert_allclose(frame.points, there, atol=1e-5)
-    assert frame.origin.tolist() == [1, 2, 3]
+    assert frame.origin.tolist() == [1, 2, 3] and not frame.is_origin_unknown
     both = recording(major, [packages], devices=[(1, 1, pose), (2, 0, pose)])
     (frame,) = frames_of(tmp_path, both)
     np.testing.assert_allclose(frame.points, np.concatenate([there, points]), atol=1e-5)
-    assert frame.origin is None
+    assert frame.origin is None and frame.is_origin_unknown
     warning = "1 of 2 sensors have no pose in use, so their points may overlap"
     assert lidarpose.open_source(tmp_path / "walk.lvx2").warnings == (warning,)
 

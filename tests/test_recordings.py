@@ -934,6 +934,22 @@ def test_frames_copy_sensor_poses_and_make_rotations_exact():
     assert frame.T_world_sensor[0, 3] == frame.origin[0] == 0.0
 
 
+@pytest.mark.parametrize(
+    "stated, option, expected",
+    [
+        ({}, None, [0, 0, 0]),
+        ({"is_origin_unknown": True}, None, None),
+        ({"is_origin_unknown": True}, (1, 2, 3), [1, 2, 3]),
+        ({"origin": (4, 5, 6)}, None, [4, 5, 6]),
+    ],
+)
+def test_unknown_sensor_position_stays_unknown(model, stated, option, expected):
+    frame = Frame(points=np.ones((9, 3)), index=0, id="0", **stated)
+    boxes = {0: [[1, 1, 1, 1, 1, 2, 0]]}
+    (result,) = lidarpose.predict_recording([frame], model=model, boxes=boxes, sensor_origin=option)
+    assert (None if result.poses.origin is None else result.poses.origin.tolist()) == expected
+
+
 def test_first_frame_of_paths_has_warnings_about_source(model, tmp_path):
     for name in "ab":
         np.save(tmp_path / f"{name}.npy", np.random.default_rng(0).normal(scale=0.3, size=(99, 3)))

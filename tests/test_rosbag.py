@@ -486,7 +486,7 @@ def test_sensor_pose_is_none_without_transform_chain(tmp_path):
 
     # a cloud that is already in the world frame; the sensor's position is unknown
     (frame,) = open_source(write(tmp_path / "map.mcap", [("/p", cloud(points_of(1), frame="/map"), START)]))
-    assert np.array_equal(frame.T_world_sensor, np.eye(4)) and frame.origin is None
+    assert np.array_equal(frame.T_world_sensor, np.eye(4)) and frame.origin is None and frame.is_origin_unknown
 
 
 @pytest.mark.long

@@ -125,7 +125,8 @@ def predict_recording(
             if the skeleton has a pelvis or hips. `live=True` tracks people and smooths their poses using past frames
             only. `up=None` means what `boxes` state, else z. `calib`, `crop`, `find`, `min_score`, `max_range`,
             `max_people`, `background`, `sensor_origin`, `skeleton` and `model` are as in `predict`, except that the
-            first frame with points decides whether all frames are crops of one person.
+            first frame with points decides whether all frames are crops of one person, and that a frame's own `origin`
+            takes the place of `sensor_origin=None`.
 
     Yields:
         `FramePoses` of each frame, including damaged frames. The warnings of the first include those about the source,
@@ -344,7 +345,8 @@ class FramePredictor:
         if self._origin is not None:
             (origin,) = self._origin
         else:
-            origin = np.zeros(3) if frame.origin is None and not self._is_crop else frame.origin
+            is_unknown = self._is_crop or frame.is_origin_unknown
+            origin = np.zeros(3) if frame.origin is None and not is_unknown else frame.origin
         return replace(scan, origin=origin, warnings=(*frame.warnings, *notes))
 
     def state(self) -> dict[str, Any]:

@@ -27,7 +27,8 @@ class Sweep:
         points: (n, 3) m in the recording's frame, usually the sensor's; rows that are NaN or 0, 0, 0 are missing
             returns.
         T_world_sensor: (4, 4) m, or None if the sensor pose is unknown; the world's z axis points up.
-        origin: (3,) m, the sensor position in the points' frame; None if unknown.
+        origin: (3,) m, the sensor position in the points' frame; None if unknown or not stated.
+        is_origin_unknown: whether None means unknown. Otherwise `predict_recording` assumes 0, 0, 0 as for point files.
         ring: (n,) the beam of each point, or None.
         warnings: lines about this frame.
     """
@@ -37,6 +38,7 @@ class Sweep:
     origin: np.ndarray | None = None
     ring: np.ndarray | None = None
     warnings: tuple[str, ...] = ()
+    is_origin_unknown: bool = False
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -190,8 +190,12 @@ def _read(
                     T = poses.get(int(header["device"]), np.eye(4))
                     clouds.append(transform_points(T, points[points.any(1)]))
     origins = [T[:3, 3] for T in poses.values()] or [np.zeros(3)]
-    origin = origins[0] if num_devices == 1 else None
-    return Sweep(points=np.concatenate(clouds), origin=origin, warnings=tuple(sorted(warnings)))
+    return Sweep(
+        points=np.concatenate(clouds),
+        origin=origins[0] if num_devices == 1 else None,
+        is_origin_unknown=num_devices != 1,
+        warnings=tuple(sorted(warnings)),
+    )
 
 
 def _content(version: Version, header: np.void) -> tuple[np.dtype | None, int]:

@@ -244,8 +244,11 @@ class _Cloud:
             points, ring = velodyne.decode_scan(self.content.packets)
         else:
             points, ring = decode_cloud(self.content)
-        origin = None if self.frame_id in _NO_SENSORS else np.zeros(3)
-        return Sweep(points=points, T_world_sensor=T_world_sensor, origin=origin, ring=ring)
+        is_unknown = self.frame_id in _NO_SENSORS
+        origin = None if is_unknown else np.zeros(3)
+        return Sweep(
+            points=points, T_world_sensor=T_world_sensor, origin=origin, is_origin_unknown=is_unknown, ring=ring
+        )
 
 
 class TransformTree:
