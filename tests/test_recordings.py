@@ -25,7 +25,7 @@ from lidarpose.io.sources.frame import Frame, FrameSource, IndexedRecording, Laz
 from lidarpose.recording import output, page, picture, result_files
 from lidarpose.recording.coordinates import in_world
 from lidarpose.recording.frame_boxes import FrameBoxes
-from lidarpose.recording.predict_recording import FramePredictor
+from lidarpose.recording.predict_recording import FramePredictor, _one_ahead
 from lidarpose.skeleton import SMPL24
 from lidarpose.viz.bird_eye import draw_scan_and_people
 
@@ -991,12 +991,33 @@ def test_close_does_not_wait_for_next_frame(model):
     start = time.perf_counter()
     frames.close()
     assert time.perf_counter() - start < 20
-    # nor does the interpreter wait at its end, and no thread is left when the frame comes
+    # nor does the interpreter wait without a limit at its end, and no thread is left when the frame comes
     (thread,) = (thread for thread in threading.enumerate() if thread not in others)
     assert thread.daemon
     is_over.set()
     thread.join(20)
     assert not thread.is_alive()
+
+
+def test_end_of_program_waits_for_frame_being_read(monkeypatch):
+    ends, read, is_over = [], [], threading.Event()
+    monkeypatch.setattr("atexit.register", ends.append)
+
+    def frames(pause):
+        yield 1
+        pause(0.1)
+        read.append(2)
+
+    # the loop may still be open, for example in a traceback
+    slow, endless = (_one_ahead(frames(pause)) for pause in (time.sleep, lambda _: is_over.wait(60)))
+    assert next(slow) == 1
+    ends[0]()
+    assert read == [2]
+    monkeypatch.setattr("lidarpose.recording.predict_recording._MAX_WAIT", 0.01)
+    assert next(endless) == 1
+    ends[1]()
+    assert read == [2]
+    is_over.set()
 
 
 def test_boxes_of_unknown_frames_raise_at_the_end(model):

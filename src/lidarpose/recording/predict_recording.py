@@ -1,5 +1,6 @@
 """`predict_recording`: poses of the people in each frame of a folder or recording, optionally tracked over time."""
 
+import atexit
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -28,6 +29,8 @@ from lidarpose.recording.known_people import KnownPeople
 from lidarpose.skeleton import Skeleton
 
 SCHEMA = "lidarpose.recording/1"
+# s; maximum wait at the end of the program for the frame that is being read
+_MAX_WAIT = 5.0
 _Item = TypeVar("_Item")
 
 
@@ -187,9 +190,17 @@ def _one_ahead(items: Iterator[_Item]) -> Iterator[_Item]:
                 made.put((next(items, None), None))
             except BaseException as error:
                 made.put((None, error))
+        atexit.unregister(end)
 
-    # a daemon, which nobody waits for at the end: the next frame of a running sensor may never come
-    threading.Thread(target=work, daemon=True).start()
+    def end() -> None:
+        requests.put(False)
+        thread.join(_MAX_WAIT)
+
+    # a daemon, since the next frame of a running sensor may never come; but a daemon in native code at the end of the
+    # interpreter aborts the process, so the end waits a moment for it
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    atexit.register(end)
     requests.put(True)
     try:
         while True:
