@@ -186,8 +186,11 @@ def test_unfinished_file_of_other_command_is_not_resumed(drive, folder, monkeypa
     finished = part.read_bytes()
     # an invalid command leaves the unfinished file unchanged and creates no file
     run(drive, "--end", 0.2, "--skeleton", "coco", "--out", out, status=2)
+    run(drive, "--start", 100, "--out", out, status=2)
+    assert "has no frames between start and end" in capsys.readouterr().err
     assert part.read_bytes() == finished
-    run(drive, "--end", 0.2, "--skeleton", "coco", "--out", folder / "wrong.jsonl", status=2)
+    for options in (("--end", 0.2, "--skeleton", "coco"), ("--start", 100)):
+        run(drive, *options, "--out", folder / "wrong.jsonl", status=2)
     assert not list(folder.glob("wrong*"))
     capsys.readouterr()
     assert main(["predict", str(drive), "--end", "0.2", "--max-people", "1", "--out", str(out)]) == 0

@@ -255,6 +255,9 @@ def write_recording(
             tell(f"{part.frames:,} frames are in {part.path}: resuming")
         try:
             _add_frames(source, predictor, part)
+            if not part.frames:
+                # before the lines of another command are cut
+                raise nothing_read(source.name, 0, None)
             if not any(line["error"] is None for line in part.lines()):
                 error = next((line["error"] for line in part.lines()), None)
                 part.remove()
