@@ -181,6 +181,16 @@ def test_mcap_without_index_is_read(tmp_path, has_chunk):
         assert np.array_equal(frame.points, points_of(k))
 
 
+@pytest.mark.parametrize("suffix", [".mcap", ".bag"])
+def test_impossible_position_of_index_is_ignored(tmp_path, suffix):
+    path = write(tmp_path / f"drive{suffix}", clouds(suffix))
+    data = bytearray(path.read_bytes())
+    at = len(data) - 28 if suffix == ".mcap" else data.index(b"index_pos=") + len(b"index_pos=")
+    data[at : at + 8] = b"\xff" * 8
+    path.write_bytes(data)
+    assert len(list(open_source(path))) == 6
+
+
 def test_ros2_folder_includes_all_its_files(tmp_path):
     file = write(tmp_path / "drive.mcap", clouds(".mcap"))
     second = write(tmp_path / "next.mcap", clouds(".mcap", 3))
@@ -524,6 +534,25 @@ def test_damaged_bytes_lose_frames_only(tmp_path, suffix):
             assert "\n" not in str(error)
         else:
             assert all(isinstance(frame, DamagedFrame) or np.isfinite(frame.points).all() for frame in frames)
+
+
+@pytest.mark.parametrize("suffix, compression", [(".mcap", None), (".mcap", "zstd"), (".bag", None), (".bag", "lz4")])
+def test_damaged_first_chunk_loses_only_itself(tmp_path, suffix, compression):
+    """Even if only that chunk names the topic, and if the size of a record in it is damaged."""
+    path = write(tmp_path / f"drive{suffix}", clouds(suffix, 6, 30_000), compression=compression)
+    data = bytearray(path.read_bytes())
+    if suffix == ".mcap":
+        at = data.index(b"zstd") + 12 if compression else data.index(b"[]\x05") + 3
+    else:
+        at = data.index(b"op=\x05") + 100 if compression else data.index(b"op=\x02") - 8
+    data[at : at + 8] = b"\xaa" * 8
+    path.write_bytes(data)
+    source = open_source(path)
+    frames = list(source)
+    assert len(frames) == 3 and source.count == 6
+    for k, frame in enumerate(frames, 3):
+        assert np.array_equal(frame.points, points_of(k, 30_000))
+    assert re.fullmatch(r"drive\w*\.\w+: 1 chunks are left out: one .*", *source.warnings)
 
 
 def test_clouds_with_inconsistent_layout_are_damaged_frames(tmp_path):

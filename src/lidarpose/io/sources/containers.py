@@ -82,17 +82,20 @@ class _Bytes:
     def __init__(self, file: BinaryIO, left: int):
         self.file, self.left = file, left
 
+    def checked(self, size: int) -> int:
+        if not 0 <= size <= self.left:
+            raise FormatError(_CUT_OFF)
+        return size
+
     def take(self, size: int) -> bytes:
-        data = self.file.read(size) if 0 <= size <= self.left else b""
+        data = self.file.read(self.checked(size))
         if len(data) != size:
             raise FormatError(_CUT_OFF)
         self.left -= size
         return data
 
     def skip(self, size: int) -> None:
-        if not 0 <= size <= self.left:
-            raise FormatError(_CUT_OFF)
-        self.file.seek(size, 1)
+        self.file.seek(self.checked(size), 1)
         self.left -= size
 
     def number(self, kind: str) -> int:
@@ -105,7 +108,7 @@ class _Bytes:
 class RecordFile(ABC):
     """A file of records, some of which are chunks of records.
 
-    topics: by name; num_damaged, damage: number of chunks that could not be unpacked since reading last began, and the
+    topics: by name; num_damaged, damage: number of chunks that could not be read since reading last began, and the
     reason.
 
     Raises:
@@ -118,6 +121,8 @@ class RecordFile(ABC):
         self.path = path
         self.topics: dict[str, Topic] = {}
         self.num_damaged, self.damage = 0, ""
+        # names of topics by channel id, kept from the index: the chunk that names them may be damaged
+        self._channels: dict[Any, str] = {}
         # only for MCAP: names of types by schema id
         self._schemas: dict[int, str] = {}
         with open(path, "rb") as file:
@@ -141,6 +146,7 @@ class RecordFile(ABC):
                 self.topics[topic].count += count if kind == "count" else 0
         except (FormatError, struct.error):
             self.topics.clear()
+            self._channels.clear()
         return any(topic.count for topic in self.topics.values())
 
     def messages(self, topics: Collection[str]) -> Iterator[Message]:
@@ -154,31 +160,36 @@ class RecordFile(ABC):
 
     def _by_topic(self, file: BinaryIO, start: int = 0) -> Iterator[tuple]:
         """Messages and counts of `_records` from byte `start` on, with the topic instead of the id. Fills `topics`."""
-        channels: dict[Any, str] = {}
         start = start or len(self.MAGIC)
         size = file.seek(0, 2)
-        file.seek(start)
+        file.seek(min(start, size))
         try:
             for kind, channel, *content in self._records(_Bytes(file, max(size - start, 0))):
                 if kind == "channel":
-                    channels[channel], *types = content
-                    self.topics.setdefault(channels[channel], Topic(*types))
-                elif channel in channels:
-                    yield kind, channels[channel], *content
+                    self._channels[channel], *types = content
+                    self.topics.setdefault(self._channels[channel], Topic(*types))
+                elif channel in self._channels:
+                    yield kind, self._channels[channel], *content
         except (struct.error, IndexError) as error:
             raise FormatError(f"is damaged ({error}): the part before the damage is read") from None
 
-    def _unpacked(self, stream: _Bytes, compression: str, size: int, unpacked_size: int) -> Iterator[tuple]:
-        """The records of a compressed chunk. A chunk that cannot be unpacked is skipped."""
+    def _chunk(self, stream: _Bytes, compression: str, size: int, unpacked_size: int) -> Iterator[tuple]:
+        """The records of a chunk up to a damaged one; none if it cannot be unpacked."""
         is_cut = size > stream.left
-        packed_data = stream.take(min(size, stream.left))
+        size, start = min(size, stream.left), stream.file.tell()
+        chunk = _Bytes(stream.file, size)
         try:
-            check_unpacked(len(packed_data), unpacked_size)
-            content = unpack(packed_data, compression, unpacked_size)
-            yield from self._records(_Bytes(BytesIO(content), len(content)), is_chunk=True)
-        except FormatError as problem:
+            if compression not in ("", "none"):
+                check_unpacked(size, unpacked_size)
+                content = unpack(chunk.take(size), compression, unpacked_size)
+                chunk = _Bytes(BytesIO(content), len(content))
+            yield from self._records(chunk, is_chunk=True)
+        except (FormatError, struct.error, IndexError) as problem:
             if not is_cut:
-                self.num_damaged, self.damage = self.num_damaged + 1, str(problem)
+                reason = str(problem) if isinstance(problem, FormatError) else f"is damaged ({problem})"
+                self.num_damaged, self.damage = self.num_damaged + 1, reason
+        stream.file.seek(start)
+        stream.skip(size)
         if is_cut:
             raise FormatError(_CUT_OFF)
 
@@ -212,9 +223,7 @@ class McapFile(RecordFile):
             if op == self._CHUNK and not is_chunk:
                 *_, unpacked_size, _ = struct.unpack("<QQQI", stream.take(28))
                 compression, size = stream.text(), stream.number("Q")
-                # records of a chunk that is not compressed follow as others do
-                if compression:
-                    yield from self._unpacked(stream, compression, size, unpacked_size)
+                yield from self._chunk(stream, compression, size, unpacked_size)
                 continue
             if op == self._SCHEMA:
                 number = stream.number("H")
@@ -228,7 +237,7 @@ class McapFile(RecordFile):
                     yield "count", channel, count
             elif op == self._MESSAGE:
                 channel, _, time, _ = struct.unpack("<HIQQ", stream.take(22))
-                yield "message", channel, time, size - 22, stream
+                yield "message", channel, time, stream.checked(size - 22), stream
             stream.skip(stream.left - bytes_after)
         if not is_chunk:
             raise FormatError(_CUT_OFF)
@@ -249,11 +258,10 @@ class Ros1File(RecordFile):
             bytes_after = stream.left - size
             op, channel = header.get(b"op", b"\0")[0], header.get(b"conn")
             if op == self._CHUNK and not is_chunk:
-                # records of a chunk that is not compressed follow as others do
                 compression = _text(header.get(b"compression", b"none"))
-                if compression != "none":
-                    unpacked_size = int.from_bytes(header.get(b"size", b""), "little")
-                    yield from self._unpacked(stream, compression, size, unpacked_size)
+                # a killed recorder leaves the size 0 in its last chunk: the records then follow as those of the file
+                unpacked_size = int.from_bytes(header.get(b"size", b""), "little")
+                yield from self._chunk(stream, compression, size, unpacked_size)
                 continue
             if op == self._CONNECTION:
                 type_ = _fields(stream.take(size)).get(b"type", b"no type")
@@ -263,7 +271,7 @@ class Ros1File(RecordFile):
                     yield "count", channel, count
             elif op == self._MESSAGE:
                 seconds, nanoseconds = struct.unpack("<II", header.get(b"time", b"")[:8].ljust(8, b"\0"))
-                yield "message", channel, seconds * 10**9 + nanoseconds, size, stream
+                yield "message", channel, seconds * 10**9 + nanoseconds, stream.checked(size), stream
             stream.skip(stream.left - bytes_after)
 
 
