@@ -121,7 +121,8 @@ def test_poses_of_sensors_apply_if_they_are_used(tmp_path, major):
     np.testing.assert_allclose(frame.points, np.concatenate([there, points]), atol=1e-5)
     assert frame.origin is None and frame.is_origin_unknown
     warning = "1 of 2 sensors have no pose in use, so their points may overlap"
-    assert lidarpose.open_source(tmp_path / "walk.lvx2").warnings == (warning,)
+    source = lidarpose.open_source(tmp_path / "walk.lvx2", topic="/points", meta="a.json")
+    assert source.warnings == (warning, "options that this kind of source does not have are ignored: topic, meta")
 
 
 def test_recordings_of_a_folder_follow_one_another(tmp_path):

@@ -289,6 +289,7 @@ def test_ouster_column_window_expects_only_its_columns(tmp_path):
 def test_open_source_accepts_path_of_metadata(tmp_path):
     path = tmp_path / "walk.pcap"
     beside = [frame.points for frame in ouster(path, [ip for payload in packets_of([0]) for ip in ip4(payload)])]
+    assert open_source(path, topic="/points").warnings[0].endswith("does not have are ignored: topic")
     path.with_suffix(".json").rename(tmp_path / "sensor.json")
     for (named,) in (
         open_source(path, meta=tmp_path / "sensor.json"),

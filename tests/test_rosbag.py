@@ -150,6 +150,7 @@ def test_every_container_format_is_read(tmp_path, suffix, compression):
             assert np.array_equal(frame.points, points_of(k)) and frame.T_world_sensor is None
             assert np.array_equal(frame.origin, np.zeros(3)) and frame.ring is None
     assert [frame.index for frame in source.frames(4)] == [4, 5] and not source.warnings
+    assert open_source(source.name, meta="a.json").warnings[0].endswith("does not have are ignored: meta")
 
 
 @pytest.mark.parametrize("has_chunk", [True, False])

@@ -16,7 +16,7 @@ from lidarpose.geometry import rotation_about
 from lidarpose.inference.background import learn_background, read_background
 from lidarpose.io.sources import DamagedFrame, FrameSource, is_single_scan, kitti, open_source
 from lidarpose.io.sources.folders import in_order
-from lidarpose.io.sources.frame import ChainedRecording, IndexedRecording, Sweep
+from lidarpose.io.sources.frame import ChainedRecording, IndexedRecording, ReadingOptions, Sweep
 
 POINTS = np.arange(1, 13, dtype=np.float32).reshape(4, 3)
 
@@ -479,7 +479,7 @@ def write_sequence(folder, T_world_velo, *, semantic=False):
 
 def test_kitti_sequence_may_be_directly_below_root(monkeypatch):
     monkeypatch.setattr(kitti, "scan_files", lambda folder: ([folder / "000000.bin"], []))
-    assert "poses are not known" in kitti._open_sequence(Path("/data")).warnings[-1]
+    assert "poses are not known" in kitti._open_sequence(Path("/data"), ReadingOptions()).warnings[-1]
 
 
 @pytest.mark.parametrize("semantic", [False, True])
@@ -494,6 +494,13 @@ def test_kitti_sequence_has_times_and_poses_in_first_frame(tmp_path, semantic):
         assert np.allclose(frames[0].T_world_sensor, np.eye(4))
         for frame in frames:
             np.testing.assert_allclose(in_world(frame), frames[0].points, atol=1e-4)
+    for path in (sequence / "velodyne").iterdir():
+        rows = np.fromfile(path, "f4").reshape(-1, 4)
+        np.pad(rows, ((0, 0), (0, 1)), constant_values=np.nan).tofile(path)
+    source = open_source(sequence, columns=5, topic="/points", meta="a.json")
+    for frame, expected in zip(source, frames, strict=True):
+        np.testing.assert_array_equal(frame.points, expected.points)
+    assert source.warnings == ("options that this kind of source does not have are ignored: topic, meta",)
     (sequence / "calib.txt").write_text("Tr: 1 2 3\n")
     source = open_source(sequence)
     assert source.count == 5 and "poses are not known" in source.warnings[0]

@@ -149,7 +149,7 @@ def _open_folder(folder: Path, options: ReadingOptions) -> Recording:
     # rosbag2 writes metadata.yaml
     if any(path.name == "metadata.yaml" for path in list_folder(folder)):
         return _open_recording(folder, options, "rosbag")
-    dataset = open_kitti(folder) or open_nuscenes(folder, options)
+    dataset = open_kitti(folder, options) or open_nuscenes(folder, options)
     if dataset is not None:
         return dataset
     files, warnings = scan_files(folder, RECORDINGS)

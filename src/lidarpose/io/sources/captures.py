@@ -29,8 +29,14 @@ def open_recording(path: Path, options: ReadingOptions) -> PacketRecording:
         InputError: The file is not a capture, is of another sensor, or is of an Ouster sensor without metadata.
         MissingExtra: The capture is of a Velodyne sensor, and the library that decodes it is not installed.
     """
-    if options.meta is not None:
-        return OusterRecording(path, options.meta)
+    recording = _open(path, options.meta)
+    recording.notes += options.ignored("topic")
+    return recording
+
+
+def _open(path: Path, meta: Path | None) -> PacketRecording:
+    if meta is not None:
+        return OusterRecording(path, meta)
     metadata_paths = (path.with_suffix(".json"), path.with_name(f"{path.stem}_0.json"))
     metadata = next((file for file in metadata_paths if file.exists()), None)
     if metadata is None:

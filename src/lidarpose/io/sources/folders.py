@@ -88,8 +88,7 @@ def open_files(name: str, paths: Sequence[Path], options: ReadingOptions) -> Ind
     paths, times = in_order(paths)
     suffixes = sorted({path.suffix.lower() for path in paths})
     warnings = [f"mixes {', '.join(suffixes)} files: one sensor is assumed"] if len(suffixes) > 1 else []
-    if options.topic is not None or options.meta is not None:
-        warnings.append("topic and meta are for recordings: they are ignored for point files")
+    warnings += options.ignored("topic", "meta")
     columns = options.columns
     if columns is None and ".bin" in suffixes:
         columns, notes = _columns_of([path for path in paths if path.suffix.lower() == ".bin"])

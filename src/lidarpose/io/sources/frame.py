@@ -107,6 +107,11 @@ class ReadingOptions:
     meta: Path | None = None
     name_times: bool = True
 
+    def ignored(self, *names: str) -> list[str]:
+        """A warning if options of these names are given, for a format that has no use for them."""
+        given = [name for name in names if getattr(self, name) is not None]
+        return [f"options that this kind of source does not have are ignored: {', '.join(given)}"] if given else []
+
 
 @dataclass(frozen=True, eq=False)
 class LazyFrame:

@@ -15,13 +15,13 @@ from lidarpose.geometry import inverse_transform, is_rotation, rigid_transform, 
 from lidarpose.io.files import read_bytes
 from lidarpose.io.point_cloud import KITTI_FIELDS, read_points
 from lidarpose.io.sources.folders import scan_files
-from lidarpose.io.sources.frame import IndexedRecording, Sweep
+from lidarpose.io.sources.frame import IndexedRecording, ReadingOptions, Sweep
 
 # m; the Earth's radius in the development kit of the raw data
 _EARTH_RADIUS = 6378137.0
 
 
-def open_kitti(folder: Path) -> IndexedRecording | None:
+def open_kitti(folder: Path, options: ReadingOptions) -> IndexedRecording | None:
     """Opens a raw drive or an odometry sequence, or the folder of scans in one; None for any other folder.
 
     The world's z axis points up. For a drive, the axes are east, north and up from its start; for a sequence, the
@@ -31,15 +31,15 @@ def open_kitti(folder: Path) -> IndexedRecording | None:
     for drive in (folder, *folder.parents[:2]):
         scans = drive / "velodyne_points" / "data"
         if scans in (folder, folder / "velodyne_points" / "data", folder / "data") and scans.is_dir():
-            return _open_drive(drive)
+            return _open_drive(drive, options)
     for sequence in (folder, folder.parent):
         if sequence / "velodyne" in (folder, folder / "velodyne") and (sequence / "velodyne").is_dir():
             if any((sequence / name).is_file() for name in ("calib.txt", "times.txt", "poses.txt")):
-                return _open_sequence(sequence)
+                return _open_sequence(sequence, options)
     return None
 
 
-def _open_drive(drive: Path) -> IndexedRecording:
+def _open_drive(drive: Path, options: ReadingOptions) -> IndexedRecording:
     files, notes = scan_files(drive / "velodyne_points" / "data")
     rows = _numbers(files)
     stamps = _timestamps(drive / "velodyne_points" / "timestamps.txt")
@@ -53,10 +53,14 @@ def _open_drive(drive: Path) -> IndexedRecording:
     if poses is None or not poses.is_there:
         poses = None
         notes.append("the sensor's poses are not known: oxts or calib_imu_to_velo.txt is missing or damaged")
-    return _recording(drive, files, times, notes, lambda i: None if poses is None else poses.T_world_velo(rows[i]))
+
+    def T_world_velo(i: int) -> np.ndarray | None:
+        return None if poses is None else poses.T_world_velo(rows[i])
+
+    return _recording(drive, files, times, notes, T_world_velo, options)
 
 
-def _open_sequence(sequence: Path) -> IndexedRecording:
+def _open_sequence(sequence: Path, options: ReadingOptions) -> IndexedRecording:
     files, notes = scan_files(sequence / "velodyne")
     rows = _numbers(files)
     stamps = _table(sequence / "times.txt", 1)
@@ -66,7 +70,7 @@ def _open_sequence(sequence: Path) -> IndexedRecording:
     row = _calibration(sequence / "calib.txt").get("Tr", np.zeros(0))
     if poses is None or len(row) != 12:
         notes.append("the sensor's poses are not known: poses.txt, or Tr of calib.txt, is missing or damaged")
-        return _recording(sequence, files, times, notes, lambda i: None)
+        return _recording(sequence, files, times, notes, lambda i: None, options)
     T_cam_velo = _transform(row)
 
     def T_world_velo(i: int) -> np.ndarray | None:
@@ -74,12 +78,16 @@ def _open_sequence(sequence: Path) -> IndexedRecording:
             return None
         return inverse_transform(T_cam_velo) @ _transform(poses[rows[i]]) @ T_cam_velo
 
-    return _recording(sequence, files, times, notes, T_world_velo)
+    return _recording(sequence, files, times, notes, T_world_velo, options)
 
 
-def _recording(folder: Path, files: Sequence[Path], times, notes: list[str], T_world_velo) -> IndexedRecording:
+def _recording(
+    folder: Path, files: Sequence[Path], times, notes: list[str], T_world_velo, options: ReadingOptions
+) -> IndexedRecording:
+    notes += options.ignored("topic", "meta")
+
     def read(i: int) -> Sweep:
-        cloud = read_points(files[i], columns=len(KITTI_FIELDS))
+        cloud = read_points(files[i], columns=options.columns or len(KITTI_FIELDS))
         pose = T_world_velo(i)
         pose = pose if pose is not None and np.isfinite(pose).all() and is_rotation(pose[:3, :3]) else None
         lines = cloud.warnings if pose is not None else (*cloud.warnings, "the sensor's pose is not known")

@@ -90,9 +90,11 @@ def open_recording(path: Path, options: ReadingOptions) -> IndexedRecording:
     """
     try:
         with open(path, "rb") as file:
-            return _open(path, file)
+            recording = _open(path, file)
     except OSError as error:
         raise unreadable(path, error) from None
+    recording.warnings += options.ignored("topic", "meta")
+    return recording
 
 
 def _open(path: Path, file: BinaryIO) -> IndexedRecording:

@@ -48,6 +48,7 @@ def open_nuscenes(folder: Path, options: ReadingOptions) -> IndexedRecording | N
         raise file_error(root, f"holds none of the {len(sweeps)} sweeps in {versions[0].name}: unpack its files there")
     num_missing = len(sweeps) - len(present_sweeps)
     notes = [f"{num_missing} of {len(sweeps)} sweeps in its tables are not on the disk"] if num_missing else []
+    notes += options.ignored("meta")
 
     def read(i: int) -> Sweep:
         if present_sweeps[i]["T_world_sensor"] is None:

@@ -144,6 +144,8 @@ class PacketRecording(ABC):
         path: the capture.
         packet_bytes: the size of the sensor's packets; by default those of the first flow with this size are read.
         datagrams: the packets if `path` is another recording.
+
+    notes: warnings about how it was opened.
     """
 
     count = None
@@ -154,6 +156,7 @@ class PacketRecording(ABC):
         self.packet_bytes = packet_bytes
         self.flow: tuple[bytes, int] | None = None
         self.num_other = 0
+        self.notes: list[str] = []
         self._damage: InputError | None = None
 
     @abstractmethod
@@ -180,7 +183,7 @@ class PacketRecording(ABC):
             "packets are captured only in part and are left out": self.capture.num_cut,
             "lidar packets of another sensor are left out": self.num_other,
         }
-        return [f"{count} {problem}" for problem, count in counts.items() if count]
+        return self.notes + [f"{count} {problem}" for problem, count in counts.items() if count]
 
     def lazy_frames(self, first: int = 0) -> Iterator[LazyFrame]:
         for index, (time, decode) in enumerate(self.sweeps()):

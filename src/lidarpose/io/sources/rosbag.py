@@ -74,7 +74,7 @@ def open_parts(name: str, files: list[Path], options: ReadingOptions) -> Recordi
     """Opens consecutive files of one recording. Raises the same errors as `open_recording`."""
     decoders()
     opened_files = [_open_file(file) for file in files]
-    return ouster_bag.open_packets(name, opened_files, options) or BagRecording(name, opened_files, options.topic)
+    return ouster_bag.open_packets(name, opened_files, options) or BagRecording(name, opened_files, options)
 
 
 def _open_file(path: Path) -> RecordFile | SqliteFile:
@@ -91,19 +91,19 @@ class BagRecording:
 
     Args:
         files: the files of the recording, in order.
-        topic: None for the topic with most clouds.
+        options: without a topic, the one with most clouds is read.
     """
 
-    def __init__(self, name: str, files: list[RecordFile | SqliteFile], topic: str | None):
+    def __init__(self, name: str, files: list[RecordFile | SqliteFile], options: ReadingOptions):
         self.name = name
         self.files = files
         topics: dict[str, Topic] = {}
         for file in files:
             for key, entry in file.topics.items():
                 topics.setdefault(key, Topic(entry.type, entry.encoding)).count += entry.count
-        self._notes: list[str] = []
+        self._notes = options.ignored("meta")
         self.topics = topics
-        self.topic = self._choose(topic)
+        self.topic = self._choose(options.topic)
         self._transforms = {
             key for key, entry in topics.items() if entry.type in TRANSFORM_TYPES and entry.encoding in decoders()
         }
