@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hostile_files import KITTI, npy, refusal
+from hostile_files import KITTI, npy, npy_header, refusal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -189,8 +189,9 @@ def test_read_boxes_converts_kitti_labels_to_lidar_frame(tmp_path, tracking):
     ):
         calib.write_text(text)
         refusal(read_boxes, label, words=[f"{calib}: ", *words])
-    label.write_text("\n".join(lines[:2]))
-    assert read_boxes(label, calib=tmp_path / "none.txt") == []
+    for empty in ("\n".join(lines[:2]), "", " \n"):
+        label.write_text(empty)
+        assert read_boxes(label, calib=tmp_path / "none.txt") == []
 
 
 def test_kitti_label_in_root_folder_has_no_calibration(monkeypatch):
@@ -274,6 +275,7 @@ def test_read_boxes_rejects_bad_structure(case):
         (npy(np.zeros((2, 8))), ["people[0]", "[x, y, z, l, w, h, yaw]"]),
         (npy(np.zeros((2, 7))), ["people[0].size", "positive"]),
         (npy(np.zeros((2, 7)))[:-1], ["cut off"]),
+        (npy_header((2**70, 0)), ["an array (n, 3+), got the shape"]),
         (b'{"people": "\xe4"}', ["UTF-8"]),
         (b"[" * 100_000, ["JSON"]),
         (b"[" + b"9" * 5000 + b"]", ["JSON"]),

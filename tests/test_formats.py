@@ -153,6 +153,15 @@ def test_read_laz_of_chunks_of_different_sizes(folder, sizes):
         refusal(read, folder, "a.laz", damaged, words=["damaged or cut off"])
 
 
+@pytest.mark.parametrize("place, number", [(-2, 0), (2, 0), (2, 21)])
+def test_read_laz_checks_items_before_unpacking(folder, capfd, place, number):
+    """lazrs prints a panic for points of impossible items."""
+    content = las(packed=True)
+    items = content.index(b"laszip encoded") - 2 + 54 + 34
+    refusal(read, folder, "a.laz", with_bytes(content, items + place, struct.pack("<H", number)), words=["damaged"])
+    assert capfd.readouterr().err == ""
+
+
 def test_read_laz_needs_extra_and_las_does_not(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "lazrs", None)
     same(read(folder, "a.las", las()))
@@ -630,6 +639,9 @@ BAD = {
     "npy header cut off": ("a.npy", npy(POINTS)[:20], ["header"]),
     "npy of 10^12": ("a.npy", npy_header((HUGE, 3)), ["cut off"]),
     "npy of 10^40": ("a.npy", npy_header((10**40, 3)), ["cut off"]),
+    "npy of huge empty rows": ("a.npy", npy_header((2**70, 0)), ["the shape (1180591620717411303424, 0)"]),
+    "npy of many dimensions": ("a.npy", npy_header((1,) * 99) + ROWS, ["the shape (1, 1, "]),
+    "npy of a logical shape": ("a.npy", npy_header((True, 3)) + ROWS, ["the shape (True, 3)"]),
     "npy negative": ("a.npy", npy_header((-1, 3)) + ROWS, ["(-1, 3)"]),
     "npy flat": ("a.npy", npy(POINTS.ravel()), ["(12,)", "(n, 3+)"]),
     "npy two columns": ("a.npy", npy(np.ones((9, 2))), ["(9, 2)", "save x, y and z"]),

@@ -193,7 +193,11 @@ def _entries(content: object) -> list | tuple:
 
 
 def _load_file(path: str | os.PathLike, calib: str | os.PathLike | None) -> object:
-    data = read_bytes(path, expected="a file of boxes")
+    # KITTI's label of a scan without objects is empty
+    is_label = str(path).lower().endswith(".txt")
+    data = read_bytes(path, expected="a file of boxes", may_be_empty=is_label)
+    if is_label and not data.strip():
+        return []
     if data.startswith(b"\x93NUMPY"):
         return load_array(data)
     try:

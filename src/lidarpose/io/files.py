@@ -84,12 +84,13 @@ def content_digest(path: str | os.PathLike, *, expected: str) -> str:
     return hashlib.sha256(read_bytes(path, expected=expected)).hexdigest()
 
 
-def read_bytes(path: str | os.PathLike, *, expected: str, most: int | None = None) -> bytes:
-    """The content of a regular, non-empty file of at most `most` bytes.
+def read_bytes(path: str | os.PathLike, *, expected: str, most: int | None = None, may_be_empty: bool = False) -> bytes:
+    """The content of a regular file of at most `most` bytes.
 
     `expected` describes the file in error messages ("a JSON file", ...).
 
-    Raises InputError for a missing, empty, too large or unreadable file, a folder, a device or a pipe.
+    Raises InputError for a missing, empty (unless `may_be_empty`), too large or unreadable file, a folder, a device or
+    a pipe.
     """
     try:
         # os.fspath rejects numbers, which stat and open would take for open file descriptors
@@ -115,7 +116,7 @@ def read_bytes(path: str | os.PathLike, *, expected: str, most: int | None = Non
         raise file_error(path, "does not fit in memory; split it first") from None
     except (TypeError, ValueError) as error:
         raise file_error(reprlib.repr(path), f"expected the path of {expected} ({error})") from None
-    if not data:
+    if not data and not may_be_empty:
         raise file_error(path, f"is empty; expected {expected}: was it copied completely?")
     return data
 

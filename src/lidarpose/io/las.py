@@ -84,6 +84,10 @@ def _unpack(data: bytes, start: int, size: int, num_points: int) -> bytes:
             points = bytearray(num_points * size)
             try:
                 record_data = data[offset - length : offset]
+                # type, size and version of each item of a point; lazrs prints a panic if they are not those of a point
+                num_items = struct.unpack_from("<H", record_data, 32)[0]
+                if sum(struct.unpack_from(f"<{3 * num_items}H", record_data, 34)[1::3]) != size:
+                    raise ValueError("items of another size than the points")
                 stream: io.IOBase = _Unseekable(data[start:])
                 if record_data[12:16] == _VARIABLE:
                     # as in COPC: without the chunk table the chunks' numbers of points are unknown

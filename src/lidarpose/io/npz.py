@@ -111,4 +111,8 @@ def load_array(data: bytes) -> np.ndarray:
     if any(n < 0 for n in shape) or not dtype.itemsize:
         raise FormatError("an array (n, 3+)", f"the shape {shape}", "save it again")
     check_bytes(data, file.tell(), math.prod(shape) * dtype.itemsize, shape[0] if shape else 1)
-    return np.ndarray(shape, dtype, data, file.tell(), order=order)
+    try:
+        return np.ndarray(shape, dtype, data, file.tell(), order=order)
+    # too many dimensions, or an array of 0 values with a dimension that is too large or not an integer
+    except (ValueError, TypeError, OverflowError):
+        raise FormatError("an array (n, 3+)", f"the shape {shorten(str(shape))}", "save it again") from None
