@@ -63,6 +63,8 @@ LINKS = {
     "vlan": (1, lambda ip: MACS + b"\x88\xa8\0\x05\x81\0\0\x07\x08\0" + ip),
     "linux": (113, lambda ip: bytes(14) + b"\x08\0" + ip),
     "linux 2": (276, lambda ip: b"\x08\0" + bytes(18) + ip),
+    "linux vlan": (113, lambda ip: bytes(14) + b"\x81\0\0\x07\x08\0" + ip),
+    "linux 2 vlan": (276, lambda ip: b"\x81\0" + bytes(18) + b"\0\x07\x08\0" + ip),
     "raw": (101, lambda ip: ip),
     "loopback": (0, lambda ip: b"\x02\0\0\0" + ip),
 }
@@ -82,10 +84,10 @@ def write(path, ips, *, link="ethernet", order="<", nano=False, period=10**6):
     return path
 
 
-def write_ng(path, ips, order="<", resolution=9, frequency=10**9):
+def write_ng(path, ips, order="<", resolution=9, frequency=10**9, offset=0):
     """pcapng with two interfaces and a block of unknown type.
 
-    resolution: of the second interface's times, as its option states it; frequency: 1/s.
+    resolution: of the second interface's times, as its option states it; frequency: 1/s; offset: s, of its times.
     """
 
     def block(kind, body):
@@ -94,11 +96,11 @@ def write_ng(path, ips, order="<", resolution=9, frequency=10**9):
 
     data = block(0x0A0D0D0A, struct.pack(order + "IHHq", 0x1A2B3C4D, 1, 0, -1))
     data += block(1, struct.pack(order + "HHI", 1, 0, 0)) + block(0xBAD, b"what is this")
-    options = struct.pack(order + "HH4sHHB3sHH", 1, 3, b"abc\0", 9, 1, resolution, b"", 0, 0)
+    options = struct.pack(order + "HH4sHHB3sHHqHH", 1, 3, b"abc\0", 9, 1, resolution, b"", 14, 8, offset, 0, 0)
     data += block(1, struct.pack(order + "HHI", 101, 0, 0) + options)
     for k, ip in enumerate(ips):
         frame = LINKS["ethernet"][1](ip) if k % 2 == 0 else ip
-        ticks = (1000 + k) * (10**6 if k % 2 == 0 else frequency)
+        ticks = (1000 + k) * 10**6 if k % 2 == 0 else (1000 + k - offset) * frequency
         head = struct.pack(order + "5I", k % 2, ticks >> 32, ticks & 0xFFFFFFFF, len(frame), len(frame))
         data += block(6, head + frame)
     path.write_bytes(data)
@@ -132,10 +134,12 @@ def test_capture_reads_pcapng_and_ipv6(tmp_path, order):
         assert [datagram.payload for datagram in datagrams] == payloads and datagrams[0].time < datagrams[1].time < 1010
 
 
-@pytest.mark.parametrize(("resolution", "frequency"), [(9, 10**9), (3, 1000), (0x80 | 20, 2**20)])
-def test_pcapng_time_resolution(tmp_path, resolution, frequency):
+@pytest.mark.parametrize(
+    ("resolution", "frequency", "offset"), [(9, 10**9, 0), (3, 1000, 900), (0x80 | 20, 2**20, -(10**6))]
+)
+def test_pcapng_time_resolution_and_offset(tmp_path, resolution, frequency, offset):
     ips = [ip4(bytes([k]))[0] for k in range(4)]
-    path = write_ng(tmp_path / "a.pcapng", ips, resolution=resolution, frequency=frequency)
+    path = write_ng(tmp_path / "a.pcapng", ips, resolution=resolution, frequency=frequency, offset=offset)
     assert [datagram.time for datagram in Capture(path)] == [1000, 1001, 1002, 1003]
 
 

@@ -198,9 +198,16 @@ def test_open_source_accepts_patterns_lists_and_recursion(tmp_path, monkeypatch)
     assert ids(open_source("day/**/*.npy")) == [str(Path(p)) for p in ("a/f_2.npy", "a/f_10.npy", "b/f_2.npy")]
     # folders match, too, and their files are not read twice
     assert ids(open_source("day/**")) == ids(open_source("day/**/*.npy"))
+    # results are read only if a pattern matches nothing else
+    Path("day/a/f.poses.csv").write_text("1,2,3\n")
+    assert ids(open_source("day/a/*")) == ["f_2", "f_10"] and ids(open_source("day/a/*.csv")) == ["f.poses"]
     folders = open_source(["day/b", "day/a"])
     assert ids(folders) == ["a/f_2", "a/f_10", "b/f_2"]
     assert folders.count == 3 and [frame.index for frame in folders.frames(2)] == [2]
+    if os.name == "posix":
+        Path("day/b/f_3.npy").symlink_to("gone.npy")
+        frame, damaged = open_source("day/b/*.npy")
+        assert "f_3.npy: no such file" in damaged.error
 
 
 def test_is_single_scan_for_one_plain_file(tmp_path):
@@ -214,6 +221,11 @@ def test_is_single_scan_for_one_plain_file(tmp_path):
     assert frame.id == "b[1]" and source.warnings == ()
 
 
+def piped(folder):
+    os.mkfifo(folder / "a.mcap")
+    return folder / "a.mcap"
+
+
 @pytest.mark.parametrize(
     "make, words",
     {
@@ -225,6 +237,7 @@ def test_is_single_scan_for_one_plain_file(tmp_path):
             lambda folder: (folder / "a.png").touch() or (folder / "b").mkdir() or folder,
             ["1 .png", "1 folders (b; give one of them)"],
         ),
+        **({"pipe": (piped, ["a.mcap: expected a file or folder, got a pipe"])} if hasattr(os, "mkfifo") else {}),
         "hidden": (lambda folder: (folder / ".a.pcd").touch() or folder, ["an empty folder"]),
     }.values(),
 )

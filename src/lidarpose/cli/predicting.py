@@ -137,7 +137,11 @@ def output_paths(
     base_path = result or Path(f"{name}.poses.json")
     picture = base_path.with_suffix(".png") if options.picture else None
     page = base_path.with_suffix(".html") if options.html else None
-    sources = [path for source in options.source for path in (glob.glob(source) or [source])]
+    sources: list[str] = []
+    for source in options.source:
+        matches = glob.glob(source) or [source]
+        # a pattern leaves out results, as a folder does
+        sources += [path for path in matches if not is_result(Path(path))] or matches
     # for a folder, its point files are inputs, but not the results that an earlier command wrote there
     files = [file for path in sources if os.path.isdir(path) for file in list_folder(Path(path))]
     files = [file for file in files if file.suffix.lower() in SUFFIXES and not is_result(file)]

@@ -15,7 +15,7 @@ from pathlib import Path
 from lidarpose.errors import InputError, check_int
 from lidarpose.io.files import file_error, listed
 from lidarpose.io.point_cloud import RECORDINGS, SUFFIXES
-from lidarpose.io.sources.folders import list_folder, natural_key, open_files, scan_files
+from lidarpose.io.sources.folders import is_result, list_folder, natural_key, open_files, scan_files
 from lidarpose.io.sources.frame import (
     ChainedRecording,
     DamagedFrame,
@@ -103,8 +103,9 @@ def _matches(path: str | os.PathLike) -> list[Path]:
         return [Path(path)]
     pattern = os.fspath(path)
     paths = sorted(map(Path, glob.glob(pattern, recursive=True)), key=natural_key)
-    # as in a folder, files of other formats, such as labels, are left out
-    paths = [p for p in paths if p.is_dir() or p.suffix.lower() in (*SUFFIXES, *RECORDINGS)] or paths
+    # as in a folder, results and files of other formats, such as labels, are left out
+    is_read = {p: p.suffix.lower() in (*SUFFIXES, *RECORDINGS) and not is_result(p) for p in paths}
+    paths = [p for p in paths if p.is_dir() or is_read[p]] or paths
     # a/** matches folders and the files in them, which would be read twice
     read_folders = {folder for p in paths if not p.is_dir() for folder in p.parents}
     paths = [p for p in paths if p not in read_folders]
@@ -116,7 +117,10 @@ def _matches(path: str | os.PathLike) -> list[Path]:
 
 def _open_all(name: str, paths: Sequence[Path], options: ReadingOptions) -> Recording:
     """Opens all point files together as one recording, and every other path as a recording of its own."""
-    files = [path for path in paths if path.is_file() and path.suffix.lower() not in RECORDINGS]
+    for path in paths:
+        if path.is_fifo():
+            raise file_error(path, "expected a file or folder, got a pipe; save it as a file first")
+    files = [path for path in paths if not path.is_dir() and path.suffix.lower() not in RECORDINGS]
     parts: list[Recording] = [open_files(name, files, options)] if files else []
     problems: list[InputError] = []
     recordings = sorted(set(paths) - set(files), key=natural_key)

@@ -223,8 +223,8 @@ def _read_pcap(file: BinaryIO) -> Iterator[tuple[float, int, bytes]]:
 
 def _read_pcapng(file: BinaryIO) -> Iterator[tuple[float, int, bytes]]:
     order = "<"
-    # link type and ticks per second of each interface
-    interfaces: list[tuple[int, float]] = []
+    # link type, ticks per second and offset, s, of each interface
+    interfaces: list[tuple[int, float, int]] = []
     while file.peek(1):  # type: ignore[attr-defined]
         kind = _take(file, 4)
         if kind == _PCAPNG:
@@ -241,27 +241,29 @@ def _read_pcapng(file: BinaryIO) -> Iterator[tuple[float, int, bytes]]:
         body = _take(file, size - 8)[:-4]
         if number == 1 and len(body) >= 8:
             link = struct.unpack_from(order + "H", body)[0]
-            interfaces.append((link, _ticks(body[8:], order)))
+            interfaces.append((link, *_clock(body[8:], order)))
         elif number == 6 and len(body) >= 20:
             interface, high, low, size, _ = struct.unpack_from(order + "5I", body)
             if interface < len(interfaces):
-                link, ticks = interfaces[interface]
+                link, ticks, offset = interfaces[interface]
                 if link in _LINKS:
-                    yield (high * 2**32 + low) / ticks, link, body[20 : 20 + size]
-                elif not any(other in _LINKS for other, _ in interfaces):
+                    yield offset + (high * 2**32 + low) / ticks, link, body[20 : 20 + size]
+                elif not any(other in _LINKS for other, *_ in interfaces):
                     _check_link(link)
 
 
-def _ticks(options: bytes, order: str) -> float:
-    """Ticks per second of an interface, from its options."""
-    offset = 0
-    while offset + 5 <= len(options):
-        code, size = struct.unpack_from(order + "HH", options, offset)
+def _clock(options: bytes, order: str) -> tuple[float, int]:
+    """Ticks per second and offset, s, of an interface's times, from its options."""
+    ticks, seconds, position = 1e6, 0, 0
+    while position + 5 <= len(options):
+        code, size = struct.unpack_from(order + "HH", options, position)
         if code == 9:
-            value = options[offset + 4]
-            return 2.0 ** (value & 127) if value & 128 else 10.0**value
-        offset += 4 + (size + 3) // 4 * 4
-    return 1e6
+            value = options[position + 4]
+            ticks = 2.0 ** (value & 127) if value & 128 else 10.0**value
+        elif code == 14 and position + 12 <= len(options):
+            (seconds,) = struct.unpack_from(order + "q", options, position + 4)
+        position += 4 + (size + 3) // 4 * 4
+    return ticks, seconds
 
 
 def _check_link(link: int) -> None:
@@ -277,7 +279,7 @@ def _ip_packet(packet: bytes, link: int) -> memoryview:
     view = memoryview(packet)
     if type_offset is not None:
         kind = int.from_bytes(view[type_offset : type_offset + 2])
-        while link == _ETHERNET and kind in _VLAN:
+        while kind in _VLAN:
             kind = int.from_bytes(view[start + 2 : start + 4])
             start += 4
         if kind not in _IP:
