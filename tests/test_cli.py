@@ -461,6 +461,7 @@ BAD_COMMANDS = {
     "import into another kind": ("import DAPT DIR/x.onnx", "give a name that ends in .safetensors"),
     "import without an out": ("import DAPT", "OUT"),
     "a calibration of no boxes": ("predict CROP --calib DIR/c.txt", "calib is for boxes"),
+    "a calibration of no file": ("predict CROP --boxes BOXES --calib DIR/c.txt", "no such file; expected KITTI's"),
     "weights that pose nobody": (
         f"predict CROP --weights {weights_file('verifier.onnx')}",
         "contains a detection network",

@@ -507,16 +507,16 @@ def test_hidden_people_are_filled_in(clouds, folder, model, monkeypatch):
 
 
 @pytest.mark.parametrize("names", [("a", "b"), (0, 1)])
-@pytest.mark.parametrize("form", ["folder", "list", "lines"])
+@pytest.mark.parametrize("form", ["boxes", "poses", "list", "lines"])
 def test_frame_boxes_match_frames_by_name_or_number(form, names, tmp_path):
     people = [{"center": [1, 2, 3], "size": [1, 1, 2]}]
     entries = [{"frame": names[0], "people": []}, {"frame": names[1], "people": people}]
     path = tmp_path / "boxes.json"
-    if form == "folder":
+    if form in ("boxes", "poses"):
         path = tmp_path / "boxes"
         path.mkdir()
         (path / f"{names[0]}.json").write_text(json.dumps({"people": []}))
-        (path / f"{names[1]}.boxes.json").write_text(json.dumps({"people": people}))
+        (path / f"{names[1]}.{form}.json").write_text(json.dumps({"people": people}))
     else:
         path.write_text("\n".join(map(json.dumps, entries)) if form == "lines" else json.dumps(entries))
     boxes = FrameBoxes(path)
@@ -624,9 +624,9 @@ def test_folder_without_readable_scans_is_an_error(tmp_path, capsys):
 def test_joint_tables_are_not_scans_and_unknown_world_warns(clouds, tmp_path, capsys):
     for k in range(2):
         np.savetxt(tmp_path / f"{k}.csv", clouds[k], fmt="%.3f", delimiter=",")
-    words = ["predict", str(tmp_path), "--world", "--format", "csv", "--out"]
-    for _ in range(2):
-        assert main([*words, str(tmp_path)]) == 0
+    words = ["--world", "--format", "csv", "--out", str(tmp_path)]
+    for source in (tmp_path, tmp_path / "*.csv"):
+        assert main(["predict", str(source), *words]) == 0
         output = capsys.readouterr()
         assert "2 frames, 4 poses" in output.out + output.err
         assert "the sensor's pose in the world is unknown in 2 of 2 frames" in output.err

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from lidarpose.inference.results import Poses
 from lidarpose.inference.scan import Scan, pose_scan, read_scan
 from lidarpose.inference.single_scan import search_alone
 from lidarpose.io.boxes import Boxes, read_boxes
+from lidarpose.io.files import read_bytes
 from lidarpose.models import BUNDLED, DEFAULT
 from lidarpose.sample import Box
 from lidarpose.skeleton import Skeleton
@@ -210,11 +211,14 @@ def check_up(boxes: Boxes, up: str | Sequence[float], *, most: float = _SAME_UP)
         raise InputError(f"the up axis of the boxes is {boxes.up}, not {up_text(up)}: give --up {boxes.up}")
 
 
-def check_choice(boxes: object, crop: bool, searched: bool, calib: object, *, find: bool | None = None) -> None:
+def check_choice(boxes: object, crop: bool, searched: bool, calib: Any, *, find: bool | None = None) -> None:
     """Raises InputError if more than one of boxes, crop and search is given, a calibration without boxes, or options of
     the search with find=False."""
     if calib is not None and boxes is None:
         raise InputError("calib is for boxes from a KITTI label: expected boxes too, got none: give the label")
+    if calib is not None:
+        # also if the boxes do not need it
+        read_bytes(calib, expected="KITTI's calibration")
     if boxes is not None and crop:
         raise InputError("expected boxes or a crop, got both: a crop contains one person, so omit the boxes")
     if searched and (boxes is not None or crop):

@@ -24,10 +24,11 @@ class FrameBoxes:
     """The boxes of the people in a recording, by frame.
 
     Args:
-        given: a folder of files named like the frames (`ID.json`, `ID.npy`, KITTI's `ID.txt`, or `ID.boxes.json`, as
-            `lidarpose detect` names them), or all by the frames' numbers; or a file of JSON lines or a JSON list of
-            `{"frame": 0, "people": [...]}`, where the frame is its number (an integer) or its id (text); or a mapping
-            from frame numbers or ids to anything that `read_boxes` takes. Ids that are integers are compared by value.
+        given: a folder of files named like the frames (`ID.json`, `ID.npy`, KITTI's `ID.txt`, or `ID.boxes.json` and
+            `ID.poses.json`, as `lidarpose detect` and `predict` name them), or all by the frames' numbers; or a file of
+            JSON lines or a JSON list of `{"frame": 0, "people": [...]}`, where the frame is its number (an integer) or
+            its id (text); or a mapping from frame numbers or ids to anything that `read_boxes` takes. Ids that are
+            integers are compared by value.
         calib: KITTI calibration, see `read_boxes`.
 
     Raises:
@@ -51,7 +52,7 @@ class FrameBoxes:
         elif os.path.isdir(given):
             for path in list_folder(Path(given)):
                 if path.suffix.lower() in _SUFFIXES:
-                    self._by_frame[path.stem.removesuffix(".boxes")] = path
+                    self._by_frame[path.stem.removesuffix(".boxes").removesuffix(".poses")] = path
         else:
             self._by_frame = _by_frame(given)
         if not self._by_frame:
