@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import os
 import shutil
 from collections import Counter
 from dataclasses import replace
@@ -117,6 +118,11 @@ def sets(tmp_path_factory):
 def evaluated(sets, name, model=None, *, split=None, limit=None, **options):
     dataset = open_eval_dataset(sets / name, split=split, limit=limit)
     return evaluate_dataset(eval_setup(model or Fake(standing), dataset, **options))
+
+
+def test_undecodable_folder_name_is_escaped(sets, tmp_path):
+    folder = shutil.copytree(sets / "lidarhuman26m", tmp_path / os.fsdecode(b"\xff"))
+    assert open_eval_dataset(folder).name == "\\udcff"
 
 
 # ---- inputs of the network

@@ -1,9 +1,11 @@
 """Parquet shards: round trips, reading with pandas, and errors for damaged files."""
 
 import json
+import os
 import sys
 from contextlib import contextmanager
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -19,6 +21,7 @@ from lidarpose.data.rows import TABLES, person_row
 from lidarpose.data.shards import open_dataset, read_rows
 from lidarpose.data.writer import check_settings, open_folder
 from lidarpose.errors import InputError, MissingExtra
+from lidarpose.recording.result_files import write_result
 from lidarpose.sample import PersonInfo
 from lidarpose.skeleton import BODY26
 
@@ -61,6 +64,17 @@ def test_samples_survive_round_trip(folder, people):
     assert [row["index"] for row in rows] == [0, 1, 2, 3] and rows[0]["distance"] is None
     assert (samples[2].info.kind, samples[2].distance, samples[2].info.upright) == ("walk", 7.5, True)
     refused(lambda: list(dataset.samples("test")), "has synthetic people, which have no split 'test'")
+
+
+@pytest.mark.parametrize("name", ["run:1", os.fsdecode(b"\xff")])
+def test_folder_name_may_hold_a_colon_or_undecodable_bytes(folder, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    path = Path(name, "a.parquet")
+    write_shard(path, "people", open_dataset(folder).rows())
+    assert shards.rows_of_shard(path) == len(list(read_rows(path, "people"))) == 4
+    refused(lambda: next(read_rows(Path(name, "b.parquet"), "people")), "b.parquet: is missing")
+    write_result(Path(name, "c.parquet"), [])
+    assert shards.rows_of_shard(Path(name, "c.parquet")) == 0
 
 
 def test_pandas_reads_shards(folder, people):

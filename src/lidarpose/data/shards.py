@@ -3,6 +3,7 @@
 Any Parquet reader opens the shards (pandas, DuckDB, Hugging Face datasets, Ray, ...).
 """
 
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -107,7 +108,12 @@ def shard_writer(path: str | Path, table: str) -> Iterator[Callable[[dict[str, A
     # with checksums: a flipped bit in points would go unnoticed
     options = {"compression": "zstd", "use_dictionary": False, "write_page_checksum": True}
     schema = to_arrow(pa, table, []).schema
-    with atomic_path(path) as temporary, parquet.ParquetWriter(temporary, schema, **options) as writer:
+    # pyarrow is given files: it takes a path with a colon for a URI, and cannot encode every file name
+    with (
+        atomic_path(path) as temporary,
+        pa.OSFile(os.fsencode(temporary), "wb") as file,
+        parquet.ParquetWriter(file, schema, **options) as writer,
+    ):
         yield add
         if buffer:
             flush()
@@ -118,7 +124,7 @@ def open_parquet(path: str | Path, remedy: str, **options: Any) -> Iterator[Any]
     """An open Parquet file. Any error with it in the block becomes an InputError of one line that names the file."""
     pa, parquet = pyarrow()
     try:
-        with parquet.ParquetFile(path, **options) as file:
+        with pa.OSFile(os.fsencode(path)) as source, parquet.ParquetFile(source, **options) as file:
             yield file
     except InputError as error:
         raise file_error(path, error) from None

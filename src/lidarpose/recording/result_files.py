@@ -1,6 +1,7 @@
 """Writes the lines of a recording to NAME.poses.jsonl, .csv or .parquet, completely or not at all."""
 
 import json
+import os
 from collections.abc import Iterable, Iterator
 from itertools import chain, islice
 from pathlib import Path
@@ -49,7 +50,10 @@ def _write_parquet(path: Path, lines: Iterable[dict[str, Any]]) -> None:
 
     tables = (pyarrow.Table.from_pandas(table, preserve_index=False) for table in _tables(lines))
     first_table = next(tables)
-    with pyarrow.parquet.ParquetWriter(path, first_table.schema) as writer:
+    with (
+        pyarrow.OSFile(os.fsencode(path), "wb") as file,
+        pyarrow.parquet.ParquetWriter(file, first_table.schema) as writer,
+    ):
         for table in chain([first_table], tables):
             writer.write_table(table)
 
