@@ -472,6 +472,11 @@ def test_triples_are_consecutive_and_evenly_spaced(sets):
     frames, two_tracks = [0, 2, 4, 6, 8, 9, 10], np.array(["a"] * 5 + ["b"] * 2)
     assert not triples_of(frames, track=two_tracks)
     assert len(triples_of(frames, track=two_tracks, sequence=two_tracks)) == 3
+    # one short step of the clock costs the two triples that are uneven by it; frame numbers may have any step
+    times = 0.1 * np.arange(8) - 0.03 * (np.arange(8) > 3)
+    assert triples_of(range(0, 40, 5), time=times) == [[k, k + 5, k + 10] for k in (0, 5, 20, 25)]
+    # a skipped frame ends a run even if the clock does not show it
+    assert triples_of([1, 2, 3, 5, 6], time=0.1 * np.arange(5)) == [[1, 2, 3]]
 
 
 def test_facing_flipped_beyond_right_angle(sets):

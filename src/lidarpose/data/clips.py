@@ -13,7 +13,7 @@ from lidarpose.geometry import to_spherical
 # margin of the angular window about a person, rad, and maximum number of its points that are kept. Source: NE
 MARGIN, MOST = np.radians(1.0), 512
 # a step between frames that exceeds the smallest step by more than this factor ends a run
-_GAP = 1.5
+GAP = 1.5
 # cell size of a map, m; a cell is static if it is occupied in at least this many scans; number of scans used
 _CELL, _LEAST, SCANS = 0.1, 3, 24
 # cell size for finding a person's points in a scan, m
@@ -37,7 +37,7 @@ def consecutive(tracks: Sequence[Hashable], frames: Sequence[int]) -> list[np.nd
         ordered_rows = np.array(sorted(track_rows, key=lambda row: frames[row]))
         steps = np.diff(np.array([frames[row] for row in ordered_rows], float))
         usual_step = steps[steps > 0].min(initial=np.inf)
-        runs += np.split(ordered_rows, np.flatnonzero(steps > _GAP * usual_step) + 1)
+        runs += np.split(ordered_rows, np.flatnonzero(steps > GAP * usual_step) + 1)
     return runs
 
 

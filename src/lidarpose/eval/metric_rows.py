@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from lidarpose.data.clips import GAP
 from lidarpose.errors import InputError
 from lidarpose.eval.metrics import aggregate, keypoints
 from lidarpose.eval.metrics.aggregate import Score, joint_groups, mean
@@ -31,7 +32,7 @@ from lidarpose.sample import CONFIDENCE_RADIUS, FEWEST_OF_SECOND, HIDDEN, SEEN, 
 # with fewer points than PLENTY the facing is often ambiguous, with fewer than FEW nearly always
 PLENTY, FEW = 100, 20
 _REPEATS = 1000
-# frames count as evenly spaced if two steps differ by less than this fraction
+# frames count as evenly spaced if two steps in time differ by less than this fraction
 _EVEN = 0.2
 # joints of each half of the body, without sides. Source: Haque et al. 2016, where the torso is in neither
 ITOP_HALVES = {
@@ -348,14 +349,15 @@ def triples(p: Predictions) -> np.ndarray:
             & (first_step > 0)
             & (np.abs(second_step - first_step) < _EVEN * first_step)
         )
-        # the step must be the shortest one of the sequence, so that no frame is skipped
+        # the steps between frame numbers must be the smallest of the sequence, so that no frame is skipped. Steps in
+        # time do not show that: clocks jitter, and next to one short step all others would be too long
         _, sequence = np.unique(p.sequence, return_inverse=True)
         pairs = np.stack([order[:-1], order[1:]], 1)
-        pair_step = np.diff(p.time[pairs], axis=1)[:, 0]
+        pair_step = np.diff(p.frame[pairs], axis=1)[:, 0]
         is_step = (owner[pairs[:, 0]] == owner[pairs[:, 1]]) & (pair_step > 0)
         step = np.full(int(sequence.max()) + 1, np.inf)
         np.minimum.at(step, sequence[pairs[is_step, 0]], pair_step[is_step])
-        is_even &= first_step < (1 + _EVEN) * step[sequence[rows[:, 0]]]
+        is_even &= (np.diff(p.frame[rows], axis=1) < GAP * step[sequence[rows[:, :1]]]).all(1)
     return rows[is_even & p.posed[rows].all(1)]
 
 
