@@ -16,6 +16,7 @@ import pytest
 import waymo_files
 from hypothesis import given
 from hypothesis import strategies as st
+from pyarrow import parquet
 from shard_files import write_shard
 
 import lidarpose
@@ -29,7 +30,7 @@ from lidarpose.eval import run as run_module
 from lidarpose.eval.dataset import evenly_drawn, load_bench, open_eval_dataset
 from lidarpose.eval.metric_rows import facing_flipped, metric_rows, triples
 from lidarpose.eval.metrics import aggregate
-from lidarpose.eval.protocols import eval_setup, jittered
+from lidarpose.eval.protocols import check_protocol, eval_setup, jittered
 from lidarpose.eval.run import evaluate_dataset
 from lidarpose.geometry import rotation_about
 from lidarpose.inference.results import PersonPose, Poses
@@ -123,6 +124,22 @@ def evaluated(sets, name, model=None, *, split=None, limit=None, **options):
 def test_undecodable_folder_name_is_escaped(sets, tmp_path):
     folder = shutil.copytree(sets / "lidarhuman26m", tmp_path / os.fsdecode(b"\xff"))
     assert open_eval_dataset(folder).name == "\\udcff"
+
+
+@pytest.mark.parametrize(
+    "settings, protocol",
+    [
+        ({"split_by": "a\nb\ud800"}, "dapt"),
+        ({"dataset": "a\nb\ud800"}, "dapt"),
+        ({"dataset": "a\nb\ud800", "split_by": "dapt"}, "clean"),
+    ],
+)
+def test_check_protocol_reports_edited_settings_in_one_line(sets, settings, protocol):
+    dataset = open_eval_dataset(sets / "lidarhuman26m")
+    edited = replace(dataset, settings=dataset.settings | settings, kind=settings.get("dataset", dataset.kind))
+    with pytest.raises(InputError, match=r"a b\\ud800") as raised:
+        check_protocol(protocol, edited)
+    assert "\n" not in str(raised.value)
 
 
 # ---- inputs of the network
@@ -671,6 +688,7 @@ def test_read_scores_rejects_other_files(written, tmp_path):
         (good | {"weights": good["weights"] | {"digest": -1}}, "not a scores.json .*digest"),
         (good | {"weights": good["weights"] | {"digest": float("nan")}}, "not a scores.json .*digest"),
         (nameless, "not a scores.json .*dataset is not text"),
+        (good | {"seed": float("inf")}, "not a scores.json .*cannot convert float infinity"),
     ]
     for change, words in [
         (lambda result: result["lines"][0].update(value="x"), "value is not a number"),
@@ -687,9 +705,15 @@ def test_read_scores_rejects_other_files(written, tmp_path):
         for read in (evaluation.read_scores, evaluation.table):
             with pytest.raises(InputError, match=words):
                 read(tmp_path)
-    (tmp_path / "poses.parquet").write_bytes(b"PAR1 and no more")
+    path = tmp_path / "poses.parquet"
+    path.write_bytes(b"PAR1 and no more")
     with pytest.raises(InputError, match="is not the poses.parquet"):
-        evaluation.read_poses(tmp_path / "poses.parquet")
+        evaluation.read_poses(path)
+    table = parquet.read_table(written[1] / "poses.parquet")
+    place = table.schema.get_field_index("points")
+    parquet.write_table(table.set_column(place, "points", [[2**40] * len(table)]), path)
+    with pytest.raises(InputError, match="is not the poses.parquet .*out of bounds"):
+        evaluation.read_poses(path)
 
 
 def test_table_command_never_overwrites_scores(written, capsys):

@@ -440,12 +440,26 @@ def test_labeled_scans_rejects_missing_scan_and_wrong_labels(tmp_path):
     (tmp_path / "labeled" / "a.json").unlink()
     path = tmp_path / "labeled" / "b.json"
     content = json.loads(path.read_text())
-    for key, value, message in (("num_points", "many", "num_points"), ("sensor_origin", "here", "sensor origin")):
+    for key, value, message in (
+        *(("num_points", value, "num_points") for value in ("many", float("inf"), 1e30, -1)),
+        ("sensor_origin", "here", "sensor origin"),
+        *(("up", value, "z up, got up") for value in ("-z", 3)),
+    ):
         changed = json.loads(json.dumps(content))
         (changed["people"][0] if key == "num_points" else changed)[key] = value
         path.write_text(json.dumps(changed))
         with pytest.raises(InputError, match=rf"b\.json.*{message}"):
             labeled_scans(tmp_path / "labeled").loaders[0]()
+    # the up axis of a lidarpose document and of a single box
+    for changed in (
+        content | {"schema": "lidarpose.boxes/1", "up": "-y"},
+        {"people": [content["people"][0] | {"up": "x"}]},
+    ):
+        path.write_text(json.dumps(changed))
+        with pytest.raises(InputError, match=r"b\.json.*z up, got up"):
+            labeled_scans(tmp_path / "labeled").loaders[0]()
+    path.write_text(json.dumps(content | {"up": "z"}))
+    assert len(labeled_scans(tmp_path / "labeled").loaders[0]().boxes) == 1
 
 
 def test_score_detector_groups_by_mount_with_unknown_origin():

@@ -34,7 +34,7 @@ import pandas as pd
 from lidarpose.data.shards import DatasetReader, open_dataset, pyarrow, read_rows
 from lidarpose.errors import InputError, check_int
 from lidarpose.geometry import rotation_about
-from lidarpose.io.files import encodable, file_error, read_bytes
+from lidarpose.io.files import file_error, one_line, read_bytes
 from lidarpose.sample import SEEN, Box, LabeledSample, PersonInfo, Pose, center_of, is_plain
 from lidarpose.skeleton import BODY26, HUMAN15, Skeleton, skeleton
 
@@ -200,7 +200,7 @@ def _open_folder(folder: Path, split: str | None, limit: int | None) -> EvalData
     source, _, leaks = str(card.about.get("split", "")).partition("; LEAKS: ")
     dataset_skeleton = skeleton(card.skeleton)
     return EvalDataset(
-        name=encodable(folder.resolve().name),
+        name=one_line(folder.resolve().name),
         kind="synth" if is_synthetic else str(card.settings.get("dataset", "labelled")),
         skeleton=dataset_skeleton,
         scored=_SYNTHETIC if is_synthetic else dataset_skeleton,

@@ -194,6 +194,6 @@ def read_poses(path: str | Path) -> dict[str, Predictions]:
             rows = [{key: value for key, value in row.items() if value is not None} for row in records]
             predictions[name] = stack(Skeleton(name=entry["skeleton"], joints=joints, parents=parents), rows)
         return predictions
-    except (pa.ArrowException, OSError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except (pa.ArrowException, OSError, KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         remedy = "lidarpose.read_poses reads .poses.json" if data.startswith(b"{") else "evaluate again"
         raise file_error(path, f"is not the poses.parquet of an evaluation ({error}); {remedy}") from None

@@ -18,7 +18,7 @@ from lidarpose.eval.dataset import EvalDataset, EvalSample
 from lidarpose.eval.predictions import Predictions, stack
 from lidarpose.eval.scores import Setting
 from lidarpose.inference.inputs import Clips
-from lidarpose.io.files import shorten
+from lidarpose.io.files import one_line, shorten
 from lidarpose.sample import PER_PERSON, UNLABELED, Box, LabeledSample, Pose, clip_windows, known_values
 from lidarpose.skeleton import Skeleton
 from lidarpose.skeleton import skeleton as skeleton_of
@@ -79,11 +79,13 @@ def check_protocol(protocol: str, dataset: EvalDataset) -> None:
     """Raises InputError, one line, if the dataset cannot be scored under the protocol."""
     check_name("protocol", protocol, PROTOCOLS)
     name, kind, split_by = dataset.name, dataset.kind, dataset.settings.get("split_by")
+    # a dataset.json that was edited may hold any text
+    kind_text, split_text = (shorten(one_line(str(value or "nothing"))) for value in (kind, split_by))
     if protocol == "clean":
         if split_by == "dapt":
             raise InputError(
                 f"{name} was split by dapt, where neighboring frames are in train and test: use protocol dapt, or "
-                f"run lidarpose prepare {kind} RAW OUT again without --split-by dapt"
+                f"run lidarpose prepare {kind_text} RAW OUT again without --split-by dapt"
             )
         return
     if kind in _OWN_CROP:
@@ -91,10 +93,11 @@ def check_protocol(protocol: str, dataset: EvalDataset) -> None:
             f"the protocol dapt centers on labels of real datasets, {name} is synthetic: use protocol clean"
         )
     if kind not in DAPT:
-        raise InputError(f"the released code evaluates {', '.join(DAPT)}, not {kind}: use protocol clean for {name}")
+        evaluated = ", ".join(DAPT)
+        raise InputError(f"the released code evaluates {evaluated}, not {kind_text}: use protocol clean for {name}")
     if split_by != (expected_split := DAPT[kind].split):
         raise InputError(
-            f"{name} was split by {split_by or 'nothing'}, the protocol dapt is by {expected_split}: run lidarpose "
+            f"{name} was split by {split_text}, the protocol dapt is by {expected_split}: run lidarpose "
             f"prepare {kind} RAW OUT --split-by {expected_split} into another folder"
         )
 

@@ -151,7 +151,7 @@ def read_scores(path: str | PathLike) -> Scores:
             if not isinstance(head["weights"].get("digest") or "", str):
                 raise TypeError("the digest of the weights is not text")
             return Scores(**head, results=tuple(map(_result, content["results"])))
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         problem = f"{error} is missing" if isinstance(error, KeyError) else error
         raise file_error(path, f"is not a {FILE} of lidarpose evaluate ({problem})") from None
     remedy = "evaluate again, or use the lidarpose version that wrote it"

@@ -17,7 +17,7 @@ from lidarpose.eval.dataset import evenly_drawn
 from lidarpose.inference.checks import rows_inside
 from lidarpose.inference.inputs import as_origin, only_returns
 from lidarpose.io.boxes import read_boxes
-from lidarpose.io.files import file_error, read_json
+from lidarpose.io.files import file_error, read_json, shorten
 from lidarpose.io.point_cloud import SUFFIXES, read_points
 from lidarpose.sample import Box
 
@@ -117,7 +117,8 @@ def labeled_scans(folder: str | os.PathLike, limit: int | None = None) -> ScanSe
       other categories are dropped.
     - `num_points`; by default the points in the box are counted.
 
-    Next to "people", SCAN.json may have `sensor`, `kind` of scene and `sensor_origin` (0, 0, 0 by default).
+    Next to "people", SCAN.json may have `sensor`, `kind` of scene and `sensor_origin` (0, 0, 0 by default). Points and
+    boxes are z up; a scan that states another `up` is refused when it is read.
 
     Raises:
         InputError: the folder has no labels, or a label file has no scan.
@@ -140,6 +141,10 @@ def _read_scan(labels: Path, cloud: Path) -> LabeledScan:
     labeled_boxes = read_boxes(labels)
     content = read_json(labels, expected="labels of people")
     document: dict[str, Any] = content if isinstance(content, dict) else {"people": content}
+    for up in (labeled_boxes.up, document.get("up")):
+        if up not in (None, "z"):
+            problem = f"expected points and boxes with z up, got up {shorten(repr(up))}: turn both until z points up"
+            raise file_error(labels, problem)
     boxes, people, kinds = [], [], []
     for box, entry in zip(labeled_boxes, document["people"], strict=True):
         entry = entry if isinstance(entry, dict) else {}
@@ -153,9 +158,13 @@ def _read_scan(labels: Path, cloud: Path) -> LabeledScan:
     points = only_returns(read_points(cloud).points)[0]
     point_counts = [len(rows) for rows in rows_inside(boxes, points)]
     try:
-        num_points = [int(entry.get("num_points", count)) for entry, count in zip(people, point_counts, strict=True)]
-    except (TypeError, ValueError):
-        raise file_error(labels, "expected whole numbers as num_points of people: correct or drop them") from None
+        counts = [int(entry.get("num_points", count)) for entry, count in zip(people, point_counts, strict=True)]
+        num_points = np.array(counts, np.int64)
+        if (num_points < 0).any():
+            raise ValueError
+    except (TypeError, ValueError, OverflowError):
+        problem = "expected whole numbers of at least 0 as num_points of people: correct or drop them"
+        raise file_error(labels, problem) from None
     try:
         origin = as_origin(document.get("sensor_origin", (0.0, 0.0, 0.0)))
     except InputError as error:
@@ -165,7 +174,7 @@ def _read_scan(labels: Path, cloud: Path) -> LabeledScan:
         points=points,
         origin=origin,
         boxes=boxes,
-        num_points=np.array(num_points, int),
+        num_points=num_points,
         is_person=is_on_foot | is_mounted,
         mounted=is_mounted,
         sensor=str(document.get("sensor", "")),
