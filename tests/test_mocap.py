@@ -11,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from lidarpose.body.mocap import digest, joint_tree, load_motion, retarget, skeleton_files
+from lidarpose.body.mocap.smpl_poses import load_betas
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, rotation_about
 from lidarpose.synth.shard_job import SynthesisJob
@@ -493,6 +494,19 @@ def test_load_motion_reads_folder_of_all_formats(tmp_path):
     assert motion.fps == 10 and tuple(motion.length) == (2, 2, 3, 13, 7)
     assert motion.of("02").names == ("02/02_01", "02/02_02")
     assert tuple(load_motion(tmp_path, hz=20).length) == (3, 3, 5, 25, 13)
+
+
+def test_folders_are_read_through_links_but_not_in_circles(tmp_path):
+    folder = tmp_path / "motion"
+    for path in (folder, tmp_path / "elsewhere" / "02"):
+        path.mkdir(parents=True)
+        files.write_amass(path / "a_poses.npz", *files.a_clip(3), betas=[float(path == folder)] * 10)
+    was = digest(folder)
+    (folder / "02").symlink_to(tmp_path / "elsewhere" / "02")
+    (folder / "02" / "above").symlink_to(folder)
+    (folder / "02" / "outside").symlink_to(tmp_path)
+    assert load_motion(folder).names == ("02/a_poses", "a_poses")
+    assert digest(folder) != was and len(load_betas(folder)) == 2
 
 
 def test_digest_depends_on_content_of_motion(tmp_path):

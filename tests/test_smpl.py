@@ -262,6 +262,12 @@ def test_smpl_pose_rejects_invalid_arguments(body, betas, rotations, translation
 # ---- SMPL as the body of synthesis
 
 
+@pytest.mark.parametrize("betas, message", [([[0.0], [np.nan]], "must be finite"), (np.zeros((0, 10)), "at least one")])
+def test_rig_rejects_invalid_betas(body, betas, message):
+    with pytest.raises(InputError, match=f"betas .*{message}"):
+        body.rig(betas)
+
+
 @pytest.mark.parametrize("joints", [24, 52])
 def test_rig_matches_smpl_without_pose_shapes(tmp_path, joints):
     model = synthetic(joints)

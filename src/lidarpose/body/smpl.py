@@ -80,9 +80,7 @@ class SmplBody:
 
         Source: Loper et al. 2015, Eq. 8 and 10.
         """
-        betas = np.asarray(betas, float)
-        if betas.ndim != 2 or betas.shape[1] > self.shape_count or not np.isfinite(betas).all():
-            raise InputError(f"betas must be finite, (n, up to {self.shape_count}), got {betas.shape}")
+        betas = self._checked_betas(betas)
         vertices = self.template + np.moveaxis(self.shapes[..., : betas.shape[1]] @ betas.T, -1, 0)
         return vertices, self.regressor @ vertices
 
@@ -147,9 +145,9 @@ class SmplBody:
     def rig(self, betas: np.ndarray) -> Rig:
         """The body as a `Rig` for synthesis, with betas (n, <= S) as its table of people. Each vertex has at most four
         bones, and there are no pose-dependent shapes."""
-        betas = np.asarray(betas, float)
-        # raises InputError for invalid betas
-        self.rest(betas[:1])
+        betas = self._checked_betas(betas)
+        if not len(betas):
+            raise InputError("betas must have a row for each person, at least one, got none")
         count = betas.shape[1]
         joint_weights = on_smpl(self.weights, self.parents)
         index = np.argsort(-joint_weights, 1, kind="stable")[:, :4]
@@ -202,6 +200,12 @@ class SmplBody:
             rest_vertices = rest_vertices + self.pose_shapes @ pose_features[i]
             posed_vertices[i] = (blend[..., :3] @ rest_vertices[..., None])[..., 0] + blend[..., 3]
         return posed_vertices, positions, global_rotations
+
+    def _checked_betas(self, betas: np.ndarray) -> np.ndarray:
+        betas = np.asarray(betas, float)
+        if betas.ndim != 2 or betas.shape[1] > self.shape_count or not np.isfinite(betas).all():
+            raise InputError(f"betas must be finite, (n, up to {self.shape_count}), got {betas.shape}")
+        return betas
 
     @staticmethod
     def _checked_translation(translation: np.ndarray | None, count: int) -> np.ndarray:

@@ -10,8 +10,9 @@ import os
 import re
 import reprlib
 import stat
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from lidarpose.errors import InputError
@@ -65,6 +66,17 @@ def listed(paths: str | os.PathLike | Iterable[str | os.PathLike]) -> list[str |
     if isinstance(paths, bytes) or not isinstance(paths, str | os.PathLike | Iterable):
         raise InputError(f"expected one or more paths, got {type(paths).__name__}: give a file or folder")
     return [paths] if isinstance(paths, str | os.PathLike) else list(paths)
+
+
+def folders_below(folder: Path) -> Iterator[tuple[Path, list[str]]]:
+    """The folder and its subfolders, each with the names of its files. Links are followed, except to a folder that
+    they lie in."""
+    for directory, folders, names in os.walk(folder, followlinks=True):
+        path = Path(directory)
+        steps = path.relative_to(folder)
+        above = {os.path.realpath(folder / step) for step in (steps, *steps.parents)}
+        folders[:] = [name for name in folders if os.path.realpath(path / name) not in above]
+        yield path, names
 
 
 def check_not_input(out: str | os.PathLike, *inputs: object) -> None:

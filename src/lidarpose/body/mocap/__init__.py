@@ -8,7 +8,7 @@
     sloper4d         SLOPER4D's _labels.pkl
     corpus           .pkl of LIPD, FreeMotion or NoiseMotion
     lidarhuman26m    a folder of numbered pose .json files
-Folders are searched recursively for all of these.
+Folders are searched recursively for all of these, also through links.
 """
 
 import hashlib
@@ -23,7 +23,7 @@ from lidarpose.body.mocap.skeleton_files import load_amc, load_bvh
 from lidarpose.body.mocap.smpl_poses import load_amass, load_lidarhuman26m, load_pkl, pose_files
 from lidarpose.errors import check_name
 from lidarpose.geometry import UP_AXES
-from lidarpose.io.files import content_digest, file_error, read_bytes
+from lidarpose.io.files import content_digest, file_error, folders_below, read_bytes
 from lidarpose.io.npz import read_npz
 
 
@@ -98,11 +98,11 @@ def _loader(path: Path) -> Callable[..., Motion]:
 def _sources(folder: Path) -> list[Path]:
     """Motion files in a folder and its subfolders, and those of its folders that hold pose files, sorted by path."""
     sources = []
-    for directory, _, names in os.walk(folder):
-        files = [Path(directory, name) for name in names if not name.lower().endswith(_NO_MOTION)]
+    for directory, names in folders_below(folder):
+        files = [directory / name for name in names if not name.lower().endswith(_NO_MOTION)]
         sources += [file for file in files if file.suffix.lower() in FORMATS.keys() - {".json"}]
-        if pose_files(Path(directory)):
-            sources.append(Path(directory))
+        if pose_files(directory):
+            sources.append(directory)
     return sorted(sources)
 
 
@@ -112,7 +112,7 @@ def digest(path: str | os.PathLike) -> str:
     path = Path(path)
     if not path.is_dir():
         return content_digest(path, expected="motion")[:16]
-    files = sorted(Path(directory, name) for directory, _, names in os.walk(path) for name in names)
+    files = sorted(directory / name for directory, names in folders_below(path) for name in names)
     files = [file for file in files if file.suffix.lower() in (*FORMATS, ".asf")]
     lines = [f"{file.relative_to(path).as_posix()} {content_digest(file, expected='motion')}" for file in files]
     return hashlib.sha256("\n".join(lines).encode("utf-8", "surrogateescape")).hexdigest()[:16]

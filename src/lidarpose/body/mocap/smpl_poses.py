@@ -38,7 +38,7 @@ from lidarpose.body.mocap.motion import Motion, is_of, join, standing_axis, usab
 from lidarpose.body.mocap.retarget import motion_from_joints
 from lidarpose.body.rig import forward_kinematics, mean_adult_joints
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_from_up
-from lidarpose.io.files import FRAME_NUMBER, file_error, read_json
+from lidarpose.io.files import FRAME_NUMBER, file_error, folders_below, read_json
 from lidarpose.io.npz import read_npz
 from lidarpose.io.pickles import load_pickle
 from lidarpose.skeleton import SMPL24
@@ -221,8 +221,9 @@ def load_betas(path: str | os.PathLike, subjects: Sequence[str] = ()) -> np.ndar
     path = Path(path)
     files = [path]
     if path.is_dir():
-        paths = {file: file.relative_to(path).as_posix() for file in sorted(path.rglob("*"))}
-        files = [file for file, name in paths.items() if not subjects or any(is_of(name, s) for s in subjects)]
+        files = sorted(directory / name for directory, names in folders_below(path) for name in names)
+        if subjects:
+            files = [file for file in files if any(is_of(file.relative_to(path).as_posix(), s) for s in subjects)]
     rows: list[np.ndarray] = []
     for file in files:
         if file.suffix.lower() == ".json" and FRAME_NUMBER.fullmatch(file.stem):
