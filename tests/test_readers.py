@@ -136,13 +136,15 @@ def test_humanm3_database_gives_joint_visibility(tmp_path, smpl):
         camera["joints_3d_vis"][1, 6] = k == 2
     frames.append({"pcd": None, "info": [{"joints_3d": [[1, 2]]}]})
     frames.append({"pcd": "nowhere/000001.pcd", "info": frames[0]["info"]})
+    joints = frames[0]["info"][0]["joints_3d"]
+    frames += [{"pcd": None, "info": info} for info in (joints, [[]], [5], 5)] + [{"pcd": "a\0", "info": [{}]}, None]
     (tmp_path / "test.pkl").write_bytes(pickle.dumps({"db": frames}))
     found = list(made("humanm3", smpl).read(tmp_path, "test.pkl"))
     items = [one for one in found if isinstance(one, LabeledSample)]
     # a joint is labeled if at least one camera sees it
     assert [int((item.joint_labels == UNLABELED).sum()) for item in items] == [1, 0, 0, 0]
     assert np.isnan(items[0].joints[5]).all()
-    assert reasons(found[len(items) :]) == {"entry in another format": 1, "labels without a cloud": 1}
+    assert reasons(found[len(items) :]) == {"entry in another format": 7, "labels without a cloud": 1}
 
 
 def test_humanm3_names_incomplete_folder_and_likely_root(tmp_path, smpl):
@@ -363,7 +365,8 @@ def test_sloper4d_counts_skipped_frames(tmp_path, smpl):
     # a fourth column must not shift the values that follow
     person["point_clouds"][3] = np.hstack([person["point_clouds"][3], np.ones((150, 1))])
     person["point_clouds"].append(person["point_clouds"][5][:9])
-    person["point_frame"] = [*person["point_frame"], 7777]
+    person["point_clouds"].append(person["point_clouds"][5])
+    person["point_frame"] = [*person["point_frame"], 7777, person["point_frame"][5]]
     person["point_clouds"][5] = np.concatenate([person["point_clouds"][5][:9], [[1.0, np.nan, 2.0]]])
     write_labels(tmp_path, content)
     items, skipped = everything("sloper4d", tmp_path, smpl)
@@ -371,7 +374,7 @@ def test_sloper4d_counts_skipped_frames(tmp_path, smpl):
     assert [(item.frame, len(item.points)) for item in items] == [(125, 9)]
     assert reasons(skipped) == {
         "empty cloud": 2, "cloud cannot be read": 2, "cloud without a pose": 1, "cloud without the LiDAR's position": 1,
-        "cloud of a frame without labels": 1,
+        "cloud of a frame without labels": 1, "another cloud of the same frame": 1,
     }  # fmt: skip
 
 
@@ -431,10 +434,13 @@ def test_corpus_entry_in_other_format_is_skipped(tmp_path, smpl):
     entries[3] = 5
     entries[4]["gt"] = np.zeros(71)
     entries.append({name: value for name, value in entries[0].items() if not name.startswith("pc")})
+    # the only cloud may be pc, also beside an empty pc_1
+    entries.append(entries[0] | {"pc": entries[0]["pc_1"]} | dict.fromkeys(("pc_1", "pc_2", "pc_3")))
     path.write_bytes(pickle.dumps(entries))
     items, skipped = everything("freemotion", tmp_path, smpl)
-    assert reasons(skipped) == {"no T_2": 1, "entry in another format": 2, "no pc": 1} and len(items) == 7
-    assert [item.source for item in items] == ["freemotion/mean shape"] * 3 + ["freemotion"] * 4
+    assert reasons(skipped) == {"no T_2": 1, "entry in another format": 2, "no pc": 1} and len(items) == 8
+    assert [item.track for item in items] == ["1", "2", "3", "1", "3", "1", "2", "1"]
+    assert [item.source for item in items[:7]] == ["freemotion/mean shape"] * 3 + ["freemotion"] * 4
     path.unlink()
     files.write_lipd(tmp_path, smpl)
     path = tmp_path / "LIPD_train.pkl"

@@ -143,7 +143,7 @@ class FreeMotion(_Corpus):
         if all(entry.content.get(name) is None for name in ("pc", "pc_1", "pc_2", "pc_3")):
             yield Skipped("no pc", entry.where)
         for view in (1, 2, 3):
-            cloud = "pc" if view == 1 and "pc_1" not in entry.content else f"pc_{view}"
+            cloud = "pc" if view == 1 and entry.content.get("pc_1") is None else f"pc_{view}"
             if entry.content.get(cloud) is None:
                 continue
             if entry.content.get(f"T_{view}") is None:

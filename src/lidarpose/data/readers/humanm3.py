@@ -120,7 +120,7 @@ def _read_database(root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
         try:
             people = _without_copies(entry["info"], where)
             path = base.find_below(root, str(entry["pcd"]))
-        except (InputError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, LookupError, AttributeError) as error:
             yield Skipped("entry in another format", f"{where}: {error!r}")
             continue
         if path is None:

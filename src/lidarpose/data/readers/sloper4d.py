@@ -68,7 +68,7 @@ class Sloper4D(Reader):
         path = next(path for path in _files(root) if path.name == part + _SUFFIX)
         content, person, walker = _content(path)
         pose, trans, pose_name = _poses(path, person)
-        clouds = _clouds(path, person)
+        clouds, repeated_frames = _clouds(path, person)
         frames = numbers(path, content.get("frame_num"), (-1,), "frame_num").astype(int).tolist()
         total = content.get("total_frames")
         total = len(frames) if total is None else int(numbers(path, total, (), "total_frames"))
@@ -122,6 +122,7 @@ class Sloper4D(Reader):
             Skipped("cloud of a frame without labels", f"{part}/{frame}")
             for frame in sorted(clouds.keys() - set(frames))
         )
+        yield from (Skipped("another cloud of the same frame", f"{part}/{frame}") for frame in repeated_frames)
 
 
 def _files(root: Path) -> list[Path]:
@@ -169,8 +170,8 @@ def _poses(path: Path, person: dict) -> tuple[np.ndarray, np.ndarray, str]:
     raise file_error(path, f"second_person has no pose and trans, got {', '.join(map(str, person))[:80]}")
 
 
-def _clouds(path: Path, person: dict) -> dict[int, np.ndarray | str]:
-    """Frame -> its cloud (k, 3) m, or a description of the error."""
+def _clouds(path: Path, person: dict) -> tuple[dict[int, np.ndarray | str], list[int]]:
+    """Frame -> its first cloud (k, 3) m, or a description of the error; and the frame of each further cloud."""
     clouds, frames = person.get("point_clouds"), person.get("point_frame")
     if clouds is None or frames is None:
         raise file_error(path, "second_person has no point_clouds and point_frame: labels from another release?")
@@ -180,13 +181,17 @@ def _clouds(path: Path, person: dict) -> dict[int, np.ndarray | str]:
     if len(clouds) != len(frames):
         raise file_error(path, f"has {len(clouds)} point_clouds for {len(frames)} frames (point_frame)")
     by_frame: dict[int, np.ndarray | str] = {}
+    repeated_frames = []
     for frame, cloud in zip(frames, clouds, strict=True):
+        if frame in by_frame:
+            repeated_frames.append(frame)
+            continue
         try:
             # NaN rows are dropped, as in the authors' loaders
             by_frame[frame] = as_cloud(path, cloud)
         except InputError as error:
             by_frame[frame] = str(error)
-    return by_frame
+    return by_frame, repeated_frames
 
 
 def _heading(quaternion: np.ndarray) -> np.ndarray:
