@@ -307,6 +307,10 @@ def test_evaluate_accepts_minimal_user_model(sets):
 
     result = evaluation.evaluate(Own(answers), "bench", limit=5)
     assert result.setting.method == "Own" and 100 < result.line("mpjpe").value < 2000
+    # a pose of NaN is none
+    nowhere = SimpleNamespace(pose=Pose(joints=np.full((24, 3), np.nan), skeleton=SMPL24))
+    result = evaluation.evaluate(Own(lambda clouds: answers(clouds)[1:] + [nowhere]), "bench", limit=5)
+    assert result.counts["without a pose"] == 1
     with pytest.raises(InputError, match="^the protocol dapt needs a model with `outputs` and `backend`"):
         evaluation.evaluate(Own(answers), sets / "humanm3", protocol="dapt")
 
@@ -324,6 +328,10 @@ def test_evaluate_accepts_minimal_user_model(sets):
             "expected confidence from 0 to 1, got 95.0 to 95.0",
         ),
         (Pose(joints=np.zeros((24, 3)), skeleton=SMPL24, person=-0.5), "expected person from 0 to 1"),
+        (
+            Pose(joints=np.full((24, 3), [[np.nan]] + [[0.0]] * 23), skeleton=SMPL24),
+            "finite joints for the person in shard 0, row [0-9]+, got 1 of 15 scored ones .*: return None",
+        ),
     ],
 )
 def test_evaluate_rejects_unsuitable_poses_of_user_models(pose, words):

@@ -387,7 +387,7 @@ class LabeledSample(Sample):
 
     @property
     def distance(self) -> float:
-        """Distance of the person from the sensor, m; NaN if unknown."""
+        """Distance from the sensor, m: horizontal for a synthetic person, else of the center in 3D; NaN if unknown."""
         if self.info is not None:
             return self.info.distance
         # rounded as in shards, so that scores are the same from memory and from a file

@@ -223,8 +223,8 @@ class EvalSetup:
                 f"{model.model['name']}.predict: expected an answer for each of {len(clouds)} clouds, with a `pose` of "
                 f"{name} or None, got {shorten(repr(people), 60)}: return the same as lidarpose.Predictor"
             )
-        for person in people:
-            self._check_pose(person.pose)
+        for sample, person in zip(samples, people, strict=True):
+            self._check_pose(person.pose, sample)
             yield {} if person.pose is None else self._prediction_columns(person.pose, ())
 
     def answers(
@@ -242,8 +242,9 @@ class EvalSetup:
             return model.predict_in(clouds, origin, name, box_centers=box_centers, check_upside_down=False)
         return model.predict(clouds, sensor_origin=origin, skeleton=name, **(clips or {}))
 
-    def _check_pose(self, pose: Any) -> None:
-        """Raises InputError unless a model's answer is None or a pose of its skeleton with shares from 0 to 1."""
+    def _check_pose(self, pose: Any, person: EvalSample) -> None:
+        """Raises InputError unless a model's answer is None or a pose of its skeleton with shares from 0 to 1. All
+        its scored joints must be finite, or none, which is the same as None."""
         model, skeleton = self.model.model["name"], self.model.skeleton
         if pose is None:
             return
@@ -258,6 +259,12 @@ class EvalSetup:
             raise InputError(
                 f"{model}.predict: expected a lidarpose.Pose with the {len(skeleton)} joints of {skeleton.name}, got "
                 f"{actual}: return poses of the model's skeleton"
+            )
+        is_finite = np.isfinite(pose.joints[skeleton.map_to(self.joints)]).all(-1)
+        if is_finite.any() and not is_finite.all():
+            raise InputError(
+                f"{model}.predict: expected finite joints for the person in shard {person.shard}, row {person.row}, "
+                f"got {(~is_finite).sum()} of {len(is_finite)} scored ones that are not: return None for no pose"
             )
         for name, value in known_values(pose, "confidence", "visible", *PER_PERSON).items():
             if not np.all((value >= 0) & (value <= 1)):
@@ -283,6 +290,7 @@ class EvalSetup:
             for k, (row, center) in enumerate(zip(rows, centers, strict=True)):
                 values = self._prediction_columns(estimates, k)
                 values["pred"] = values["pred"] + center
+                # no pose if any joint is not finite, as in Predictor.predict: `outputs` has no other way to say so
                 answers[row] = values if np.isfinite(values["pred"]).all() else {}
         yield from (answers[row] for row in range(len(samples)))
 
