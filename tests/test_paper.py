@@ -1,11 +1,13 @@
 """`lidarpose paper`: tables and their cells, steps that run once and can be resumed, pages, figures."""
 
 import json
+import os
 import re
 import shutil
 import signal
 import sys
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -646,10 +648,64 @@ def test_the_first_line_of_a_log_does_not_count_for_a_trainings_speed(tmp_path, 
     monkeypatch.setattr(steps.os, "kill", lambda process, number: signals.append(number))
     log = [json.dumps({"people": people, "seconds": seconds}) for people, seconds in lines]
     (tmp_path / "log.jsonl").write_text("\n".join(log) + "\n")
-    with steps._Watch(tmp_path, 1000 / 3600) as watch:
+    with loop.StopRequest(), steps._Watch(tmp_path, 1000 / 3600, print) as watch:
         watch._thread.join(timeout=10)
     assert watch.fit == pytest.approx(fit) if fit else watch.fit is None
     assert signals == [signal.SIGINT] * bool(fit)
+
+
+@pytest.mark.parametrize("first", ["user", "watch"])
+def test_a_users_stop_is_not_lost_to_the_watch(tmp_path, monkeypatch, capsys, first):
+    """Neither before the watch, whose signal would abort the saving, nor after it, while the training saves."""
+    monkeypatch.setattr(steps, "_POLL", 0.001)
+    monkeypatch.setattr(steps, "_people", lambda folder: 20_000)
+    step, asked, saved = Step(("pretrain", "--people", "20000"), hours=1000 / 3600), [], []
+
+    def execute(words):
+        asked.append(words)
+        try:
+            with loop.StopRequest() as stop:
+                if first == "user":
+                    os.kill(os.getpid(), signal.SIGINT)
+                step.folder(tmp_path).mkdir(parents=True)
+                log = "".join(json.dumps({"people": 64 * k, "seconds": 100.0 * k}) + "\n" for k in (1, 2))
+                (step.folder(tmp_path) / "log.jsonl").write_text(log)
+                until = time.monotonic() + (0.1 if first == "user" else 10)
+                while time.monotonic() < until and not (first == "watch" and stop.number):
+                    time.sleep(0.01)
+                if first == "watch":
+                    os.kill(os.getpid(), signal.SIGINT)
+                    time.sleep(10)
+                saved.append(True)
+                raise loop.Interrupted("stopped after 128 samples, saved: go on", stop.number)
+        except KeyboardInterrupt as interrupt:
+            print(f"lidarpose: {interrupt or 'stopped'}", file=sys.stderr)
+            return 130
+
+    with pytest.raises(KeyboardInterrupt):
+        run_steps(step, tmp_path, execute, print)
+    assert len(asked) == 1 and bool(saved) == (first == "user") and "length" not in steps._state(step, tmp_path)
+
+
+def test_watch_tells_why_it_cannot_watch(tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr(steps, "_POLL", 0.001)
+    (tmp_path / "log.jsonl").write_text('{"people": 64}\n')
+    with steps._Watch(tmp_path, 1.0, told.append) as watch:
+        watch._thread.join(timeout=10)
+    assert told == [f"warning: --hours has no effect on {tmp_path.name} (KeyError: 'seconds')"]
+
+
+def test_resumed_training_has_its_workers_and_no_less_than_it_has_seen(tmp_path, monkeypatch):
+    words = ("finetune", "--data", "x", "--workers", "4")
+    step, asked = Step(words), []
+    folder = step.folder(tmp_path)
+    run_dir.begin(folder, Finetune(data=("x",), epochs=12.344), "")
+    run_steps(step, tmp_path, lambda words: asked.append(words) or 0, print)
+    assert asked == [["finetune", "--out", str(folder), "--resume", "--workers", "4"]]
+    (folder / "log.jsonl").write_text('{"people": 12344}\n')
+    monkeypatch.setattr(steps, "_people", lambda folder: 12_344)
+    assert steps._shortened(step, folder, 12_344.0) == ["--epochs", "12.344"]
 
 
 @pytest.mark.long

@@ -8,6 +8,7 @@ training with --resume.
 import hashlib
 import io
 import json
+import math
 import os
 import shlex
 import shutil
@@ -113,6 +114,10 @@ class StepFailed(LidarPoseError):
     """A command that ended with an error; its message is the command's error message."""
 
 
+class _Saved(KeyboardInterrupt):
+    """A training that was asked to stop, and has saved its state."""
+
+
 def is_done(step: Step, out: Path) -> bool:
     """Whether the step's command has finished successfully."""
     return _state(step, out).get("done", False)
@@ -158,14 +163,16 @@ def _run(step: Step, out: Path, execute: Execute, tell: Callable[[str], None]) -
     words = step.command(out)
     if step.kind in KINDS and (folder / CONFIG).is_file():
         folder_words = [str(folder)] if step.kind == "pretrain" else ["--out", str(folder)]
-        words = [step.kind, *folder_words, "--resume", *length_of(step, out)]
+        workers = words[words.index("--workers") :][:2] if "--workers" in words else []
+        words = [step.kind, *folder_words, "--resume", *length_of(step, out), *workers]
     if step.hours is None or step.kind not in KINDS or "length" in _state(step, out):
         _execute(words, execute)
         return
-    with _Watch(folder, step.hours) as watch:
+    with _Watch(folder, step.hours, tell) as watch:
         try:
             _execute(words, execute)
-        except KeyboardInterrupt:
+        except _Saved:
+            # any other interruption is the user's, also of the saving that the watch asked for
             if not watch.fit:
                 raise
     if watch.fit:
@@ -185,7 +192,8 @@ def _execute(words: list[str], execute: Execute) -> None:
             status = exit_error.code if isinstance(exit_error.code, int) else 2
     if status >= 128:
         # the command itself said how far it came
-        raise KeyboardInterrupt("the same lidarpose paper command goes on here")
+        has_saved = last_line.line.startswith("lidarpose: stopped after")
+        raise (_Saved if has_saved else KeyboardInterrupt)("the same lidarpose paper command goes on here")
     if status:
         raise StepFailed(last_line.line.removeprefix("lidarpose: error: ") or f"ended with status {status}")
 
@@ -213,9 +221,9 @@ class _Watch:
     fit: how many people can be seen in these hours; None as long as it has not stopped the training.
     """
 
-    def __init__(self, folder: Path, hours: float):
+    def __init__(self, folder: Path, hours: float, tell: Callable[[str], None]):
         self.fit: float | None = None
-        self._folder, self._seconds, self._over = folder, 3600 * hours, threading.Event()
+        self._folder, self._seconds, self._tell, self._over = folder, 3600 * hours, tell, threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
     def __enter__(self) -> "_Watch":
@@ -227,6 +235,13 @@ class _Watch:
         self._thread.join()
 
     def _watch(self) -> None:
+        try:
+            self._stop_in_time()
+        except Exception as error:
+            # an exception ends a thread without anybody noticing
+            self._tell(f"warning: --hours has no effect on {self._folder.name} ({type(error).__name__}: {error})")
+
+    def _stop_in_time(self) -> None:
         while not self._over.wait(_POLL):
             entries = read_log(self._folder)
             if not entries or entries[-1]["seconds"] < min(_WATCH, _WATCH_SHARE * self._seconds):
@@ -239,10 +254,14 @@ class _Watch:
                 continue
             speed = (entry["people"] - first["people"]) / max(entry["seconds"] - first["seconds"], 1e-3)
             fit = entry["people"] + (self._seconds - entry["seconds"]) * speed
-            if max(fit, _MORE * entry["people"]) < _people(self._folder) and not self._over.is_set():
+            if max(fit, _MORE * entry["people"]) >= _people(self._folder):
+                return
+            # the number of a `StopRequest`: none before a resumed training runs; not 0 once the user has stopped it, and
+            # a second signal would abort the saving
+            if getattr(getattr(signal.getsignal(signal.SIGINT), "__self__", None), "number", None) == 0:
                 self.fit = fit
                 os.kill(os.getpid(), signal.SIGINT)
-            return
+                return
 
 
 def last_entry(folder: Path) -> dict[str, Any] | None:
@@ -267,7 +286,8 @@ def _shortened(step: Step, folder: Path, fit: float) -> list[str]:
     recipe = read_config(folder, KINDS[step.kind])[0].to_dict()
     name = next(name for name in LENGTHS if name in recipe)
     length = recipe[name] * share
-    return [f"--{name}", str(max(round(length), 1)) if name == "people" else f"{length:.4g}"]
+    # rounded up, so that it stays above what the run has seen
+    return [f"--{name}", str(math.ceil(length) if name == "people" else math.ceil(1e4 * length) / 1e4)]
 
 
 def length_of(step: Step, out: Path) -> tuple[str, ...]:
