@@ -781,6 +781,14 @@ def test_markdown_of_cells():
         assert line in page.splitlines()
 
 
+@pytest.mark.parametrize(("mean_pose", "is_noted"), [(200.4, False), (202.3, True)])
+def test_markdown_notes_columns_of_different_people(mean_pose, is_noted):
+    """The mean pose of other training people differs a little on the same people."""
+    entries = [_entry(), _entry(row="b", mean_pose=mean_pose), _entry(row="c", state="failed", reason="r", mean_pose=1)]
+    page = markdown({"title": "T", "target": "real sets", "people": 2000, "hours": None, "cells": entries})
+    assert ("- x: mean poses of 200.0 to 202.3 mm: the rows score different people" in page.splitlines()) is is_noted
+
+
 def test_table_leaves_out_seeds_that_were_neither_chosen_nor_run(tmp_path):
     options = Options(seeds=2)
     ours = next(c for c in cells(TABLES["table1"], options, ["ours"]) if c.seed == 1 and c.evaluation)
@@ -838,6 +846,20 @@ def test_fig7_is_drawn_from_copied_cells(tmp_path):
     (path,) = figures.draw("fig7", [cell], tmp_path)
     assert path.read_bytes().startswith(b"\x89PNG")
     assert "stability" not in report._entry(cell, tmp_path, "")
+
+
+def test_figures_have_all_finished_rows_whatever_the_chosen_ones(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(figures, "compare_stability", lambda studies: drawn.append(list(studies)) or b"")
+    selected = cells(TABLES["fig7"], Options(), ["dapt", "ours"])
+    (tmp_path / "cells").mkdir()
+    for cell in selected:
+        results = _entry(stability=_study(1))
+        report._path(cell.evaluation, tmp_path).write_text(
+            json.dumps({name: results[name] for name in results if name not in ("row", "column", "seed")})
+        )
+    assert main(["paper", "fig7", "--rows", "ours", "--table-only", "--out", str(tmp_path)]) == 0
+    assert drawn == [[cell.row for cell in selected]]
 
 
 def test_compare_stability_aligns_amounts_without_poses(monkeypatch):

@@ -87,7 +87,8 @@ def _paper(commands, execute: Callable[[list[str]], int], options: argparse.Name
     else:
         content = run_table(table, paper_options, out, row_keys, execute, tell)
     print(out / f"{table.name}.md")
-    for path in figures.draw(table.name, selected_cells, out) if table.name.startswith("fig") else ():
+    # of all rows, as the page: --rows says which to run
+    for path in figures.draw(table.name, cells(table, paper_options), out) if table.name.startswith("fig") else ():
         print(path)
     if failed := sum(entry["state"] == "failed" for entry in content["cells"]):
         done = "the others are done where they were asked for"
