@@ -232,9 +232,12 @@ def test_bare_attention_takes_rows_of_lower_precision(monkeypatch):
 
 @torch.no_grad()
 @pytest.mark.parametrize("count", [3, 40, 60, 200])
-def test_pointnet_features_are_independent_of_batch(count):
+@pytest.mark.parametrize("has_copies", [False, True])
+def test_pointnet_features_are_independent_of_batch(count, has_copies):
     torch.manual_seed(0)
     network, (points, valid) = PointNet2(64, 8).eval(), _cloud(4, (512, count))
+    if has_copies:
+        points[1, count // 2 : count] = points[1, : count - count // 2].clone()
     alone = network(points[1:, :count], valid[1:, :count])
     torch.testing.assert_close(network(points, valid)[1:], alone, atol=1e-5, rtol=1e-5)
 

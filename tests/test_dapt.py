@@ -467,8 +467,9 @@ def test_last_patch_contains_remainder(patch, lengths):
     torch.testing.assert_close(run(net, [row]).anchors, run(net, [row], "padded").anchors, rtol=1e-4, atol=1e-5)
 
 
-def test_layouts_agree_with_patches_and_small_people_are_exact():
-    net = network(replace(TINY, patch=100))
+@pytest.mark.parametrize("orders", [TINY.orders, ("hilbert",), ("z",)])
+def test_layouts_agree_with_patches_and_small_people_are_exact(orders):
+    net = network(replace(TINY, patch=100, orders=orders))
     clouds = [person(700), person(30, 1), person(100, 2), person(0)]
     ragged, padded = run(net, clouds), run(net, clouds, "padded")
     for name in ("anchors", "points", "inter", "logits_x", "parts"):

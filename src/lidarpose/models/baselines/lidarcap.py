@@ -125,9 +125,10 @@ class SetAbstraction(nn.Module):
         center_features = self.layers(rows.flatten(0, 2)).unflatten(0, shape).amax(2)
         is_center = torch.ones_like(center_index, dtype=torch.bool)
         if not self.as_published:
-            # a small cloud repeats a center; as neighbors of the next layer, copies would displace others
-            is_equal = center_index[:, :, None] == center_index[:, None]
-            is_center = ~is_equal.tril(-1).any(2)
+            # a small cloud repeats a center, or has copies of a point, of which a large batch would choose one; as
+            # neighbors of the next layer, copies would displace others
+            x, y, z = (axis[:, :, None] == axis[:, None] for axis in centers.unbind(-1))
+            is_center = ~(x & y & z).tril(-1).any(2)
         return centers, is_center, center_features
 
 

@@ -87,8 +87,8 @@ class PatchAttention(nn.Module):
             output = self._attend(blocks, level.patch_valid).flatten(0, 1)[place]
             return self.proj(output)
         sequence = level.sequence[order % level.sequence.shape[0]]
-        # with one curve, rows are already in the order of the patches
-        is_sorted = level.sequence.shape[0] == 1
+        # with one patch per person, rows are already in the order of the patches
+        is_sorted = level.patch_lengths.shape == level.lengths.shape
         qkv = (qkv if is_sorted else qkv[sequence]).unflatten(-1, (3, self.heads, -1))
         lengths = level.patch_lengths.tolist()
         if len(set(lengths)) == 1:
