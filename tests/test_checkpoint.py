@@ -2,7 +2,9 @@
 
 import copy
 import json
+import math
 import re
+import struct
 import warnings
 from pathlib import Path
 
@@ -152,6 +154,13 @@ def test_load_checkpoint_warns_without_digest(stored, tmp_path):
     assert all(torch.equal(value, same.state_dict()[name]) for name, value in network.state_dict().items())
 
 
+@pytest.mark.parametrize("shape", [[10**4000, 10**4000], [5], [-4]])
+def test_shape_of_a_tensor_fits_its_bytes(tmp_path, shape):
+    header = json.dumps({"w": {"dtype": "F32", "shape": shape, "data_offsets": [0, 4]}}).encode()
+    (tmp_path / "x.safetensors").write_bytes(struct.pack("<Q", len(header)) + header + bytes(4))
+    assert_one_line(tmp_path / "x.safetensors", "its header is damaged .tensor w.", read=parameter_count)
+
+
 def test_safetensors_file_survives_truncation_after_open(network, stored, tmp_path):
     """With a memory-mapped file, the process would crash."""
     path = tmp_path / "x.safetensors"
@@ -266,7 +275,8 @@ def test_load_checkpoint_rejects_invalid_headers(stored, tmp_path, header, words
         ({"head_channels": 5}, "must be divisible by head_channels"),
         ({"blocks": [1, 1]}, "blocks must be 3 whole numbers"),
         ({"blocks": 3}, "blocks must be 3 whole numbers"),
-        ({"grid": -1}, "grid must be a positive number"),
+        *(({"grid": grid}, "grid must be a positive number") for grid in (-1, math.inf, 10**400)),
+        ({"size": {"a": 1}}, "size must be text"),
         ({"heatmap": "round"}, "unknown heatmap 'round'"),
         ({"skeleton": "body27"}, "unknown skeleton 'body27'"),
     ],

@@ -9,6 +9,7 @@ import re
 import runpy
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -210,6 +211,23 @@ def test_info_sums_people_of_all_runs(monkeypatch, capsys):
 def test_random_initial_weights_are_no_run():
     card = {"command": "lidarpose finetune", "init_card": {}}
     assert runs_of(card) == [card] and runs_of(card | {"init_card": card}) == [card | {"init_card": card}, card]
+    for _ in range(2_000):
+        card = {"init_card": card}
+    assert len(runs_of(card)) == 2_001
+
+
+def test_info_of_a_card_with_wrong_types(monkeypatch, capsys):
+    header = read_header(bundled_path("tiny"))
+    card = {"hours": "x", "people_seen": "many", "command": 7, "init_card": {"hours": 10**400, "people_seen": 5}}
+    monkeypatch.setattr("lidarpose.models.checkpoint.read_header", lambda path: replace(header, card=card))
+    assert run("info", "tiny") == 0
+    lines = capsys.readouterr().out.splitlines()[1:]
+    assert lines == [
+        "trained  7",
+        " " * 9 + "unknown length, 0.00 hours",
+        "trained  unknown",
+        " " * 9 + "5 people, 0.00 hours",
+    ]
 
 
 def test_info_of_checkpoint_prints_network_and_runs(capsys):

@@ -412,6 +412,7 @@ def test_recipes_accept_numpy_numbers_paths_and_single_names():
         ({"shards": [3]}, r"shards must be a list of texts, got \[3\]"),
         # subjects need a motion file
         ({"subjects": ("a",)}, "subjects select captured clips: give their file by motion too"),
+        ({"captured": 1.0}, "captured is the share of captured poses: give their file by motion too"),
         ({"head": "arms"}, "unknown head 'arms': .*"),
         ({"drop_path": "much"}, "drop_path must be a number, got 'much'"),
         *(({"keep_anchors": value}, "keep_anchors must be true or false, got .*") for value in ("false", 0, None)),
@@ -436,6 +437,7 @@ def test_recipe_rejects_invalid_settings(change, message):
         ),
         (Pretrain, {"heatmap_rate": 10}, "heatmap_rate is for .*, tiny has none: omit it"),
         (Pretrain, {"size": "paper-small", "muon_rate": 0.01}, "muon_rate is for the package's own networks, .*: omit"),
+        (Pretrain, {"optimizer": "adam"}, "tiny is trained by Muon and AdamW: omit --optimizer, or add --muon-rate 0"),
         (Finetune, {"data": "a", "neck": "prn"}, "a checkpoint has its own neck: omit --neck"),
         (Finetune, {"data": "a", "set": "keep=0.5", "mix": 0}, "change the people that are mixed in: give --mix X"),
         (Finetune, {"data": "a", "set": "recorded=1"}, "recorded needs captured motion"),

@@ -85,12 +85,16 @@ def checkpoint_facts(weights: str) -> dict[str, Any]:
 
 
 def _checkpoint_lines(facts: dict[str, Any]) -> Iterator[str]:
+    from lidarpose.models.config import is_number
+
     name = facts["config"].get("size") or facts["config"].get("name") or facts["network"]
     yield f"{facts['file']}: {name}, {facts['parameters']:,} parameters, written by lidarpose {facts['lidarpose']}"
     for run in facts["runs"]:
-        seen = next((f"{value:,} {key[:-5]}" for key, value in run.items() if key.endswith("_seen")), "")
+        # cards are not checked when they are read
+        numbers = {key: value for key, value in run.items() if is_number(value)}
+        seen = next((f"{value:,} {key[:-5]}" for key, value in numbers.items() if key.endswith("_seen")), "")
         yield f"trained  {run.get('command', 'unknown')}"
-        yield f"         {seen or 'unknown length'}, {run.get('hours', 0):.2f} hours"
+        yield f"         {seen or 'unknown length'}, {numbers.get('hours', 0):.2f} hours"
 
 
 def installed() -> dict[str, Any]:

@@ -40,6 +40,8 @@ _EXPECTED = "a checkpoint (.safetensors)"
 _BUFFERS = ("running_mean", "running_var", "num_batches_tracked", "coord_range", "joint_wise_weight")
 # largest header that safetensors allows, bytes
 _MOST_HEADER = 100_000_000
+# end of any tensor in a file, bytes: numbers of thousands of digits cannot be printed
+_MOST_BYTES = 1 << 63
 _AGAIN = "get the file again"
 
 
@@ -76,9 +78,11 @@ class Header:
 
 def runs_of(card: dict) -> list[dict]:
     """The cards of all training runs behind the weights: the last run first, then the run that it started from, etc."""
-    init_card = card.get("init_card")
+    runs = [card]
     # random initial weights have no card
-    return [card, *(runs_of(init_card) if isinstance(init_card, dict) and init_card else [])]
+    while isinstance(init_card := runs[-1].get("init_card"), dict) and init_card:
+        runs.append(init_card)
+    return runs
 
 
 # ---- reading and writing
@@ -263,7 +267,9 @@ def _parse_safetensors(path: str | os.PathLike, content: bytes) -> dict:
         for name, entry in header.items():
             if name != "__metadata__":
                 start, stop = entry["data_offsets"]
-                if not 0 <= start <= stop or not all(isinstance(n, int) and n >= 0 for n in (start, *entry["shape"])):
+                is_valid = all(isinstance(n, int) and n >= 0 for n in (start, stop - start, *entry["shape"]))
+                # no type of number takes less than a byte
+                if not is_valid or math.prod(entry["shape"]) > stop - start or stop > _MOST_BYTES:
                     raise ValueError(f"tensor {name}")
                 end = max(end, stop)
     except json.JSONDecodeError as error:

@@ -1,5 +1,6 @@
 """The base class of network configurations, and the configuration and named sizes of the package's own network."""
 
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import MISSING, Field, asdict, dataclass, field, fields
@@ -27,7 +28,8 @@ def check_counts(name: str, value: Any, count: int, *, least: int = 1, levels: s
 
 
 def is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    """Whether a value is a finite number; integers of a file can be larger than any float."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 def at_least(least: int, default: Any = MISSING, *, levels: str = "") -> Any:
@@ -89,6 +91,7 @@ def _checked(f: Field, value: Any) -> Any:
         return check_counts(f.name, value, len(type_args), least=least, levels=f.metadata.get("levels", ""))
     checks: dict[Any, tuple[Callable[[Any], bool], str]] = {
         bool: (lambda flag: isinstance(flag, bool), "true or false"),
+        str: (lambda text: isinstance(text, str), "text"),
         float: (lambda number: is_number(number) and number > 0, "a positive number of meters"),
     }
     if f.metadata.get("probability"):

@@ -179,11 +179,13 @@ def finetuned_network(
 
 
 def check_rates(recipe: Pretrain | Finetune, config: Config) -> None:
-    """Raises InputError for a learning rate of layers that the network does not have."""
+    """Raises InputError for a learning rate of layers that the network does not have, and for Adam in place of Muon."""
     if recipe.heatmap_rate != 1 and not (isinstance(config, DaptConfig) and config.bins):
         raise InputError(f"heatmap_rate is for the paper's network with heatmaps, {config.name} has none: omit it")
     if recipe.muon_rate not in (0, type(recipe).muon_rate) and not isinstance(config, NetworkConfig):
         raise InputError(f"muon_rate is for the package's own networks, {config.name} is not one of them: omit it")
+    if recipe.optimizer != "adamw" and recipe.muon_rate and isinstance(config, NetworkConfig):
+        raise InputError(f"{config.name} is trained by Muon and AdamW: omit --optimizer, or add --muon-rate 0")
 
 
 def _with_options(config: Any, options: tuple[str, ...]) -> Any:

@@ -201,6 +201,8 @@ class Pretrain(PoseRecipe):
         check_name("head", self.head, HEADS)
         if self.subjects and not self.motion:
             raise InputError("subjects select captured clips: give their file by motion too")
+        if self.captured not in (0, type(self).captured) and not self.motion:
+            raise InputError("captured is the share of captured poses: give their file by motion too")
 
 
 @dataclass(frozen=True, kw_only=True)
