@@ -256,8 +256,8 @@ class _Watch:
             fit = entry["people"] + (self._seconds - entry["seconds"]) * speed
             if max(fit, _MORE * entry["people"]) >= _people(self._folder):
                 return
-            # the number of a `StopRequest`: none before a resumed training runs; not 0 once the user has stopped it, and
-            # a second signal would abort the saving
+            # the number of a `StopRequest`: None before a resumed training runs, 0 until the user stops it. A second
+            # signal would abort the saving
             if getattr(getattr(signal.getsignal(signal.SIGINT), "__self__", None), "number", None) == 0:
                 self.fit = fit
                 os.kill(os.getpid(), signal.SIGINT)
