@@ -19,7 +19,7 @@ _PRINTED = (
     " In parentheses the paper's values, not run here: those of LiDARCap and NE are relative to the root, "
     "without shapes; that of LPFormer on Waymo is for detected boxes."
 )
-# the mean pose's error on the same people varies by less, mm: its training people differ, and it is stored rounded
+# on the same people the mean pose's error varies by less, mm, unless it was made from a few training people
 _SAME_PEOPLE = 0.5
 # a metric of newer cells, and the rows whose printed values are in it
 ROOT, _ROOT_ROWS = "root_mpjpe", ("LiDARCap", "NE")
@@ -52,7 +52,7 @@ def result_lines(content: dict[str, Any]) -> list[str]:
 
 def _note_lines(entries: list[dict[str, Any]]) -> list[str]:
     """The notes of the evaluations, each once with the columns that it applies to, and one for a column whose mean
-    poses show that its people are not the same."""
+    poses tell that its people may not be the same."""
     columns: dict[str, list[str]] = {}
     mean_poses: dict[str, list[float]] = {}
     for entry in entries:
@@ -62,7 +62,7 @@ def _note_lines(entries: list[dict[str, Any]]) -> list[str]:
             mean_poses.setdefault(entry["column"], []).append(entry["mean_pose"])
     for column, errors in mean_poses.items():
         if max(errors) - min(errors) > _SAME_PEOPLE:
-            note = f"mean poses of {min(errors):.1f} to {max(errors):.1f} mm: the rows score different people"
+            note = f"mean poses of {min(errors):.1f} to {max(errors):.1f} mm: the rows may score different people"
             columns.setdefault(note, []).append(column)
     return [*(f"- {', '.join(dict.fromkeys(names))}: {note}" for note, names in columns.items()), *[""][: len(columns)]]
 
