@@ -101,12 +101,14 @@ class PoseBank:
         the origin, facing +x; None if no clip is long enough. tempo: see `SceneConfig`; if no clip is long enough for
         the drawn speed, the original speed is used."""
         speed = np.exp(rng.uniform(-tempo, tempo)) if tempo else 1.0
-        windows = self.clips.windows(ceil((frames - 1) * speed) + 1)
-        if not len(windows):
-            speed, windows = 1.0, self.clips.windows(frames)
-        if not len(windows):
+        length = ceil((frames - 1) * speed) + 1
+        starts = self.clips.window_starts(length)
+        if not len(starts):
+            speed, length, starts = 1.0, frames, self.clips.window_starts(frames)
+        if not len(starts):
             return None
-        clip = self.clips.cut(windows[rng.integers(len(windows))]).resampled(CLIP_HZ / speed)
+        start = starts[rng.integers(len(starts))]
+        clip = self.clips.cut(np.arange(start, start + length)).resampled(CLIP_HZ / speed)
         rotations, translation = facing_x(clip.rotations[None, :frames], clip.translation[None, :frames])
         rotations, (translation,) = _vary(rotations, rng, translation)
         return rotations[0], translation[0]

@@ -97,13 +97,17 @@ class Motion:
         rotations, translation = self._between(np.concatenate([*fractional_frames, np.zeros(0)]), last_frame)
         return replace(self, rotations=rotations, translation=translation, length=length, fps=float(hz))
 
+    def window_starts(self, frames: int) -> np.ndarray:
+        """First frames (n,) of the windows of `frames` frames, see `windows`."""
+        frame, last_frame = self._last_frames()
+        return frame[frame + frames - 1 <= last_frame]
+
     def windows(self, frames: int) -> np.ndarray:
         """Frame indices of all windows of `frames` frames: (n, frames) int. No window crosses the end of a clip.
 
         Index the same motion: `motion.rotations[motion.resampled(10).windows(16)]` would mix frame rates.
         """
-        frame, last_frame = self._last_frames()
-        return frame[frame + frames - 1 <= last_frame, None] + np.arange(frames)
+        return self.window_starts(frames)[:, None] + np.arange(frames)
 
     def cut(self, frames: np.ndarray) -> "Motion":
         """One clip of the frames (n,), such as a row of `windows`."""
