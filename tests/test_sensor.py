@@ -221,6 +221,7 @@ def test_load_sensor_json_sets_all_fields(tmp_path):
         ("a.json", {"elevations_deg": ANGLES, "tilt_deg": 400}, "within .*90 degrees, got 400"),
         ("a.json", {"elevations_deg": ANGLES, "range_max": "far"}, "range_max must be a number"),
         ("a.json", {"elevations_deg": ANGLES, "tilt_deg": "down"}, "tilt_deg must be a number"),
+        ("a.json", {"elevations_deg": ANGLES, "name": "a/b"}, "name must not contain '/'.*got 'a/b'"),
         ("a.json", {"elevations_deg": ANGLES, "range_min": 9.0, "range_max": 1.0}, "min < max"),
         ("a.csv", "elevation,azimuths\n1,2\n3,4\n", "unknown column 'azimuths': name it azimuth_offset"),
         ("a.csv", "\n\n", "no rows"),

@@ -212,12 +212,15 @@ def load_sensor(path: str | Path) -> Sensor:
         if offsets.shape != elevations.shape:
             raise file_error(path, f"has {len(elevations)} elevations and {len(offsets)} azimuth offsets")
         offsets = np.radians(-offsets[order] if clockwise else offsets[order])
+    name = str(fields.pop("name", path.stem))
+    if "/" in name:
+        raise file_error(path, f"the sensor's name must not contain '/', got {name!r}")
     columns = fields.pop("columns", _COLUMNS)
     if isinstance(columns, bool) or not isinstance(columns, int) or not 1 <= columns <= 100_000:
         raise file_error(path, f"columns must be a whole number of columns per turn, got {columns!r}")
     try:
         return Sensor(
-            name=str(fields.pop("name", path.stem)),
+            name=name,
             elevations=np.radians(elevations[order]),
             azimuth_offsets=offsets,
             azimuth_step=2 * np.pi / columns,
