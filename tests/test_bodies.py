@@ -8,7 +8,7 @@ from motion_files import joints_of
 
 from lidarpose.body.mocap.motion import Motion
 from lidarpose.body.pose_prior.clearance import cleared
-from lidarpose.body.rig import clothing, load_rig
+from lidarpose.body.rig import clothing, load_rig, mean_adult_joints
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth import bodies
@@ -69,6 +69,9 @@ def test_draw_bodies_uses_requested_share_of_captured_poses(share):
     step = np.array([drawn.moved(row)[1][0] for row in range(120)]) - drawn.joints[:, 0]
     aside = (np.abs(step[:, 0]) < 1e-3) & (np.abs(np.abs(step[:, 1]) - 0.09) < 0.05)
     assert aside.mean() == pytest.approx(share, abs=0.12) and captured[aside].all()
+    # their steps of 0.1 m are scaled with the length of their legs
+    ratio = bodies._leg_length(drawn.joints) / bodies._leg_length(mean_adult_joints()[None])
+    np.testing.assert_allclose(np.abs(step[aside & ~prior, 1]), 0.1 * ratio[aside & ~prior], rtol=0.01)
     if share == 0:
         np.testing.assert_array_equal(captured, prior)
 

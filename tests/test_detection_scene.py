@@ -6,16 +6,21 @@ from importlib import resources
 
 import numpy as np
 import pytest
+from walkers import strider
 
 from lidarpose.errors import InputError
+from lidarpose.lidar.presets import sensor
 from lidarpose.lidar.raycast import scan
 from lidarpose.lidar.sensor import Sensor
+from lidarpose.synth.detection_people import PlacedPerson
+from lidarpose.synth.detection_scan import _integrated
 from lidarpose.synth.detection_scene import DetectionScene, detection_scene
 from lidarpose.synth.environment.layouts import LAYOUTS, LEFT_OUT
 from lidarpose.synth.environment.mesh import shape
 from lidarpose.synth.environment.site import Mount, Site
 from lidarpose.synth.environment.things import KINDS, THINGS
 from lidarpose.synth.environment.traffic import with_windows
+from lidarpose.synth.place import Place
 
 LEFT_OUT_THINGS = {name for name, thing in THINGS.items() if thing.left_out}
 
@@ -96,6 +101,26 @@ def test_third_of_people_in_training_do_not_stand(train, heldout):
         for scenes in (train, heldout)
     )
     assert 0.26 < low < 0.4 and of_heldout < low - 0.05
+
+
+def test_label_of_long_frame_is_at_middle_of_extrapolated_motion():
+    step = np.array([0.1, -0.05, 0.02])
+    bodies, place = strider(step), Place(feet=np.zeros(3), yaw=0.0, distance=1.0)
+    person = PlacedPerson(bodies=bodies, row=0, place=place, props=[])
+    # three steps, the vertical one without the extrapolated two
+    motion = step * [3, 3, 1]
+    vertices, joints = person.label(0.3)
+    np.testing.assert_allclose(joints, bodies.joints[0] + motion / 2, atol=1e-6)
+    np.testing.assert_allclose(vertices, np.concatenate([bodies.vertices[0], bodies.vertices[0] + motion]), atol=1e-6)
+
+
+def test_integrated_rosette_spreads_frames_over_time():
+    azimuth, _, time, _ = _integrated("livox-avia", 3).rays(0)
+    parts = [sensor("livox-avia").rays(number) for number in range(3)]
+    np.testing.assert_array_equal(azimuth, np.concatenate([part[0] for part in parts]))
+    # each frame fills its own third of the time
+    np.testing.assert_array_equal((3 * time).astype(int), np.repeat(range(3), [len(part[0]) for part in parts]))
+    assert 0 <= time.min() < 0.01 and 0.99 < time.max() < 1
 
 
 def test_with_windows_lets_beams_into_some_cars():

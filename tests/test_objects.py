@@ -9,8 +9,9 @@ from lidarpose.errors import InputError
 from lidarpose.lidar.presets import sensor
 from lidarpose.sample import Sample
 from lidarpose.skeleton import BODY26
+from lidarpose.synth import objects
 from lidarpose.synth.acquisition import Acquisition
-from lidarpose.synth.environment.mesh import Mesh
+from lidarpose.synth.environment.mesh import Mesh, box
 from lidarpose.synth.environment.things import THINGS
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.objects import LEAST_POINTS, draw_object
@@ -47,6 +48,13 @@ def test_draw_object_has_no_person(left_out):
         assert sample.box.contains(sample.points).all()
         assert (sample.box.size <= [1.2, 1.2, 2.2]).all()
     assert len(kinds) >= (4 if left_out else 10)
+
+
+def test_draw_object_crops_surface_of_large_thing(monkeypatch):
+    # its middle is farther from its surface than a box reaches
+    monkeypatch.setattr(objects, "draw_thing", lambda name, rng: box((4.0, 4.0, 1.8)))
+    for index in range(4):
+        draw_object(replace(WILD, noise=NoiseConfig()), 1, index)
 
 
 @pytest.mark.parametrize("name", ["merged", "accumulated", "inverted", "sparse"])

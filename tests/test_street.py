@@ -185,6 +185,13 @@ def test_pedestrian_has_activity_of_streets(monkeypatch):
     assert module._draw_pedestrian(4, RNG(0)).kinds[0] == "run"
 
 
+def test_people_on_sidewalks_head_along_street():
+    plan = module.StreetPlan(road=3.0, front=7.0, kerb=0.1, sensor_y=0.5, height=1.8, turn=0.4, ahead=False)
+    places = [module._draw_start(plan, goer(still=True), RNG(seed))[0] for seed in range(60)]
+    along = [abs(np.cos(place.yaw - plan.turn)) for place in places if place.feet[2] > -plan.height + 0.05]
+    assert len(along) > 35 and min(along) > 0.95
+
+
 def test_rosette_pattern_continues_in_next_frame():
     still, walker = quad(20.0, np.zeros(2)).moved((0, 0, -1.2)), (goer(still=True), replace(WALKER, yaw=0.0))
     turn = (sensor("livox-avia"), still, [walker])

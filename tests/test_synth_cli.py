@@ -356,18 +356,21 @@ def test_hard_sets_difficulty_of_people(tmp_path):
 
 
 def test_streets_alternate_between_sensors(monkeypatch, tmp_path):
-    asked = []
+    asked, box_draws = [], set()
 
     def made(seed, index, *, sensor, frames):
         asked.append((index, sensor))
         return Street(frames=(), sensor=sensor, height=1.7)
 
     monkeypatch.setattr(street, "street", made)
+    monkeypatch.setattr(street, "samples", lambda scene, rng: box_draws.add(rng.random()) or [])
     job = SynthesisJob(what="streets", count=5, sensors=("os1-64", "vlp-16"))
     maker = Maker(job=job, card=job.card(), folder=tmp_path, generator=job.generator())
     for index in range(5):
         maker._street_rows(index)
     assert asked == [(k, ("os1-64", "vlp-16")[k % 2]) for k in range(5)]
+    # each street has its own errors of boxes
+    assert len(box_draws) == 5
 
 
 def test_job_passes_scene_and_captured_share_to_generator(tmp_path):
