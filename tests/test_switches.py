@@ -82,8 +82,8 @@ def test_keep_option_sets_mask_of_scene(tmp_path, monkeypatch):
 # --- recorded positions
 
 
-def _bank(offset):
-    rotations, way = files.a_clip(8)
+def _bank(offset, frames=8):
+    rotations, way = files.a_clip(frames)
     folder_motion = load_motion_of(rotations, way + offset)
     return PoseBank.of_motion(folder_motion), folder_motion
 
@@ -133,11 +133,22 @@ def test_recorded_positions_need_motion_and_single_frames(tmp_path):
     with pytest.raises(InputError, match="--clips"):
         SynthesisJob(what="clips", count=1, motion="m.npz", set=("recorded=1",))
     bank, _ = _bank(np.zeros(3))
+    with pytest.raises(InputError, match="ask for --captured above 0"):
+        Generator(scene=scene, bank=bank)
     with pytest.raises(InputError, match="clips have no recorded positions: set recorded=0"):
         Generator(scene=scene, bank=bank, captured=1.0).clip(1, 0)
     for changes, words in ((("accumulated=0.1",), "set accumulated=0"), (("integration=1",), "set integration=0")):
         with pytest.raises(InputError, match=words):
             Generator(scene=scene.changed(changes), bank=bank, captured=1.0)
+
+
+def test_combined_frames_of_captured_people_need_long_clips():
+    scene = scene_config("wild").changed(("accumulated=0.5",))
+    short, enough = (_bank(np.zeros(3), frames)[0] for frames in (5, 6))
+    with pytest.raises(InputError, match="no clip lasts 0.5 s.*: give longer motion, or set accumulated=0$"):
+        Generator(scene=scene, bank=short, captured=1.0)
+    for bank, captured in ((short, 0.5), (enough, 1.0)):
+        Generator(scene=scene, bank=bank, captured=captured)
 
 
 # --- random weights

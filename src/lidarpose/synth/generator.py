@@ -22,7 +22,7 @@ from lidarpose.sample import CLIP_FRAMES, Box, PersonInfo, Pose, Sample, center_
 from lidarpose.skeleton import BODY26
 from lidarpose.synth import noise
 from lidarpose.synth.acquisition import ACQUISITION_DRAWS, MOST_FRAMES, SINGLE_SCAN, Acquisition, draw_acquisition
-from lidarpose.synth.bodies import Bodies, PoseBank, draw_bodies, draw_moving_bodies
+from lidarpose.synth.bodies import CLIP_HZ, Bodies, PoseBank, draw_bodies, draw_moving_bodies
 from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.environment.surroundings import ground, occluder, surroundings
 from lidarpose.synth.place import Place, draw_place
@@ -84,12 +84,18 @@ class Generator:
         if not 0 <= self.captured <= 1:
             raise InputError(f"Generator.captured must be a share in [0, 1], got {self.captured}")
         if self.config.recorded and not self.captured:
-            raise InputError("recorded=1 keeps the positions of captured motion: give its file by --motion")
+            needed = "give its file by --motion" if self.bank is None else "ask for --captured above 0"
+            raise InputError(f"recorded=1 keeps the positions of captured motion: {needed}")
         multi_frame_fields = [name for name in ("accumulated", "integration") if getattr(self.config, name)]
+        settings = " and ".join(f"{name}=0" for name in multi_frame_fields)
         if self.config.recorded and multi_frame_fields:
-            settings = " and ".join(f"{name}=0" for name in multi_frame_fields)
             raise InputError(
                 f"recorded=1 keeps the positions of single frames, and combined frames have none: set {settings}"
+            )
+        if multi_frame_fields and self.captured == 1 and not len(self.bank.clips.window_starts(MOST_FRAMES + 1)):
+            raise InputError(
+                f"{self.bank.clips.source}: no clip lasts {MOST_FRAMES / CLIP_HZ:g} s, which combined frames need: "
+                f"give longer motion, or set {settings}"
             )
         # an unknown sensor raises here rather than at the first person
         self._bodies  # noqa: B018
