@@ -319,8 +319,8 @@ class PersonInfo:
     sensor: name; kind: activity, a name of `body.pose_prior.activities.KINDS`; distance: horizontal, from the sensor,
     m; visible: number of returns from body and clothes, as a fraction (at most 1) of the returns from the body alone
     without any loss, so that returns lost to range or slant count as hidden too; height_seen: fraction of the body
-    height between its lowest and highest return; clutter: fraction of points that are neither body nor ground; upright:
-    whether the person stands or walks.
+    height between its lowest and highest return, above 1 if noise or motion raise or lower returns; clutter: fraction
+    of points that are neither body nor ground; upright: whether the person stands or walks.
     """
 
     sensor: str = ""
