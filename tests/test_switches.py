@@ -41,6 +41,12 @@ def test_scene_fields_are_changed_by_name():
     assert (masked.mask, masked.mask_keep) == (1.0, (0.6, 0.6))
     assert scene.changed(()) == scene
     assert scene.changed(("sensors=os1-64:hdl-64e",)) == replace(scene, sensors=("os1-64", "hdl-64e"))
+    # converted by the declared type, not by that of the old value
+    assert scene_config("paper").changed(("median_points=0.9",)).median_points == 0.9
+    assert scene.changed(("dapt_compat=1",)).noise.dapt_compat is True
+    # `sparse` would replace the named sensors
+    named, both = (scene_config("wide").changed(("sensors=os1-64", *more)) for more in ((), ("sparse=0.5",)))
+    assert (named.sensors, named.sparse, both.sparse) == (("os1-64",), 0.0, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -56,6 +62,9 @@ def test_scene_fields_are_changed_by_name():
         ("slope=-1", "at least 0"),
         ("slope=nan", "expected slope"),
         ("distance=9:4", "LOW:HIGH"),
+        ("most_clutter=1.5", "most_clutter must be a whole number, got 1.5"),
+        ("apart=0.5", "apart must be 0 or 1, got 0.5"),
+        ("dapt_compat=0.5", "dapt_compat must be 0 or 1, got 0.5"),
     ],
 )
 def test_scene_rejects_unknown_fields_and_invalid_values(setting, told):

@@ -166,6 +166,23 @@ BAD = {
     "nobody seen": (["-n", "3", "--sensor", "../near.json"], "sensors such as near"),
     "scene of streets": (["-n", "1", "--scenes", "--scene", "paper"], "their own scene"),
     "tempo": (["-n", "1", "--set", "tempo=0.5"], "tempo changes nothing without captured motion"),
+    "tempo of single frames": (
+        ["-n", "1", "--motion", "../short.npz", "--set", "tempo=0.5"],
+        "of clips or accumulated frames: give --motion, and --clips or accumulated, too, or omit it",
+    ),
+    "tempo of no captured poses": (
+        ["-n", "1", "--clips", "--motion", "../short.npz", "--captured", "0", "--set", "tempo=0.5"],
+        "tempo changes nothing without captured motion",
+    ),
+    "clear limbs": (["-n", "1", "--set", "clear_limbs=1"], "clear_limbs changes nothing without captured poses"),
+    "sigma": (
+        ["-n", "1", "--scene", "reference", "--set", "sigma=0.5:1"],
+        "sigma changes nothing without symmetric range noise: set dapt_compat=0",
+    ),
+    "double rate of clips": (
+        ["-n", "1", "--clips", "--scene", "wide", "--set", "double_rate=0.5"],
+        "double_rate changes nothing without merged clouds of people",
+    ),
     "double rate": (["-n", "1", "--set", "double_rate=0.5"], "double_rate changes nothing without merged clouds"),
     "integration": (
         ["-n", "1", "--scene", "wide", "--sensor", "os1-64", "--set", "integration=1"],
@@ -381,3 +398,11 @@ def test_job_passes_scene_and_captured_share_to_generator(tmp_path):
         generator = job.generator()
         assert generator.scene == scene_config("paper") and generator.captured == share
         assert (generator.bank is None) == (not settings)
+
+
+def test_sensors_are_named_by_option_or_as_field_of_scene():
+    by_option, by_field = (
+        SynthesisJob(what="people", count=1, scene="wide", **settings)
+        for settings in (dict(sensors=("os1-64",)), dict(set=("sensors=os1-64",)))
+    )
+    assert by_option.card() == by_field.card() and by_option.generator() == by_field.generator()

@@ -51,6 +51,8 @@ _SHARES = frozenset(
     "recorded clear_limbs hard mask ground_window box_window mask_keep missing_part intensity_dropout beam_divergence "
     "dapt_compat loose cut".split()
 )
+# fields that are 0 or 1
+_SWITCHES = frozenset("apart recorded ground_window box_window clear_limbs dapt_compat".split())
 
 
 def _check_fields(config: Any) -> None:
@@ -220,13 +222,15 @@ class SceneConfig:
     def changed(self, settings: Sequence[str]) -> "SceneConfig":
         """The same scenes with some fields changed, each given as "name=value": a field of the scene, its noise or its
         crops; a range is "distance=4:12"; the noise's clutter is "noise.clutter". "keep=R" is the paper's r_keep: every
-        sample is masked and keeps a share R; several sensors are "sensors=NAME:NAME". Raises InputError for an unknown
-        field or an invalid value.
+        sample is masked and keeps a share R; several sensors are "sensors=NAME:NAME", which sets `sparse` to 0 unless
+        it is given too. Raises InputError for an unknown field or an invalid value.
         """
         scene = self
         for setting in settings:
             scene = _changed(scene, *setting.partition("=")[::2])
-        return scene
+        names = {setting.partition("=")[0] for setting in settings}
+        # `sparse` would replace the chosen sensors by others
+        return replace(scene, sparse=0.0) if "sensors" in names and "sparse" not in names else scene
 
 
 def _changed(scene: SceneConfig, name: str, text: str) -> SceneConfig:
@@ -244,20 +248,21 @@ def _changed(scene: SceneConfig, name: str, text: str) -> SceneConfig:
         return replace(scene, sensors=tuple(text.split(":")))
     check_name("setting of the scene", name, ("sensors", *targets))
     group, field_name = targets[name]
-    old_value = getattr(groups[group], field_name)
+    declared: Any = {field.name: field.type for field in fields(groups[group])}[field_name]
+    is_pair = declared == tuple[float, float]
     try:
         numbers = [float(part) for part in text.split(":")]
-        is_valid = len(numbers) in ((1, 2) if isinstance(old_value, tuple) else (1,)) and all(
-            0 <= n < inf for n in numbers
-        )
+        is_valid = len(numbers) in ((1, 2) if is_pair else (1,)) and all(0 <= n < inf for n in numbers)
         if not is_valid or numbers[0] > numbers[-1]:
             raise ValueError
     except ValueError:
-        expected = "a number or two, LOW:HIGH" if isinstance(old_value, tuple) else "a number"
+        expected = "a number or two, LOW:HIGH" if is_pair else "a number"
         raise InputError(f"expected {name}={expected}, at least 0, got {name}={text}") from None
     if field_name in _SHARES and numbers[-1] > 1:
         raise InputError(f"{name} must be between 0 and 1, got {text}")
-    value = (numbers[0], numbers[-1]) if isinstance(old_value, tuple) else type(old_value)(numbers[0])
+    if (declared is int or field_name in _SWITCHES) and numbers[0] % 1:
+        raise InputError(f"{name} must be {'a whole number' if declared is int else '0 or 1'}, got {text}")
+    value = (numbers[0], numbers[-1]) if is_pair else declared(numbers[0])
     changes: dict[str, Any] = {field_name: value} | ({"mask": 1.0} if name == "keep" else {})
     if not group:
         return replace(scene, **changes)

@@ -98,13 +98,19 @@ class SynthesisJob:
             sensor(name)
         devices = map(sensor, scene.sensors if self.sensors is None else self.sensors)
         has_rosette = any(isinstance(device, RayPattern) and device.duration for device in devices)
+        has_motion = self.what == "clips" or scene.accumulated or (scene.integration and has_rosette)
         without_effect = {
-            "tempo": (self.motion is None, "captured motion: give its file with --motion too"),
-            "double_rate": (not scene.merged, "merged clouds: set merged, too"),
+            "tempo": (
+                not (self.share and has_motion),
+                "captured motion of clips or accumulated frames: give --motion, and --clips or accumulated, too",
+            ),
+            "clear_limbs": (not self.share, "captured poses: give their file with --motion too"),
+            "double_rate": (self.what == "clips" or not scene.merged, "merged clouds of people: set merged, too"),
             "integration": (not has_rosette, "rosettes: name one by --sensor"),
+            "sigma": (scene.noise.dapt_compat, "symmetric range noise: set dapt_compat=0"),
         }
         for name, (is_unused, needed) in without_effect.items():
-            if name in set_names and getattr(scene, name) and is_unused:
+            if name in set_names and getattr(scene, name, True) and is_unused:
                 raise InputError(f"{name} changes nothing without {needed}, or omit it")
         if self.sensors is not None and not self.sensors:
             raise InputError("expected the names of sensors, got none; lidarpose sensors lists them")
@@ -129,7 +135,7 @@ class SynthesisJob:
             # `sparse` would replace the chosen sensors by others
             scene = replace(scene, sensors=self.sensors, sparse=0.0)
         bank = PoseBank.from_clips(self.motion, self.subjects) if self.motion is not None else None
-        if self.what == "clips" and self.share and bank is not None and not len(bank.clips.windows(CLIP_FRAMES + 1)):
+        if self.what == "clips" and bank and self.share and not len(bank.clips.window_starts(CLIP_FRAMES + 1)):
             raise file_error(
                 self.motion, f"no clip lasts {CLIP_FRAMES / CLIP_HZ:g} s: give longer motion, or omit --clips"
             )
