@@ -44,7 +44,8 @@ from lidarpose.train.setup import make_setup
 class Way:
     """How the paper's network is trained. scene: the scene of the training people; rates: learning rates of the two
     stages; anchors: whether anchors are kept between the stages; recipe: changes of the recipe; one_stage: all people
-    train heatmaps, at the second rate."""
+    train heatmaps, at the second rate; dropout: of the neck, 0.1, and stochastic depth of 0.1; else none and 0.05, as
+    in the package's reduced sizes."""
 
     what: str
     scene: str = "paper"
@@ -52,6 +53,7 @@ class Way:
     anchors: bool = False
     recipe: dict | None = None
     one_stage: bool = False
+    dropout: bool = True
 
 
 OURS = "ours"
@@ -60,7 +62,13 @@ DECODINGS: tuple[str, ...] = ("dark", "window")
 # people of the paper's own scene
 OWN_PEOPLE = 1000
 _FASTER: dict[str, Any] = {"rates": (2e-3, 2e-3), "anchors": True, "recipe": {"ema": 0.99, "clip": 1.0}}
-_HEATMAPS = {"heatmap_rate": 10.0}
+_HEATMAPS: dict[str, Any] = _FASTER | {"recipe": _FASTER["recipe"] | {"heatmap_rate": 10.0}}
+_ONE_STAGE: dict[str, Any] = {
+    "scene": "wild",
+    "rates": (0.0, 2e-3),
+    "recipe": {"warmup": 0.1, "clip": 35.0, "decay": 0.01, "heatmap_rate": 10.0},
+    "one_stage": True,
+}
 WAYS = {
     "paper": Way("the paper's network and recipe"),
     "paper, faster": Way(
@@ -68,22 +76,26 @@ WAYS = {
     ),
     "paper, wild": Way("the paper's network, rates of 2e-3, on our people", scene="wild", **_FASTER),
     "paper, heatmaps": Way(
-        "the paper's network, the same rates, ten times that in the last layer of heatmaps",
-        **_FASTER | {"recipe": _FASTER["recipe"] | _HEATMAPS},
+        "the paper's network, the same rates, ten times that in the last layer of heatmaps", **_HEATMAPS
+    ),
+    "paper, heatmaps, no dropout": Way(
+        "the paper's network, these rates, no dropout in the neck and less stochastic depth", **_HEATMAPS, dropout=False
     ),
     "paper, one stage": Way(
-        "the paper's network, heatmaps alone in one stage and one cycle, the same rates, on our people",
-        scene="wild",
-        rates=(0.0, 2e-3),
-        recipe={"warmup": 0.1, "clip": 35.0, "decay": 0.01} | _HEATMAPS,
-        one_stage=True,
+        "the paper's network, heatmaps alone in one stage and one cycle, the same rates, on our people", **_ONE_STAGE
+    ),
+    "paper, one stage, no dropout": Way(
+        "the paper's network, this one stage on our people, no dropout in the neck and less stochastic depth",
+        **_ONE_STAGE,
+        dropout=False,
     ),
     OURS: Way("ours: `tiny` without convolutions", scene="wild"),
 }
 
 
-def sized(config: DaptConfig) -> DaptConfig:
+def sized(config: DaptConfig, dropout: bool) -> DaptConfig:
     """The paper's design at the size of `tiny`."""
+    regularization: dict[str, Any] = {"anchor_dropout": 0.1, "drop_path": 0.1} if dropout else {}
     return replace(
         small(config),
         name=f"tiny-{config.name}",
@@ -93,6 +105,7 @@ def sized(config: DaptConfig) -> DaptConfig:
         decoder_channels=(32, 32),
         decoder_heads=(4, 4),
         anchor_channels=(32, 32, 32),
+        **regularization,
     )
 
 
@@ -137,10 +150,10 @@ def run_paper(options: argparse.Namespace, name: str, seed: int, folder: Path) -
     heatmap_rate = changes.pop("heatmap_rate", 1.0)
     changes |= {"strays": 0.2, "noise": 0.15} if variant.scene == "wild" else {}
     settings = recipe(Pretrain, "paper", **changes, seed=seed, rate=variant.rates[0])
-    finetuning = DaptObjective(config=sized(finetuning_config("humanm3")), stage="finetune")
+    finetuning = DaptObjective(config=sized(finetuning_config("humanm3"), variant.dropout), stage="finetune")
     make_network: Callable[[], nn.Module] = finetuning.network
     if not variant.one_stage:
-        pretraining = DaptObjective(config=sized(pretraining_config()), stage="pretrain")
+        pretraining = DaptObjective(config=sized(pretraining_config(), variant.dropout), stage="pretrain")
         setup = replace(make_setup(settings), objective=pretraining, network=pretraining.network)
         trained_network, _ = load_checkpoint(train(settings, folder / "pretrain", setup=setup))
         make_network = partial(transferred, trained_network, finetuning.config, keep_anchors=variant.anchors)
