@@ -139,8 +139,8 @@ def finetuning_config(dataset: str) -> DaptConfig:
 def small(config: DaptConfig) -> DaptConfig:
     """The same design, joints and heads with a fortieth of the weights and levels of 4, 8 and 16 cm, for CPUs.
 
-    Less stochastic depth, and no dropout in the neck: with them, two stages do not learn the facing of 100,000 people,
-    and attention with dropout has no fast implementation on CPUs.
+    Less stochastic depth, and no dropout in the neck: with them pre-training takes a quarter more people to learn the
+    facing, and attention with dropout has no fast implementation on CPUs.
     """
     return replace(
         config,
