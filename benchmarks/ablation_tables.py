@@ -33,7 +33,6 @@ FIGURES = {
 }
 # figure of `against_paper.py`
 OWN_SCENE = "the paper's scene"
-_BESIDE = ("all", "plain", "clean", "cluttered")
 _SHOWN = ("plain", "clean", "cluttered", "company", "occluded", "turned round")
 # names of figures and conditions on the pages, if they differ from those in the data
 WORDS = {"company": "second person", "crop": "poor box", "turned round": "facing > 90 deg off"}
@@ -184,9 +183,7 @@ def against_paper(runs: list[dict]) -> Rows:
 def _beside(runs: Runs, variant: str) -> tuple[str, ...]:
     run = runs.by[variant, runs.seeds(variant)[0]]
     clutter_cost = runs.mean(variant, "cluttered") - runs.mean(variant, "clean")
-    cells = [f"{runs.mean(variant, figure):.1f}" for figure in _BESIDE]
-    # older runs were not scored there
-    own = f"{runs.mean(variant, OWN_SCENE):.1f}" if OWN_SCENE in run["figures"] else "-"
+    *cells, own = (f"{runs.mean(variant, name):.1f}" for name in ("all", "plain", "clean", "cluttered", OWN_SCENE))
     minutes = np.mean([runs.by[variant, seed]["processor_seconds"] for seed in runs.seeds(variant)]) / 60
     people, parameters = f"{runs.people:,}", f"{run['parameters']:,}"
     return run["what"], people, parameters, *cells, f"{clutter_cost:+.1f}", own, f"{minutes:.0f}"
