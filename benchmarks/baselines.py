@@ -1,6 +1,7 @@
 """People per second of each network, in a training step and in inference, on people synthesized for training.
 
     python benchmarks/baselines.py prn lpformer dapt paper-small ours lidarcap ne --threads 1
+    python benchmarks/baselines.py prn lpformer dapt --precision bf16     # training steps as with `--precision bf16`
 
 Names are model names or sizes. For networks that read clips, each frame counts as a person. Times are this process's
 processor time, on which other programs have little influence; with several threads, time on the clock of a machine that
@@ -31,7 +32,9 @@ def main() -> None:
     parser.add_argument("models", nargs="*", default=list(MODELS), metavar="MODEL")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--people", type=int, default=16, help="a batch")
+    parser.add_argument("--precision", choices=("float32", "bf16"), default="float32", help="of training steps")
     options = parser.parse_args()
+    is_bf16 = options.precision == "bf16"
     torch.set_num_threads(options.threads)
     source = SyntheticSource(scene="wild", seed=0)
     # training sorts people by size, so the people of a batch have similar sizes
@@ -55,7 +58,9 @@ def main() -> None:
             def step(
                 objective=objective, network=network, network_optimizers=network_optimizers, arrays=arrays
             ) -> None:
-                total(objective.terms(network.train(), arrays)).backward()
+                with torch.autocast("cpu", torch.bfloat16, enabled=is_bf16):
+                    loss = total(objective.terms(network.train(), arrays))
+                loss.backward()
                 for optimizer in network_optimizers:
                     optimizer.step()
                     optimizer.zero_grad()

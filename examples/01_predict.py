@@ -1,7 +1,7 @@
 """The pose of one person from an array of points.
 
 The cloud here is synthesized; yours may come from anywhere, as an (n, 3) array in meters with z up.
-Run: python examples/01_predict.py    (needs, in the clone: pip install '.[synth]')
+Run: python examples/01_predict.py    (needs, in the clone: pip install ".[synth]")
 """
 
 import lidarpose

@@ -1,7 +1,7 @@
 """All people in a whole sweep, detected or given by boxes, from files.
 
 The sweep here is synthesized and written first; for your own files only the second half is needed.
-Run: python examples/02_people_in_a_sweep.py    (needs, in the clone: pip install '.[synth]')
+Run: python examples/02_people_in_a_sweep.py    (needs, in the clone: pip install ".[synth]")
 """
 
 import json

@@ -528,7 +528,7 @@ def test_commands_name_missing_extra(tmp_path):
     *lines, damaged = done.stderr.splitlines()
     assert "something else" in damaged
     for line, extra in zip(lines, LACKING.values(), strict=True):
-        assert re.fullmatch(rf"lidarpose: error: .*: in the clone, pip install '\.\[{extra}\]'", line), line
+        assert re.fullmatch(rf"lidarpose: error: .*: in the clone, pip install \"\.\[{extra}\]\"", line), line
     needs = [re.search(r"(.*) needs .*\[(.*)\]", line).groups() for line in done.stdout.splitlines()]
     assert needs[:2] == [("lidarpose.export", "export"), ("lidarpose.import_dapt", "train")]
     assert needs[2] == (f"running {DEFAULT}.safetensors with torch", "train")

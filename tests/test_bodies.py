@@ -9,6 +9,7 @@ from motion_files import joints_of
 from lidarpose.body.mocap.motion import Motion
 from lidarpose.body.pose_prior.clearance import cleared
 from lidarpose.body.rig import clothing, load_rig, mean_adult_joints
+from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import BODY26, SMPL24
 from lidarpose.synth import bodies
@@ -93,6 +94,12 @@ def test_draw_moving_bodies_captured_share_and_jumps(share):
         # a frame ends with the pose of the next frame
         np.testing.assert_array_equal(somebody.moved(0)[0], somebody.vertices[1])
         np.testing.assert_array_equal(somebody.moved(0)[1], somebody.joints[1])
+
+
+def test_generator_clip_rejects_motion_shorter_than_a_clip():
+    generator = Generator(scene="wild", bank=PoseBank.of_motion(motion(frames=10)), captured=1.0)
+    with pytest.raises(InputError, match=r"no clip lasts 16 frames, 1.5 s: give longer motion, or lower captured"):
+        generator.clip(0, 0)
 
 
 def test_draw_moving_bodies_mixes_sources_in_any_order():

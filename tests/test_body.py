@@ -11,6 +11,7 @@ from reference.rig import add_folds_reference, pose_bodies_reference, vertex_nor
 from lidarpose.body import rig as body_rig
 from lidarpose.body.rig import MAX_CLOTHING, clothing, forward_kinematics, load_rig, pose_bodies, sample_people
 from lidarpose.body.rig_kernels import dress_people, fold_clothing, vertex_normals
+from lidarpose.errors import InputError
 from lidarpose.geometry import axis_angle_to_matrix, rotation_about
 from lidarpose.skeleton import BODY26, SMPL24
 
@@ -190,6 +191,13 @@ def test_pose_bodies_is_rigid_and_follows_forward_kinematics(rig, some):
     a, b = np.array(BODY26.bones).T
     length = [np.linalg.norm(j[:, a] - j[:, b], axis=-1) for j in (after[1], some.joints)]
     np.testing.assert_allclose(*length, atol=1e-5)
+
+
+def test_pose_bodies_rejects_other_shapes(rig):
+    rest, eye = rig.rest(np.zeros((1, rig.coefficients.shape[1]))), np.broadcast_to(np.eye(3), (2, 24, 3, 3))
+    for rotations, translation in ((eye, np.zeros((2, 3))), (eye[:1], np.zeros(3)), (eye[:1, :23], np.zeros((1, 3)))):
+        with pytest.raises(InputError, match=r"1 bodies need rotations \(1, 24, 3, 3\) and translation \(1, 3\)"):
+            pose_bodies(rig, rest, rotations, translation)
 
 
 def test_pose_bodies_bends_joints_in_expected_directions(rig, mean_adult):

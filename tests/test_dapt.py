@@ -594,6 +594,7 @@ def test_named_configs_have_joints_of_released_networks():
         ({"strides": (2, 3)}, "strides must be 2, 4 or 8"),
         ({"orders": ("z", "spiral")}, "unknown curve 'spiral'"),
         ({"orders": ()}, "at least one curve"),
+        ({"orders": 5}, "at least one curve of .*, got 5"),
         ({"drop_path": 1.0}, "drop_path must be a probability"),
         ({"joints": ("nose", "nose")}, "joints must be joint names, each once"),
         ({"joints": ("noze",)}, "unknown joint of body26 'noze': did you mean nose"),

@@ -259,7 +259,7 @@ def test_study_without_poses_or_numba_can_be_drawn(synthetic, monkeypatch):
 
     monkeypatch.setattr(module, "_sensor_curve", missing)
     nobody = studied(set_up(synthetic, lambda points: None))
-    assert "'.[synth]'" in nobody.notes[0] and "sensors" not in [curve.name for curve in nobody.curves]
+    assert '".[synth]"' in nobody.notes[0] and "sensors" not in [curve.name for curve in nobody.curves]
     assert all(point.mpjpe is None for curve in nobody.curves for point in curve.points) and not nobody.ends
     sensors = replace(nobody.curves[0], name="sensors")
     assert draw_stability(replace(nobody, curves=(*nobody.curves, sensors)))[:4] == b"\x89PNG"

@@ -377,7 +377,7 @@ def test_export_rejects_bad_format_name_and_path(folder, tmp_path, monkeypatch):
 
 def test_export_names_missing_extra(folder, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "onnxscript", None)
-    with pytest.raises(MissingExtra, match=r"pip install '\.\[export\]'"):
+    with pytest.raises(MissingExtra, match=r'pip install "\.\[export\]"'):
         export(folder / "net.safetensors", tmp_path / "out.onnx")
     assert list(tmp_path.iterdir()) == []
 

@@ -152,6 +152,8 @@ def test_atomic_path_reports_disk_errors(tmp_path, monkeypatch, call, number):
     [
         ("a" * 300, "choose a shorter name"),
         ("", "^'': is a folder; give the name of a file"),
+        ("~/a.txt", "~ was not replaced with the home folder; give the whole path"),
+        ("~somebody/a.txt", "~somebody was not replaced"),
         (".", "is a folder; give the name of a file"),
         ("file/a.txt", "file .*is a file: choose another folder"),
         ("file/deeper/a.txt", "file/deeper .*is a file: choose another folder"),
@@ -166,6 +168,14 @@ def test_write_atomic_rejects_invalid_paths(tmp_path, monkeypatch, path, words):
     assert "\n" not in str(caught.value) and tree(tmp_path) == ["file"]
     with pytest.raises(InputError, match="3: expected the path of a file to write"):
         check_suffix(3, ".png")
+
+
+def test_write_atomic_accepts_an_existing_folder_that_begins_with_a_tilde(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "~old").mkdir()
+    write_atomic("~old/a.txt", "x")
+    write_atomic("./~new.txt", "x")
+    assert tree(tmp_path) == ["~new.txt", "~old", "~old/a.txt"]
 
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")

@@ -165,7 +165,7 @@ def test_read_laz_checks_items_before_unpacking(folder, capfd, place, number):
 def test_read_laz_needs_extra_and_las_does_not(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "lazrs", None)
     same(read(folder, "a.las", las()))
-    with pytest.raises(MissingExtra, match=r"'.\[recordings\]'"):
+    with pytest.raises(MissingExtra, match=r'"\.\[recordings\]"'):
         read(folder, "a.laz", las(packed=True))
 
 

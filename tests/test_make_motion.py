@@ -63,9 +63,36 @@ def test_make_motion_excludes_and_shortens_clips_by_name(tmp_path, capsys):
         assert "--first: expected a share" in capsys.readouterr().err
 
 
+def test_make_motion_excludes_pieces_of_cut_clips(tmp_path, capsys):
+    write_archive(tmp_path)
+    path = tmp_path / "02/02_01.amc"
+    lines = path.read_text().splitlines()
+    start = lines.index("13")
+    lines[start + 1] = "root nan " + " ".join(lines[start + 1].split()[2:])
+    path.write_text("\n".join(lines))
+    assert list(make_motion.read_clips([tmp_path / "02"], [])) == ["002_01", "002_01#2", "002_10"]
+    # with and without leading zeros
+    for pattern in ("002_01", "02_01"):
+        assert list(make_motion.read_clips([tmp_path / "02"], [], without=[pattern])) == ["002_10"]
+    words = [str(tmp_path), "--out", str(tmp_path / "motion.npz")]
+    for option in (["--without", "02_1", "typo*"], ["--first", "0.5", "02_1", "typo*"]):
+        assert make_motion.main([*words, *option]) == 2
+        assert f"{option[0]}: no clip is called 02_1, typo*" in capsys.readouterr().err
+
+
 def test_read_clips_resamples_with_given_fps(tmp_path):
     write_archive(tmp_path)
     assert len(make_motion.read_clips([tmp_path], ["2"], fps=60)["002_01"]) == 5
+    # only of files that do not state their rate
+    make_motion.save_clips(tmp_path / "clips/clips.npz", {"002_01": files.joints_of(*files.a_clip(30))})
+    assert len(make_motion.read_clips([tmp_path / "clips"], [], fps=60)["002_01"]) == 30
+
+
+def test_read_clips_follows_links(tmp_path):
+    write_archive(tmp_path / "archive")
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked/02").symlink_to(tmp_path / "archive/02")
+    assert list(make_motion.read_clips([tmp_path / "linked"], [])) == ["002_01", "002_10"]
 
 
 @pytest.mark.parametrize(

@@ -103,7 +103,7 @@ def test_load_motion_amc_round_trip(tmp_path, length):
     skeleton, axes = files.asf_text(length=length)
     written(tmp_path, skeleton, "02.asf")
     path = written(tmp_path, files.amc_text(ROTATIONS, WAY, axes, length=length), "02_05.amc")
-    tree, values, unit_m = skeleton_files.read_amc(path)
+    tree, values, _, unit_m = skeleton_files.read_amc(path)
     positions = tree.positions(values) * unit_m @ UP_AXES["y"].T
     for i, bone in enumerate(tree.names):
         if bone in files.ASF_ENDS:
@@ -113,6 +113,40 @@ def test_load_motion_amc_round_trip(tmp_path, length):
     # both collars are one point in this format
     error = errors(motion)
     assert error[:, MAIN].mean() < 0.05 and error[:, [J["left_ankle"], J["right_ankle"]]].mean() < 0.02
+
+
+def test_load_motion_amc_is_cut_where_frame_numbers_jump(tmp_path):
+    written(tmp_path, ASF, "02.asf")
+    cut = re.sub(r"(?m)^(\d+)$", lambda found: str(int(found[1]) + 500 * (int(found[1]) > 12)), AMC)
+    motion = load_motion(written(tmp_path, cut, "02_05.amc"))
+    assert motion.names == ("02_05", "02_05#2") and motion.length.tolist() == [12, 8]
+    # numbers that do not rise say nothing
+    same = re.sub(r"(?m)^\d+$", "1", AMC)
+    assert load_motion(written(tmp_path, same, "02_05.amc")).length.tolist() == [20]
+
+
+def test_load_motion_reads_clip_names_of_bytes(tmp_path):
+    clips = {"joints": JOINTS, "clip": np.array([b"002_01"]), "clip_start": [0], "clip_length": [20], "fps": 30.0}
+    np.savez(tmp_path / "a.npz", **clips)
+    assert load_motion(tmp_path / "a.npz").names == ("002_01",)
+
+
+def test_load_betas_of_selected_clips(tmp_path):
+    for sequence, beta in (("5", 1.0), ("50", 2.0)):
+        (tmp_path / "pose" / sequence).mkdir(parents=True)
+        for frame in (1, 2):
+            content = {"pose": [0.0] * 72, "trans": [0.0] * 3, "beta": [beta] * 10}
+            written(tmp_path / "pose" / sequence, json.dumps(content), f"{frame:06}.json")
+    person = {"pose": np.zeros((2, 72)), "trans": np.zeros((2, 3))}
+    labels = {"framerate": 20.0}
+    labels |= {f"{k}_person": person | {"beta": [b] * 10} for k, b in (("first", 3.0), ("second", 4.0))}
+    (tmp_path / "s_labels.pkl").write_bytes(pickle.dumps(labels))
+    for path, subjects, expected in (
+        ("pose", ("5",), [1.0]), ("pose/5", ("5",), [1.0]), ("pose/5", (), [1.0]), ("pose", (), [1.0, 2.0]),
+        (".", ("s_labels_second",), [4.0]), (".", ("pose/50", "s_labels"), [2.0, 3.0, 4.0]),
+        ("s_labels.pkl", ("s_labels_first",), [3.0]),
+    ):  # fmt: skip
+        assert load_betas(tmp_path / path, subjects)[:, 0].tolist() == expected, (path, subjects)
 
 
 def test_load_motion_amc_finds_its_asf(tmp_path):
@@ -291,14 +325,14 @@ def test_load_motion_amass_in_parts_and_other_up_axis(tmp_path):
     pose, path = files.to_smpl(rotations, "y"), tmp_path / "a_stageii.npz"
     rate = np.array(120.0)
     np.savez(path, root_orient=pose[:, :3], pose_body=pose[:, 3:66], trans=way @ files.C, mocap_frame_rate=rate)
-    refused(path, "stand along y, not z; give load_motion up='y'")
+    refused(path, "stand or lie along y, not z; give load_motion up='y'")
     check_same(load_motion(path, up="y"), rotations, way)
     assert load_motion(path, up="y", fps=30).fps == 30
     assert load_motion(path, up="y", hz=60).rotations.shape[0] == 3
     # people may lie down if up is given
     rotations[:, 0] = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], float) @ rotations[:, 0]
     path = files.write_amass(tmp_path / "lies_poses.npz", rotations, way)
-    refused(path, "people stand along")
+    refused(path, "people stand or lie along")
     check_same(load_motion(path, up="z"), rotations, way)
 
 

@@ -18,6 +18,12 @@ from lidarpose.synth.scene import scene_config
 ROOT = Path(__file__).parents[1]
 
 
+def test_files_named_in_notice_exist():
+    words = (word.strip(".,;:()") for word in (ROOT / "NOTICE").read_text("utf-8").split())
+    paths = [word for word in words if word.startswith(("src/", "docs/", "tools/"))]
+    assert len(paths) > 4 and [path for path in paths if not (ROOT / path).exists()] == []
+
+
 @pytest.mark.slow
 def test_wheel_installs_into_empty_environment_and_predicts(tmp_path):
     """Needs a package index. The new environment must not see any path of this repository."""

@@ -7,7 +7,7 @@ import lidarpose
 from lidarpose.errors import InputError
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.sample import Box, Pose
-from lidarpose.skeleton import SKELETONS, Skeleton
+from lidarpose.skeleton import SKELETONS, WAYMO14, Skeleton
 
 
 def test_read_poses_restores_saved_results(tmp_path):
@@ -51,6 +51,10 @@ def test_read_poses_restores_skeleton_of_user():
     person = PersonPose(pose=pose, points=np.zeros((9, 3)), skeleton=skeleton)
     result = lidarpose.read_poses(Poses(people=(person,), skeleton=skeleton).to_dict())
     assert result.skeleton == skeleton and result[0].confidence is None and result[0].in_range is None
+    # a skeleton with the name and joints of the package's own, but another tree
+    other = Skeleton(name="waymo14", joints=WAYMO14.joints, parents=(-1,) + (0,) * 13)
+    person = PersonPose(pose=Pose(joints=np.zeros((14, 3)), skeleton=other), points=np.zeros((9, 3)), skeleton=other)
+    assert lidarpose.read_poses(Poses(people=(person,), skeleton=other).to_dict()).skeleton == other
 
 
 @pytest.mark.parametrize(

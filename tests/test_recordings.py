@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import islice, product
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pandas
@@ -21,6 +22,7 @@ import lidarpose
 from lidarpose import Box, Boxes, InputError
 from lidarpose.cli import main
 from lidarpose.geometry import UP_AXES, rigid_transform, rotation_about, rotation_from_up
+from lidarpose.io.sources import open_source
 from lidarpose.io.sources.frame import Frame, FrameSource, IndexedRecording, LazyFrame, Sweep
 from lidarpose.recording import output, page, picture, result_files
 from lidarpose.recording.coordinates import in_world
@@ -346,12 +348,40 @@ def test_predict_does_not_overwrite_input_files(clouds, tmp_path, capsys):
     for source in (tmp_path, tmp_path / "*.csv"):
         assert main(["predict", str(source), "--format", "csv", "--out", str(tmp_path / "0.csv")]) == 2
         assert "0.csv" in capsys.readouterr().err
+    (tmp_path / "deep/er").mkdir(parents=True)
+    for name, source in (("deep/er/1.csv", "**/1.csv"), ("a[1].csv", "a[1].csv")):
+        (tmp_path / name).write_bytes(before)
+        words = ["predict", str(tmp_path / source), "--format", "csv", "--out", str(tmp_path / name)]
+        assert main(words) == 2 and "is also an input file" in capsys.readouterr().err
+        assert (tmp_path / name).read_bytes() == before
+        (tmp_path / name).unlink()
     assert (tmp_path / "0.csv").read_bytes() == before
     # results of an earlier command may be overwritten
     for _ in range(2):
         words = ["predict", str(tmp_path), "--out", f"{tmp_path}/", "--picture", "--html", "--quiet"]
         assert main(words) == 0, capsys.readouterr().err
-    assert {path.suffix for path in tmp_path.iterdir()} == {".csv", ".jsonl", ".png", ".html"}
+    assert {path.suffix for path in tmp_path.iterdir() if path.is_file()} == {".csv", ".jsonl", ".png", ".html"}
+
+
+def test_frames_of_relative_and_absolute_paths_have_different_names(clouds, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("a/000.npy", "b/000.npy"):
+        (tmp_path / name).parent.mkdir()
+        np.save(tmp_path / name, clouds[0])
+    frames = open_source(["a/000.npy", tmp_path / "b/000.npy"])
+    assert {frame.id for frame in frames} == {os.path.join("a", "000.npy"), os.path.join("b", "000.npy")}
+    # Windows has no common folder of two drives
+    monkeypatch.setattr(os.path, "commonpath", Mock(side_effect=ValueError))
+    frames = open_source(["a/000.npy", "b/000.npy"])
+    assert [frame.id for frame in frames] == [str(tmp_path / name / "000.npy") for name in "ab"]
+
+
+def test_table_of_joints_is_not_read_as_points(clouds, tmp_path, capsys):
+    path = tmp_path / "all.csv"
+    np.save(tmp_path / "a.npy", clouds[0])
+    assert main(["predict", str(tmp_path / "a.npy"), "--crop", "--format", "csv", "--out", str(path), "--quiet"]) == 0
+    assert main(["predict", str(path)]) == 2
+    assert "expected points, got a table of joints, as lidarpose predict writes it" in capsys.readouterr().err
 
 
 def test_csv_and_parquet_have_one_row_per_person_and_joint(tracked, tmp_path):

@@ -85,6 +85,8 @@ def test_map_to_matches_names_and_reports_missing_joints():
         (("a", "b"), (-1, 0), (("a", "b"),), "pairs of indices"),
         (("a", "b"), (-1, 0), ((0,),), r"extra bone \(0,\) must be a pair"),
         ((1, 2), (-1, 0), (), "joint names must be text"),
+        ((), (), (), "joints are a list of names"),
+        ("ab", (-1, 0), (), "joints are a list of names"),
     ],
 )
 def test_skeleton_rejects_invalid_trees(joints, parents, extra, message):

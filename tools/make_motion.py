@@ -26,7 +26,7 @@ A subject is the part of a clip's name before the first `_`; numbers may be give
 import argparse
 import io
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -37,6 +37,7 @@ from lidarpose.body.mocap import load_motion
 from lidarpose.body.rig import forward_kinematics, mean_adult_joints
 from lidarpose.errors import InputError
 from lidarpose.io.atomic import write_atomic
+from lidarpose.io.files import folders_below
 from lidarpose.skeleton import SMPL24
 
 SUFFIXES = (".amc", ".bvh", ".npz")
@@ -70,27 +71,33 @@ def read_clips(
     Args:
         folders: searched for files with `SUFFIXES`.
         subjects: subjects whose clips are read; all clips if empty.
-        without: patterns of the names of clips that are left out.
-        fps: frames per second of recordings that do not state it; None: 120, as in CMU and HDM05.
+        without: patterns of the names of clips that are left out, with all pieces of a clip that was cut.
+        fps: frames per second of .amc files, which do not state it; None: 120, as in CMU and HDM05.
         up: the recordings' up axis; None: as determined by `load_motion`.
 
     Returns:
         (frames, 24, 3) float32 m each, z up, at `HZ` frames per second, sorted by name.
 
     Raises:
-        InputError: a folder or a subject is missing, a file cannot be read, or two clips have one name.
+        InputError: a folder or a subject is missing, a file cannot be read, two clips have one name, or a pattern fits
+            no clip.
     """
+    names: list[str] = []
     clips: dict[str, np.ndarray] = {}
     for folder in folders:
         if not folder.is_dir():
             raise InputError(f"{folder}: expected a folder of {', '.join(SUFFIXES)} files; give the unpacked archive")
-        for path in sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES):
+        files = (directory / name for directory, names_there in folders_below(folder) for name in names_there)
+        for path in sorted((path for path in files if path.suffix.lower() in SUFFIXES), key=Path.as_posix):
             # an npz file contains the names of its clips
             if path.suffix.lower() != ".npz" and not is_of(clip_name(path.stem), subjects):
                 continue
-            motion = load_motion(path, hz=HZ, fps=fps, up=up)
+            motion = load_motion(path, hz=HZ, fps=fps if path.suffix.lower() == ".amc" else None, up=up)
             for c, name in enumerate(map(clip_name, motion.names)):
-                if not is_of(name, subjects) or is_like(name, without):
+                if not is_of(name, subjects):
+                    continue
+                names.append(name)
+                if is_like(name, without):
                     continue
                 if name in clips:
                     raise InputError(f"{path}: there are two clips {name}; give each recording once")
@@ -100,11 +107,21 @@ def read_clips(
     if missing_subjects or not clips:
         what = f"clip of subject {', '.join(missing_subjects)}" if missing_subjects else f"{', '.join(SUFFIXES)} file"
         raise InputError(f"{', '.join(map(str, folders))}: no {what} there")
+    check_patterns("--without", without, names)
     return dict(sorted(clips.items()))
 
 
 def is_like(name: str, patterns: Sequence[str]) -> bool:
-    return any(fnmatchcase(name, pattern) for pattern in patterns)
+    """Whether a clip, or the clip of which it is a piece (NAME#2), fits a pattern."""
+    whole_name = name.partition("#")[0]
+    return any(fnmatchcase(n, clip_name(pattern)) for pattern in patterns for n in (name, whole_name))
+
+
+def check_patterns(option: str, patterns: Sequence[str], names: Iterable[str]) -> None:
+    """Raises InputError for a pattern that fits none of the clips."""
+    useless = [pattern for pattern in patterns if not any(is_like(name, [pattern]) for name in names)]
+    if useless:
+        raise InputError(f"{option}: no clip is called {', '.join(useless)}; check the names")
 
 
 def mean_adult(rotations: np.ndarray, translation: np.ndarray) -> np.ndarray:
@@ -145,13 +162,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--without", nargs="+", default=[], metavar="CLIP", help="clips to leave out; may have * and ?")
     first_help = "keep only the first share, above 0 and at most 1, of the frames of these clips"
     parser.add_argument("--first", nargs="+", default=[], metavar=("SHARE", "CLIP"), help=first_help)
-    parser.add_argument("--fps", type=float, help="frames a second of recordings that do not say it (default: 120)")
+    parser.add_argument("--fps", type=float, help="frames a second of .amc files (default: 120)")
     parser.add_argument("--up", help="up axis of the recordings (default: what their format says)")
     parser.add_argument("--out", required=True, type=Path, metavar="FILE.npz")
     args = parser.parse_args(arguments)
     try:
         share = first_share(args.first)
         clips = read_clips(args.folders, args.subjects, without=args.without, fps=args.fps, up=args.up)
+        check_patterns("--first", args.first[1:], list(clips))
         clips = {
             name: joints[: max(int(share * len(joints)), 1)] if is_like(name, args.first[1:]) else joints
             for name, joints in clips.items()

@@ -20,7 +20,7 @@ class MissingExtra(LidarPoseError, ImportError):
     """An optional dependency is not installed; the message contains the pip command."""
 
     def __init__(self, what: str, extra: str):
-        super().__init__(f"{what} needs an optional dependency: in the clone, pip install '.[{extra}]'")
+        super().__init__(f'{what} needs an optional dependency: in the clone, pip install ".[{extra}]"')
 
 
 # optional module -> extra that installs it

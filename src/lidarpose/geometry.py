@@ -187,7 +187,7 @@ def rotation_of_boxes(up: str | Sequence[float]) -> np.ndarray:
 def axes_from_above(up: str | Sequence[float]) -> tuple[str, str]:
     """Names of the input's axes that point right and up in a picture from above."""
     right, upward = map(nearest_axis, rotation_from_up(up)[:2])
-    if up in UP_AXES:
+    if isinstance(up, str) and up in UP_AXES:
         return right, upward
     # turned far, both are nearest to one axis, which then names neither
     is_named = right[-1] != upward[-1]

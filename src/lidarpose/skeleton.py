@@ -42,6 +42,8 @@ class Skeleton:
     def __post_init__(self):
         # accept lists instead of tuples
         try:
+            if isinstance(self.joints, str) or not len(self.joints):
+                raise TypeError(f"got {self.joints!r}")
             object.__setattr__(self, "joints", tuple(self.joints))
             object.__setattr__(self, "parents", tuple(map(index, self.parents)))
             object.__setattr__(self, "extra_bones", tuple(tuple(map(index, pair)) for pair in self.extra_bones))

@@ -22,6 +22,7 @@ from importlib import resources
 
 import numpy as np
 
+from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.skeleton import BODY26, SMPL24
 
@@ -179,6 +180,7 @@ def pose_bodies(
     """Poses bodies by linear blend skinning on one core; callers distribute people over threads.
 
     Args:
+        rest: n bodies.
         rotations: (n, 24, 3, 3) local rotations.
         translation: (n, 3) m, position of the pelvis.
 
@@ -186,11 +188,17 @@ def pose_bodies(
         Vertices (n, V, 3) and joints (n, 26, 3) in BODY26's order, float32 m.
 
     Raises:
+        InputError: for other shapes.
         ModuleNotFoundError: without numba.
     """
     from lidarpose.body.rig_kernels import pose_people
 
     rotations, translation = (np.ascontiguousarray(a, np.float32) for a in (rotations, translation))
+    count = len(rest.vertices)
+    # the kernel does not check bounds
+    if rotations.shape != (count, 24, 3, 3) or translation.shape != (count, 3):
+        expected = f"rotations ({count}, 24, 3, 3) and translation ({count}, 3)"
+        raise InputError(f"{count} bodies need {expected}, got {rotations.shape} and {translation.shape}")
     vertices, joints = np.empty_like(rest.vertices), np.empty_like(rest.joints)
     pose_people(
         rest.vertices, rest.joints, rotations, translation, rig.parents, rig.weight_index, rig.weight, vertices, joints

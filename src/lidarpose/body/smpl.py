@@ -127,7 +127,7 @@ class SmplBody:
             InputError: For other shapes and for values that are not finite.
         """
         vertices, joints = self.rest(betas)
-        rotations = np.asarray(rotations, float)
+        rotations = _as_floats("rotations", rotations)
         if rotations.shape[1:] != (24, 3, 3):
             raise InputError(f"rotations must be ({len(vertices)}, 24, 3, 3), got {rotations.shape}")
         local_rotations = self._all_rotations(_R_LEVEL_SMPL.T @ rotations @ _R_LEVEL_SMPL, len(vertices))
@@ -202,27 +202,24 @@ class SmplBody:
         return posed_vertices, positions, global_rotations
 
     def _checked_betas(self, betas: np.ndarray) -> np.ndarray:
-        betas = np.asarray(betas, float)
+        betas = _as_floats("betas", betas)
         if betas.ndim != 2 or betas.shape[1] > self.shape_count or not np.isfinite(betas).all():
             raise InputError(f"betas must be finite, (n, up to {self.shape_count}), got {betas.shape}")
         return betas
 
     @staticmethod
     def _checked_translation(translation: np.ndarray | None, count: int) -> np.ndarray:
-        translation = np.zeros((count, 3)) if translation is None else np.asarray(translation, float)
-        if translation.shape != (count, 3):
-            raise InputError(f"translation must be ({count}, 3), got {translation.shape}")
+        translation = np.zeros((count, 3)) if translation is None else _as_floats("translation", translation)
+        if translation.shape != (count, 3) or not np.isfinite(translation).all():
+            raise InputError(f"translation must be finite, ({count}, 3), got {translation.shape}")
         return translation
 
     def _all_rotations(self, rotations: np.ndarray, count: int) -> np.ndarray:
         """Matrices (n, J, 3, 3) from any form of rotations that `pose` accepts."""
-        try:
-            rotations = np.asarray(rotations, float)
-        except (TypeError, ValueError):
-            raise InputError("rotations must be an array of numbers") from None
+        rotations = _as_floats("rotations", rotations)
         joint_count = len(self.parents)
         if rotations.shape in ((count, 72), (count, 3 * joint_count)):
-            rotations = rotations.reshape(count, -1, 3)
+            rotations = rotations.reshape(count, rotations.shape[1] // 3, 3)
         if rotations.shape in ((count, 24, 3), (count, joint_count, 3)):
             rotations = axis_angle_to_matrix(rotations)
         if rotations.shape not in ((count, 24, 3, 3), (count, joint_count, 3, 3)) or not np.isfinite(rotations).all():
@@ -253,6 +250,13 @@ class SmplBody:
         head = np.flatnonzero(on_smpl(self.weights, self.parents).argmax(1) == _HEAD)
         x, _, z = self.template[head].T
         return int(head[z.argmax()]), head[[x.argmax(), x.argmin()]]
+
+
+def _as_floats(name: str, value: object) -> np.ndarray:
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{name} must be an array of numbers") from None
 
 
 def load_body(path: str | os.PathLike) -> SmplBody:

@@ -1,10 +1,10 @@
 """`lidarpose predict` of one scan, and `lidarpose detect`; folders and recordings are `cli.recordings`."""
 
 import argparse
-import glob
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -131,17 +131,18 @@ def output_paths(
     from lidarpose.io.atomic import check_writable
     from lidarpose.io.files import check_not_input
     from lidarpose.io.point_cloud import SUFFIXES
+    from lidarpose.io.sources import matching_paths
     from lidarpose.io.sources.folders import is_result, list_folder
 
     result = _result_path(options.out, name, "poses", *(f".{suffix}" for suffix in formats))
     base_path = result or Path(f"{name}.poses.json")
     picture = base_path.with_suffix(".png") if options.picture else None
     page = base_path.with_suffix(".html") if options.html else None
-    sources: list[str] = []
+    sources: list[str | Path] = []
     for source in options.source:
-        matches = glob.glob(source) or [source]
-        # a pattern leaves out results, as a folder does
-        sources += [path for path in matches if not is_result(Path(path))] or matches
+        # what does not exist is reported when it is read
+        with suppress(InputError):
+            sources += matching_paths(source)
     # for a folder, its point files are inputs, but not the results that an earlier command wrote there
     files = [file for path in sources if os.path.isdir(path) for file in list_folder(Path(path))]
     files = [file for file in files if file.suffix.lower() in SUFFIXES and not is_result(file)]

@@ -61,7 +61,11 @@ def _is_recording(options: argparse.Namespace) -> bool:
 
 def _name_of(paths: Sequence[str]) -> str:
     """What results are named after: the file's or folder's stem, of several files their folder's."""
-    path = paths[0] if len(paths) == 1 else os.path.commonpath([os.path.abspath(path) for path in paths])
+    from lidarpose.io.files import common_folder
+
+    path = paths[0] if len(paths) == 1 else common_folder(paths)
+    if path is None:
+        return "recording"
     if any(letter in path for letter in "*?[") and not os.path.exists(path):
         path = os.path.dirname(path.split("**")[0]) or "."
     path = os.path.realpath(path)

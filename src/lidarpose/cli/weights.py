@@ -179,7 +179,7 @@ def _models(options: argparse.Namespace) -> None:
 
 def _torch() -> str:
     if find_spec("torch") is None:
-        return "not installed, training and --device need it: in the clone, pip install '.[train]'"
+        return 'not installed, training and --device need it: in the clone, pip install ".[train]"'
     try:
         # torch may be installed and still fail to load its shared libraries
         import torch

@@ -112,6 +112,8 @@ def make_shards(make: Make, shards: list[int], *, workers: int = 1) -> Iterator[
 def _by_processes(make: Make, shards: list[int], workers: int) -> Iterator[tuple[int, int]]:
     # fresh interpreters: workers must not inherit threads and open files
     context = multiprocessing.get_context("spawn")
+    # Windows waits for at most 61 processes
+    workers = min(workers, 61) if os.name == "nt" else workers
     counter, stop = context.Value("q", 0), context.Event()
     with ProcessPoolExecutor(workers, mp_context=context, initializer=_start, initargs=(make, counter, stop)) as pool:
         try:

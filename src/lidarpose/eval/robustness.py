@@ -288,7 +288,7 @@ def study(
         try:
             curves.append(_sensor_curve(setup, advance))
         except (MissingExtra, ModuleNotFoundError):
-            notes.append("other sensors need new ray casts of people: in the clone, pip install '.[synth]'")
+            notes.append('other sensors need new ray casts of people: in the clone, pip install ".[synth]"')
     else:
         notes.append("other sensors: people in new ray casts have no released center")
     who, ends = f"{len(people):,} {_people_text(setup)}", end_errors(predictions)

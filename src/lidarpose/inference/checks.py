@@ -126,7 +126,7 @@ def upside_down_warning(pose: Pose, turned: Pose | None) -> str | None:
         return None
     if turned.spread.mean() > _CLEARLY_SURER * pose.spread.mean():
         return None
-    return "the pose is more certain upside down: does the up axis point down? try --up -z"
+    return "the pose is more certain upside down: does the up axis point down? try --up -z, or the opposite of --up"
 
 
 def is_lying(pose: Pose, points: np.ndarray) -> bool:

@@ -76,10 +76,10 @@ def _poses(document: Any) -> Poses:
 
 
 def _skeleton(stated: dict[str, Any]) -> Skeleton:
-    """The skeleton of a document: the package's own of that name and joints, else the user's, from its bones."""
+    """The skeleton of a document: the package's own of that name, joints and bones, else the user's, from its bones."""
     name, joints = stated["name"], tuple(stated["joints"])
     known = SKELETONS.get(name)
-    if known is not None and known.joints == joints:
+    if known is not None and known.joints == joints and known.bones == tuple(map(tuple, stated["bones"])):
         return known
     parents, extra_bones = [-1] * len(joints), []
     for start, end in stated["bones"]:

@@ -71,6 +71,10 @@ def atomic_path(path: str | os.PathLike) -> Iterator[Path]:
         target = Path(os.path.realpath(path))
     except (OSError, TypeError, ValueError) as error:
         raise file_error(repr(path), f"expected the path of a file to write ({error})") from None
+    first_part = re.split(r"[/\\]", os.fsdecode(path))[0]
+    if first_part.startswith("~") and not os.path.lexists(first_part):
+        # a folder of that name would be created, and removing it by `rm -r ~` empties the home folder
+        raise file_error(path, f"{first_part} was not replaced with the home folder; give the whole path")
     mode = None
     with suppress(OSError):
         mode = target.stat().st_mode

@@ -79,6 +79,15 @@ def folders_below(folder: Path) -> Iterator[tuple[Path, list[str]]]:
         yield path, names
 
 
+def common_folder(paths: Iterable[str | os.PathLike]) -> str | None:
+    """The absolute path of the folder that holds all paths, or of the only one; None if they are on different drives of
+    Windows."""
+    try:
+        return os.path.commonpath([os.path.abspath(path) for path in paths])
+    except ValueError:
+        return None
+
+
 def check_not_input(out: str | os.PathLike, *inputs: object) -> None:
     """Raises InputError if the output file is one of the input files, also under another name. Inputs that are not
     paths, or whose files do not exist, are ignored."""

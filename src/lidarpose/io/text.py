@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.io.files import FormatError, shorten
+from lidarpose.sample import JOINT_COLUMNS
 
 # a table of at most this many rows and more than this many columns has a point per column
 FEW_ROWS, _MANY_COLUMNS = 5, 50
@@ -155,6 +156,8 @@ def _find_columns(text: str) -> tuple[Sequence[str], int, bool, str | None, str]
     if names := _pandas_names(cells, next(lines, ""), separator):
         return names, num_skipped + 1, True, separator, decimal
     if not all(_is_number(cell, decimal) for cell in cells):
+        if set(JOINT_COLUMNS) <= set(cells):
+            raise FormatError("points", "a table of joints, as lidarpose predict writes it", "give the file of points")
         if not has_xyz(cells):
             raise FormatError("numbers, or a header with x, y and z", f"neither {where}", "export or rename x, y, z")
         return cells, num_skipped + 1, True, separator, decimal

@@ -100,5 +100,6 @@ def weights_path(weights: str | os.PathLike) -> Path:
         kind = type(weights).__name__
         raise InputError(f"expected weights as {', '.join(BUNDLED)} or the path of a file, got {kind}") from None
     is_path = not isinstance(weights, str) or "/" in name or name.endswith((".safetensors", ".onnx"))
-    is_path = name not in BUNDLED and (is_path or os.path.isfile(name))
+    # a run's folder is a path, too: reading it says which file to give
+    is_path = name not in BUNDLED and (is_path or os.path.exists(name))
     return Path(name) if is_path else bundled_path(name)

@@ -260,7 +260,8 @@ class _Watch:
             # signal would abort the saving
             if getattr(getattr(signal.getsignal(signal.SIGINT), "__self__", None), "number", None) == 0:
                 self.fit = fit
-                os.kill(os.getpid(), signal.SIGINT)
+                # on Windows os.kill ends the process; elsewhere it also wakes the main thread
+                (signal.raise_signal if os.name == "nt" else partial(os.kill, os.getpid()))(signal.SIGINT)
                 return
 
 

@@ -171,6 +171,9 @@ class Generator:
             raise InputError("clips have no recorded positions: set recorded=0")
         frames = check_int("a clip's frames", frames, least=1)
         seed, index = check_int("seed", seed, least=0), check_int("index", index, least=0)
+        if self.captured == 1 and self.bank is not None and not len(self.bank.clips.window_starts(frames)):
+            needed = f"{frames} frames, {(frames - 1) / CLIP_HZ:g} s"
+            raise InputError(f"{self.bank.clips.source}: no clip lasts {needed}: give longer motion, or lower captured")
         rng = np.random.default_rng([seed, RandomStream.CLIP, index])
         bodies = draw_moving_bodies(
             self.bank, self.captured, 1, frames, rng, clothes=self.config.clothes, tempo=self.config.tempo,

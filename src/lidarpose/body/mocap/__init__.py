@@ -15,6 +15,7 @@ import hashlib
 import os
 from collections.abc import Callable
 from dataclasses import replace
+from numbers import Real
 from pathlib import Path
 
 from lidarpose.body.mocap.motion import Motion, join
@@ -67,8 +68,8 @@ def load_motion(
     if up is not None:
         check_name("up axis", up, UP_AXES)
     for name, rate in (("fps", fps), ("hz", hz)):
-        if rate is not None and not 0 < rate < float("inf"):
-            raise file_error(path, f"{name} must be frames per second, above 0, got {rate}")
+        if rate is not None and not (isinstance(rate, Real) and 0 < rate < float("inf")):
+            raise file_error(path, f"{name} must be frames per second, above 0, got {rate!r}")
     try:
         path = Path(path)
         whole_folder = path.is_dir()
@@ -103,7 +104,8 @@ def _sources(folder: Path) -> list[Path]:
         sources += [file for file in files if file.suffix.lower() in FORMATS.keys() - {".json"}]
         if pose_files(directory):
             sources.append(directory)
-    return sorted(sources)
+    # on Windows, paths themselves are compared without case
+    return sorted(sources, key=Path.as_posix)
 
 
 def digest(path: str | os.PathLike) -> str:
@@ -112,8 +114,8 @@ def digest(path: str | os.PathLike) -> str:
     path = Path(path)
     if not path.is_dir():
         return content_digest(path, expected="motion")[:16]
-    files = sorted(directory / name for directory, names in folders_below(path) for name in names)
-    files = [file for file in files if file.suffix.lower() in (*FORMATS, ".asf")]
+    files = [directory / name for directory, names in folders_below(path) for name in names]
+    files = sorted((file for file in files if file.suffix.lower() in (*FORMATS, ".asf")), key=Path.as_posix)
     lines = [f"{file.relative_to(path).as_posix()} {content_digest(file, expected='motion')}" for file in files]
     return hashlib.sha256("\n".join(lines).encode("utf-8", "surrogateescape")).hexdigest()[:16]
 

@@ -132,6 +132,7 @@ def tree_motion(
     kind: str,
     unit_m: float | None = None,
     matched: dict[str, int] | None = None,
+    number: np.ndarray | None = None,
 ) -> Motion:
     """The motion of one clip of any skeleton, named after the file.
 
@@ -140,6 +141,7 @@ def tree_motion(
         up: The up axis, by default the axis along which people stand, or y if they do not stand.
         unit_m: Meters per unit of the file, by default the unit that gives the most typical body size.
         matched: SMPL joint name -> index in the tree; by default found by `match_joints`.
+        number: (F,) frame numbers in the recording, by default without gaps.
 
     Raises:
         InputError: For a skeleton without the joints of a person, and as `motion_from_joints` does.
@@ -147,11 +149,12 @@ def tree_motion(
     matched = match_joints(path, tree.names, tree.parents) if matched is None else matched
     positions = tree.positions(values)
     name, is_finite = Path(path).stem, np.isfinite(positions).all((1, 2))
-    usable_clips(path, [name], [len(is_finite)], is_finite, fps)
+    usable_clips(path, [name], [len(is_finite)], is_finite, fps, number)
     joints = np.full((len(is_finite), 24, 3), np.nan)
     with np.errstate(over="ignore", invalid="ignore"):
         joints[is_finite] = smpl_joints(tree.parents, matched, positions[is_finite])
-    return motion_from_joints(path, joints, [name], [len(is_finite)], fps=fps, up=up, kind=kind, unit_m=unit_m)
+    about: dict[str, Any] = {"fps": fps, "up": up, "unit_m": unit_m, "number": number}
+    return motion_from_joints(path, joints, [name], [len(is_finite)], kind=kind, **about)
 
 
 def match_joints(path: object, names: Sequence[str], parents: Sequence[int]) -> dict[str, int]:

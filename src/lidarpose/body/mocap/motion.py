@@ -217,12 +217,15 @@ def load_clips(path: str | PathLike) -> tuple[np.ndarray, tuple[str, ...], np.nd
     rate = float(fps.item())
     if not 0 < rate < np.inf:
         raise file_error(path, f"fps must be frames per second, above 0, got {rate}")
-    return joints, tuple(map(str, np.ravel(clip))), length, rate
+    names = (name.decode("utf-8", "replace") if isinstance(name, bytes) else str(name) for name in np.ravel(clip))
+    return joints, tuple(names), length, rate
 
 
 def standing_axis(trunk: np.ndarray) -> str | None:
     """The axis along which people stand, such as "-y", from the unit vectors (F, 3) of their trunks; None if they do
     not stand."""
+    if not len(trunk):
+        return None
     mean = trunk.mean(0)
     axis = int(np.abs(mean).argmax())
     return None if abs(mean[axis]) <= _UPRIGHT else ("-" if mean[axis] < 0 else "") + "xyz"[axis]

@@ -15,6 +15,7 @@ Source: the format's description and CMU's database (mocap.cs.cmu.edu), its page
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -43,7 +44,8 @@ _OPTIONAL = ("left_foot", "right_foot", "left_hand", "right_hand", "neck")
 
 
 def load_bvh(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
-    """The motion of a BVH file as one clip, named after the file. up: by default the axis along which people stand."""
+    """The motion of a BVH file as one clip, named after the file. up: by default the axis along which people stand;
+    give it for recordings of people who lie."""
     tree, values, rate = read_bvh(path)
     rate = fps or rate
     if rate is None:
@@ -57,9 +59,10 @@ def load_amc(path: str | os.PathLike, *, up: str | None = None, fps: float | Non
     Its skeleton is the ASF file with the same name or with the name up to its last or first `_` (02.asf for 02_01.amc),
     else the only ASF file in the folder. fps: by default CMU's 120; up: by default y.
     """
-    tree, values, unit_m = read_amc(path)
+    tree, values, number, unit_m = read_amc(path)
     indices = {joint: tree.names.index(bone) for joint, bone in _BONES.items() if bone in tree.names}
-    return tree_motion(path, tree, values, fps=fps or CMU_FPS, up=up or "y", kind="AMC", unit_m=unit_m, matched=indices)
+    about: dict[str, Any] = {"fps": fps or CMU_FPS, "up": up or "y", "unit_m": unit_m, "number": number}
+    return tree_motion(path, tree, values, kind="AMC", matched=indices, **about)
 
 
 def _numbers(path: object, what: str, words: Sequence[str], count: int | None = None) -> np.ndarray:
@@ -163,11 +166,11 @@ def _bvh_frames(path: object, lines: list[str], channel_count: int) -> tuple[np.
 # ASF and AMC
 
 
-def read_amc(path: str | os.PathLike) -> tuple[JointTree, np.ndarray, float]:
+def read_amc(path: str | os.PathLike) -> tuple[JointTree, np.ndarray, np.ndarray | None, float]:
     """Reads an AMC file and its ASF file: the bones' ends as joints, frames of channels (F, C) of the bones that move,
-    and meters per unit. Raises InputError."""
+    numbers (F,) of the frames, None if they do not rise, and meters per unit. Raises InputError."""
     path = Path(path)
-    values = _amc_frames(path)
+    values, number = _amc_frames(path)
     skeleton = _skeleton_of(path)
     tree, unit_m = read_asf(skeleton)
     unknown_bones = sorted(values.keys() - set(tree.names))
@@ -186,7 +189,7 @@ def read_amc(path: str | os.PathLike) -> tuple[JointTree, np.ndarray, float]:
             raise file_error(
                 path, f"{joint.name} has {numbers} numbers per frame, its skeleton {freedoms} degrees of freedom"
             )
-    return tree, np.concatenate([values[name] for name in tree.names if name in values], 1), unit_m
+    return tree, np.concatenate([values[name] for name in tree.names if name in values], 1), number, unit_m
 
 
 def _skeleton_of(path: Path) -> Path:
@@ -338,14 +341,16 @@ def _in_tree_order(path: Path, lines: list[list[str]], bones: dict[str, Joint]) 
     return [bones[name] for name in order]
 
 
-def _amc_frames(path: Path) -> dict[str, np.ndarray]:
-    """Channel values (F, n) of each bone that moves."""
+def _amc_frames(path: Path) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
+    """Channel values (F, n) of each bone that moves, and the numbers (F,) of the frames, None if they do not rise."""
     frames: list[dict[str, list[str]]] = []
+    numbers: list[int] = []
     for words in _words_of_lines(path, "an AMC file"):
         if words[0].startswith(":"):
             continue
         if len(words) == 1 and FRAME_NUMBER.fullmatch(words[0]):
             frames.append({})
+            numbers.append(int(words[0]))
         elif not frames:
             raise file_error(path, f"an AMC file has numbered frames of bones, got {' '.join(words)[:60]!r}")
         else:
@@ -362,4 +367,5 @@ def _amc_frames(path: Path) -> dict[str, np.ndarray]:
     for name in lengths:
         words = [word for frame in frames for word in frame[name]]
         values[name] = _numbers(path, f"numbers of {name}", words).reshape(len(frames), -1)
-    return values
+    do_rise = all(a < b for a, b in zip(numbers, numbers[1:], strict=False))
+    return values, np.array(numbers, float) if do_rise else None

@@ -107,7 +107,8 @@ def motion_from_smpl(
     rotations[:, 0] = R_level_world @ root_rotations @ _R_LEVEL_SMPL.T
     axis = standing_axis(root_rotations[..., 1])
     if up is None and axis not in ("z", None):
-        raise file_error(path, f"people stand along {axis}, not z; give load_motion up={axis!r}")
+        remedy = f"give load_motion up={axis!r}, or up='z' if they lie"
+        raise file_error(path, f"people stand or lie along {axis}, not z; {remedy}")
     return Motion(
         rotations=rotations,
         translation=(trans @ R_level_world.T).astype(np.float32),
@@ -174,16 +175,18 @@ def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: fl
     any entry has a pose. Raises InputError if no entry remains."""
     # of each clip's entries: pose, position, and number in the sequence, which skipped entries have, too
     clips: dict[str, list[tuple[np.ndarray, np.ndarray, int]]] = {}
+    # clips in which any entry has a position: there, entries without one are skipped
+    placed = {_clip_of(path, entry) for entry in entries if isinstance(entry, dict) and _position(entry) is not None}
     counts: Counter[str] = Counter()
     entries = [entry for entry in entries if isinstance(entry, dict)]
     key = "gt" if any(entry.get("gt") is not None for entry in entries) else "gt_joint"
     for entry in entries:
-        name = str(entry.get("seq_path", entry.get("motion_id", Path(path).stem)))
+        name = _clip_of(path, entry)
         counts[name] += 1
         try:
             pose = np.asarray(entry[key], float)
-            position = next((entry[name] for name in ("T_1", "trans") if entry.get(name) is not None), np.zeros(3))
-            trans = np.asarray(position, float).reshape(3)
+            position = _position(entry)
+            trans = np.asarray(np.zeros(3) if position is None and name not in placed else position, float).reshape(3)
             # the middle one of NoiseMotion's three poses, as in its reader
             pose = pose.reshape(-1, _SMPL)[pose.size // _SMPL // 2]
         except (KeyError, TypeError, ValueError, OverflowError, IndexError):
@@ -200,7 +203,8 @@ def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: fl
         about: dict[str, Any] = {"fps": rate, "up": up, "kind": "LIPD", "unit_m": 1.0, "number": numbers}
         return motion_from_joints(path, joints, list(clips), length, **about)
     # the published loaders do not define the up axis
-    up = up or standing_axis(axis_angle_to_matrix(poses[:, :3])[..., 1]) or "z"
+    finite_poses = poses[np.isfinite(poses).all(1)]
+    up = up or standing_axis(axis_angle_to_matrix(finite_poses[:, :3])[..., 1]) or "z"
     ends = np.cumsum(length)
     spans = [slice(end - count, end) for end, count in zip(ends, length, strict=True)]
     motions = [
@@ -212,28 +216,44 @@ def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: fl
     return join(motions, source=f"corpus: {path}")
 
 
+def _clip_of(path: str | os.PathLike, entry: dict) -> str:
+    """The name of a corpus entry's clip."""
+    return str(entry.get("seq_path", entry.get("motion_id", Path(path).stem)))
+
+
+def _position(entry: dict) -> Any:
+    """A corpus entry's position in the first LiDAR's frame, None if it has none."""
+    return next((entry[name] for name in ("T_1", "trans") if entry.get(name) is not None), None)
+
+
 def load_betas(path: str | os.PathLike, subjects: Sequence[str] = ()) -> np.ndarray:
     """The distinct body shapes (n, 10) in a motion file, or in all files of a folder and its subfolders: `beta` of
     LiDARHuman26M's files and SLOPER4D's labels, `betas` of AMASS files. n is 0 if there are no shapes.
 
-    subjects: see `Motion.of`; in a folder, only files whose paths in it start with one of them are read.
+    subjects: only people of whose clips the names start with one of them, see `Motion.of`.
     """
     path = Path(path)
     files = [path]
     if path.is_dir():
         files = sorted(directory / name for directory, names in folders_below(path) for name in names)
-        if subjects:
-            files = [file for file in files if any(is_of(file.relative_to(path).as_posix(), s) for s in subjects)]
     rows: list[np.ndarray] = []
+
+    def is_wanted(clip: str) -> bool:
+        return not subjects or any(is_of(clip, subject) for subject in subjects)
+
     for file in files:
+        # the clip's name, as `load_motion` gives it
+        clip = file.stem if file == path else file.relative_to(path).with_suffix("").as_posix()
         if file.suffix.lower() == ".json" and FRAME_NUMBER.fullmatch(file.stem):
-            content = read_json(file, expected=_POSE_FILE)
-            rows.append(_first_betas(content.get("beta") if isinstance(content, dict) else None))
-        elif file.suffix.lower() == ".npz":
+            sequence = clip if file == path else path.stem if file.parent == path else clip.rpartition("/")[0]
+            if is_wanted(sequence):
+                content = read_json(file, expected=_POSE_FILE)
+                rows.append(_first_betas(content.get("beta") if isinstance(content, dict) else None))
+        elif file.suffix.lower() == ".npz" and is_wanted(clip):
             rows.append(_first_betas(read_npz(file, ("betas",), expected="an npz file of motion")[0].get("betas")))
         elif file.suffix.lower() == ".pkl" and isinstance(labels := load_pickle(file), dict):
-            people = (labels.get(person) for person in _PEOPLE)
-            rows += [_first_betas(person.get("beta")) for person in people if isinstance(person, dict)]
+            people = (p for p in _PEOPLE if is_wanted(f"{clip}_{p.removesuffix('_person')}"))
+            rows += [_first_betas(labels[p].get("beta")) for p in people if isinstance(labels.get(p), dict)]
     return np.unique(np.concatenate([np.zeros((0, _BETAS)), *rows]), axis=0)
 
 

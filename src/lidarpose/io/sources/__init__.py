@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 
 from lidarpose.errors import InputError, check_int
-from lidarpose.io.files import file_error, listed
+from lidarpose.io.files import common_folder, file_error, listed
 from lidarpose.io.point_cloud import RECORDINGS, SUFFIXES
 from lidarpose.io.sources.folders import is_result, list_folder, natural_key, open_files, scan_files
 from lidarpose.io.sources.frame import (
@@ -73,14 +73,10 @@ def open_source(
     """
     if columns is not None:
         columns = check_int("columns", columns, least=3, hint=" (x y z first)")
-    matched_paths = [path for path_or_pattern in listed(paths) for path in _matches(path_or_pattern)]
+    matched_paths = [path for path_or_pattern in listed(paths) for path in matching_paths(path_or_pattern)]
     if not matched_paths:
         raise file_error("source", "expected files, folders or recordings, got none")
-    name = (
-        str(matched_paths[0])
-        if len(matched_paths) == 1
-        else os.path.commonpath([os.path.abspath(path) for path in matched_paths])
-    )
+    name = str(matched_paths[0]) if len(matched_paths) == 1 else common_folder(matched_paths) or "several disks"
     meta_path = None if meta is None else Path(meta)
     options = ReadingOptions(columns=columns, topic=topic, meta=meta_path, name_times=rate is None)
     return FrameSource(_open_all(name, matched_paths, options), rate=rate, start=start, end=end, every=every)
@@ -95,8 +91,8 @@ def is_single_scan(paths: str | os.PathLike | Sequence[str | os.PathLike]) -> bo
     return not is_pattern and Path(path_list[0]).suffix.lower() not in RECORDINGS
 
 
-def _matches(path: str | os.PathLike) -> list[Path]:
-    """The paths that match a path or pattern, in natural order."""
+def matching_paths(path: str | os.PathLike) -> list[Path]:
+    """The paths that match a path or pattern, in natural order. Raises InputError if there are none."""
     if not isinstance(path, str | os.PathLike):
         raise InputError(f"expected paths, got {type(path).__name__} among them: give files or folders")
     if os.path.exists(path):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lidarpose.errors import LidarPoseError
-from lidarpose.io.files import file_error, shorten
+from lidarpose.io.files import common_folder, file_error, shorten
 from lidarpose.io.point_cloud import SUFFIXES, read_points
 from lidarpose.io.sources.frame import IndexedRecording, ReadingOptions, Sweep
 
@@ -95,8 +95,8 @@ def open_files(name: str, paths: Sequence[Path], options: ReadingOptions) -> Ind
         warnings += notes
     ids = [scan_id(path) for path in paths]
     if len(set(ids)) < len(ids):
-        common_folder = os.path.commonpath([path.parent for path in paths])
-        ids = [os.path.relpath(path, common_folder) for path in paths]
+        folder = common_folder(path.parent for path in paths)
+        ids = [os.path.relpath(path, folder) if folder else os.path.abspath(path) for path in paths]
 
     def read(i: int) -> Sweep:
         cloud = read_points(paths[i], columns=columns)

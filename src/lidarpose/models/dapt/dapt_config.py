@@ -110,8 +110,9 @@ class DaptConfig(Config):
                 raise InputError(
                     f"{channels} must be divisible by {heads}, got {getattr(self, channels)} and {getattr(self, heads)}"
                 )
-        if not self.orders:
-            raise InputError(f"orders must name at least one curve of {', '.join(CURVES)}, got none")
+        if not isinstance(self.orders, tuple) or not self.orders:
+            curves = ", ".join(CURVES)
+            raise InputError(f"orders must be a tuple of at least one curve of {curves}, got {self.orders!r}")
         for order in self.orders:
             check_name("curve", order, CURVES)
         check_joints(self.joints)

@@ -60,10 +60,11 @@ class SubmanifoldConvolution(nn.Module):
             return out + F.linear(neighbor_rows, self.weight.flatten(1))
         # all three are set if there is no table
         all_sources, all_targets, pairs = cast("tuple[Tensor, Tensor, Tensor]", (near.source, near.target, near.counts))
-        counts = pairs.tolist()
-        for weight, source, target in zip(weights, all_sources.split(counts), all_targets.split(counts), strict=True):
-            if source.shape[0]:
-                out = out.index_add_(0, target, F.linear(rows.index_select(0, source), weight))
+        # one gather and one sum for all taps: their gradients pass over the rows once, not once a tap
+        neighbor_rows = rows.index_select(0, all_sources).split(pairs.tolist())
+        terms = [F.linear(tap, weight) for weight, tap in zip(weights, neighbor_rows, strict=True) if len(tap)]
+        if terms:
+            out = out.index_add(0, all_targets, torch.cat(terms))
         return out
 
 

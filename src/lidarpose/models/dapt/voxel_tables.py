@@ -107,7 +107,7 @@ def build_tables(
     # a placeholder, which neighbors and parents treat like a real voxel
     clouds = [np.asarray(cloud, np.float32) if len(cloud) else np.zeros((1, 3), np.float32) for cloud in clouds]
     lengths = np.array([len(cloud) for cloud in clouds], np.int64)
-    points, person = np.concatenate(clouds), np.repeat(np.arange(len(clouds)), lengths)
+    points, person = np.concatenate(clouds), np.repeat(np.arange(len(clouds), dtype=np.int64), lengths)
     is_point = np.repeat(has_points, lengths)
     cells = _cells(points, lengths, config)
     key = person << (3 * _WIDE) | z_order(cells)
