@@ -677,6 +677,7 @@ def test_quiet_prints_errors_only(crop, tmp_path, capsys):
 @pytest.mark.parametrize(
     "words, problem",
     [
+        ("--quiet predict a.pcd", "arguments: --quiet: options come after the command, lidarpose predict --quiet; see"),
         ("predct a.pcd", "invalid choice: 'predct', did you mean predict?; see lidarpose --help"),
         ("qqqq", "invalid choice: 'qqqq' (choose from"),
         ("detect a.pcd --picture", "unrecognized arguments: --picture; see lidarpose detect --help"),

@@ -29,11 +29,12 @@ _SIGNED = ("--sensor-origin", "--up")
 def run(arguments: list[str] | None = None) -> int:
     """As `lidarpose.cli.main`."""
     parser = make_parser()
-    options, unknown = parser.parse_known_args(_joined(sys.argv[1:] if arguments is None else arguments))
+    words = _joined(sys.argv[1:] if arguments is None else arguments)
+    options, unknown = parser.parse_known_args(words)
     if unknown:
         # the error points to the command's own help, which lists its options
         parser.prog = " ".join(filter(None, (parser.prog, options.command)))
-        parser.error(f"unrecognized arguments: {' '.join(unknown)}{_hint(options.command, unknown)}")
+        parser.error(f"unrecognized arguments: {' '.join(unknown)}{_hint(options.command, unknown, words)}")
     if options.command is None:
         parser.print_help()
         return 0
@@ -72,8 +73,11 @@ def run(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def _hint(command: str | None, unknown: list[str]) -> str:
-    """What to do instead about names of pictures and pages, "" for other arguments."""
+def _hint(command: str | None, unknown: list[str], words: list[str]) -> str:
+    """What to do instead about names of pictures and pages, and about options before the command, "" for other
+    arguments. words: all arguments."""
+    if command in words and unknown[0] in words[: words.index(command)]:
+        return f": options come after the command, lidarpose {command} {unknown[0]}"
     if command != "predict" or any(os.path.splitext(word)[1].lower() not in (".png", ".html") for word in unknown):
         return ""
     return ": --picture and --html take no file name, they are named as --out, NAME.png beside NAME.json or NAME.jsonl"
