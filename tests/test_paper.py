@@ -16,6 +16,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from dataset_files import write_lidarhuman26m, write_sloper4d
+from matplotlib import style
 from matplotlib.text import Text
 from training_runs import Killed, few_to_validate_on  # noqa: F401
 
@@ -878,6 +879,12 @@ def test_compare_stability_aligns_amounts_without_poses(monkeypatch):
         # the legend is below the axes and hides no line
         assert axes.get_legend() is None
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["whole", "gap"]
+
+
+def test_compare_stability_is_independent_of_settings_of_user():
+    png = charts.compare_stability({"ours": _study(1)})
+    with style.context("dark_background"):
+        assert charts.compare_stability({"ours": _study(1)}) == png
 
 
 def _drawn_alone(name, selected, out):

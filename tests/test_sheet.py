@@ -8,6 +8,9 @@ import shutil
 import dataset_files as files
 import numpy as np
 import pytest
+from matplotlib import rcParams, style
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
 
 from lidarpose.cli import main
 from lidarpose.data.prepare import prepare
@@ -18,7 +21,7 @@ from lidarpose.skeleton import BODY26
 from lidarpose.synth import shard_job
 from lidarpose.synth.shard_job import SynthesisJob, write_dataset
 from lidarpose.synth.street import street
-from lidarpose.viz import contact_sheet
+from lidarpose.viz import bird_eye, contact_sheet
 from lidarpose.viz.bird_eye import (
     MAX_SCANS,
     ScanPanel,
@@ -166,6 +169,41 @@ def test_draw_scans_shows_boxes_poses_and_tracks():
 
 
 @pytest.mark.long
+def test_pictures_of_scans_are_independent_of_settings_of_user():
+    """LaTeX, which may be missing, and styles, which draw white on black."""
+    scan, card = panel(), Panel(points=POINTS[:9], label="ann")
+    png = draw_scan_and_people(scan, [card], title="one")
+    ugly = {"text.usetex": True, "font.size": 30, "axes.grid": True, "lines.marker": "o", "image.cmap": "gray"}
+    for settings in ("dark_background", "ggplot", ugly):
+        with style.context(settings):
+            assert draw_scan_and_people(scan, [card], title="one") == png
+            assert settings is not ugly or rcParams["font.size"] == 30
+
+
+def test_names_are_inside_view(monkeypatch):
+    """A name that is cut off may read as another one."""
+    figures = []
+    monkeypatch.setattr(bird_eye, "png_of", lambda figure: figures.append(figure) or b"")
+    places = [(x, y) for x in (-70, 0, 70) for y in (-70, 0, 70)]
+    for sensor in (places[0], places[-1]):
+        boxes = [
+            Box(center=[*place, 0], size=[0.8, 0.9, 1.7], id="M" * 12 if k % 2 else 100 + k)
+            for k, place in enumerate(places)
+        ]
+        draw_scans([panel(boxes=boxes, sensor=sensor)])
+        axes, renderer = figures[-1].axes[0], FigureCanvasAgg(figures[-1]).get_renderer()
+        view = axes.get_window_extent()
+        texts = [text for text in axes.findobj(Text) if text.get_text() in {*map(bird_eye._name, boxes), "sensor"}]
+        assert len(texts) == len(places) + 1
+        for text in texts:
+            text.update_positions(renderer)
+            # of an annotation without its arrow
+            extent = Text.get_window_extent(text, renderer)
+            assert view.x0 <= extent.x0 and extent.x1 <= view.x1, (text.get_text(), extent, view)
+            assert view.y0 <= extent.y0 and extent.y1 <= view.y1, (text.get_text(), extent, view)
+
+
+@pytest.mark.long
 def test_draw_scans_accepts_no_and_too_many_panels():
     empty = ScanPanel(points=np.zeros((0, 3)), sensor=None)
     broken = ScanPanel(points=np.full((9, 3), np.nan), label="$x")
@@ -236,6 +274,15 @@ def test_label_offsets_avoid_overlap():
     plain = np.linalg.norm((centers + [11, 11])[:, None] - (centers + [11, 11]), axis=-1) + 99 * np.eye(len(centers))
     assert apart.min() > 12 > plain.min()
     assert label_offsets(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)).shape == (0, 2)
+
+
+def test_label_offsets_stay_inside_limits():
+    # a person in each corner and a crowd at the right edge
+    corners = [[x, y] for x in (1.0, 499.0) for y in (1.0, 299.0)]
+    centers, width = np.concatenate([corners, [[495.0, 100 + 9 * k] for k in range(8)]]), 70.0
+    places = centers + label_offsets(centers, np.zeros((0, 2)), np.full(12, width), np.array([[0, 0], [500, 300]]))
+    half_size = np.array([width, 13]) / 2
+    assert (places >= half_size).all() and (places <= [500, 300] - half_size).all()
 
 
 def test_label_offsets_keep_long_names_apart():

@@ -1,6 +1,6 @@
 """Charts of an evaluation: errors by group of people and by joint, reliability, stability, people with large errors.
 
-Drawn with matplotlib's Agg canvas through its object interface; every function returns the bytes of a PNG.
+Drawn with matplotlib's Agg canvas and default settings, as in `viz.draw`; every function returns the bytes of a PNG.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from lidarpose.eval.predictions import Predictions
 from lidarpose.eval.robustness import Curve, End, Stability
 from lidarpose.eval.scores import BASELINE, OURS, Result, Setting
 from lidarpose.sample import CONFIDENCE_RADIUS, Pose
-from lidarpose.viz.draw import BLUE, FAINT, HAIRLINE, INK, ORANGE, Panel, draw_people, png_of
+from lidarpose.viz.draw import BLUE, FAINT, HAIRLINE, INK, ORANGE, Panel, default_settings, draw_people, png_of
 
 # one color per network, from the palette of Okabe and Ito
 _PALETTE = (BLUE, ORANGE, "#009e73", "#cc79a7", "#56b4e9", "#7a828c", "#b59a00")
@@ -27,6 +27,7 @@ _SPREADS = (0.0, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, np.inf)
 _FEWEST = 20
 
 
+@default_settings()
 def draw_errors(result: Result) -> bytes:
     """MPJPE by distance, number of points, hidden share and joint, with intervals and numbers of people."""
     panels = {
@@ -57,6 +58,7 @@ def draw_errors(result: Result) -> bytes:
     return png_of(figure)
 
 
+@default_settings()
 def draw_reliability(predictions: Predictions, result: Result) -> bytes | None:
     """Predicted confidence against the share of joints within 10 cm, and predicted spread against the true error.
 
@@ -80,6 +82,7 @@ def draw_reliability(predictions: Predictions, result: Result) -> bytes | None:
     return png_of(figure)
 
 
+@default_settings()
 def draw_stability(study: Stability) -> bytes:
     """The curves of a study, the other sensors, and the end-joint errors of the people with the largest errors."""
     columns, count = 4, len(study.curves) + bool(study.ends)
@@ -103,6 +106,7 @@ def draw_stability(study: Stability) -> bytes:
     return png_of(figure)
 
 
+@default_settings()
 def compare_stability(studies: dict[str, dict[str, Any]]) -> bytes:
     """Curves of several networks in one chart. Paper: Figure 7.
 
@@ -126,6 +130,7 @@ def compare_stability(studies: dict[str, dict[str, Any]]) -> bytes:
     return png_of(figure)
 
 
+@default_settings()
 def compare_ends(studies: dict[str, dict[str, Any]]) -> bytes:
     """End-joint errors over the people with the largest errors, for several networks: means, and quartiles as lines.
     Paper: Figure 8.
@@ -269,8 +274,7 @@ def _figure(width: float, height: float, title: str, subtitle: str):
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white", layout="constrained")
-    options = {"parse_math": False, "family": "DejaVu Sans"}
-    figure.suptitle(f"{title}\n{subtitle}", x=0.01, ha="left", fontsize=10.5, color=INK, **options)
+    figure.suptitle(f"{title}\n{subtitle}", x=0.01, ha="left", fontsize=10.5, color=INK, parse_math=False)
     return figure
 
 

@@ -1,6 +1,6 @@
 """Whole scans from above: points colored by height; boxes, ids, headings, skeletons and tracks of people.
 
-Drawn with matplotlib's object interface, as in `draw`: no global state is changed.
+Drawn with matplotlib's object interface and default settings, as in `draw`.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,17 @@ from lidarpose.arrays import evenly_spaced
 from lidarpose.models.detector.ground import Ground, estimate_ground
 from lidarpose.models.detector.proposals import heights_above
 from lidarpose.sample import Box, Pose
-from lidarpose.viz.draw import ALERT, FAINT, INK, SIDE_COLORS, draw_people, png_of, shortened, stack_pictures
+from lidarpose.viz.draw import (
+    ALERT,
+    FAINT,
+    INK,
+    SIDE_COLORS,
+    default_settings,
+    draw_people,
+    png_of,
+    shortened,
+    stack_pictures,
+)
 from lidarpose.viz.person_view import Panel, bone_pairs, bone_sides, box_edges, finite, is_known
 
 MAX_SCANS = 12
@@ -20,8 +30,10 @@ LONGEST_NAME = 12  # characters of a person's name that are drawn in a scan
 _MAX_POINTS = 120_000  # per scan; more points would only cover each other at this size
 _DPI, _PANEL, _TITLE = 110, 7.6, 0.6  # inches
 _WIDE, _CARDS_IN_ROW = 11.5, 4  # width of a scan, inches, above the cards of at least this number of people
-# pt: distances of a name from its box, size of a short name, width of a letter
-_LABEL_RADII, _LABEL_SIZE, _LETTER = (15.0, 26.0, 38.0), 13.0, 6.0
+# pt: distances of a name from its box, size of a short name, font size
+_LABEL_RADII, _LABEL_SIZE, _NAME_FONT = (15.0, 26.0, 38.0), 13.0, 9
+# pt: room that the word "sensor" needs
+_SENSOR_ROOM = 45.0
 _MARGIN, _LEAST_SPAN = 3.0, 16.0  # m: margin around the people, and minimum side of a view
 _BELOW, _ABOVE = 0.25, 2.5  # range of heights that the colors cover, m above the ground
 _GROUND, _HIGH = "#d5d9de", "#eceff2"
@@ -66,6 +78,7 @@ def draw_scan_and_people(scan: ScanPanel, people: Sequence[Panel], *, title: str
     return stack_pictures([*pictures, draw_people(list(people))] if people else pictures)
 
 
+@default_settings()
 def draw_scans(panels: Sequence[ScanPanel], *, title: str = "", panel_width: float = _PANEL) -> bytes:
     """Draws scans from above, side by side.
 
@@ -123,7 +136,11 @@ def _draw_panel(ax, panel: ScanPanel, size: np.ndarray) -> None:
     _draw_points(ax, inside_points[evenly_spaced(len(inside_points), _MAX_POINTS)], estimate_ground(points))
     if panel.sensor is not None:
         ax.plot(*panel.sensor, ls="", marker="^", ms=8, color=INK, mec="white", zorder=5)
-        ax.annotate("sensor", panel.sensor, (7, -3), textcoords="offset points", fontsize=8, zorder=5)
+        fits = (high[0] - panel.sensor[0]) * 72 / scale > _SENSOR_ROOM
+        ax.annotate(
+            "sensor", panel.sensor, (7 if fits else -7, -3), textcoords="offset points",
+            ha="left" if fits else "right", fontsize=8, zorder=5,
+        )  # fmt: skip
     for track in panel.tracks:
         ax.plot(track[:, 0], track[:, 1], color=ALERT, lw=1.2, ls=":", zorder=4)
         ax.plot(*track[-1, :2], ls="", marker="o", ms=2.5, color=ALERT, zorder=4)
@@ -131,8 +148,9 @@ def _draw_panel(ax, panel: ScanPanel, size: np.ndarray) -> None:
         ax.plot(panel.places[:, 0], panel.places[:, 1], ls="", marker="o", ms=2.5, color=ALERT, alpha=0.5, zorder=4)
     centers = np.array([box.center[:2] for box in panel.boxes]).reshape(-1, 2)
     arrow_tips = np.array([_arrow_tip(box) for box in panel.boxes]).reshape(-1, 2)
-    widths = _LETTER * np.array([len(_name(box)) for box in panel.boxes])
-    offsets = label_offsets(centers * 72 / scale, arrow_tips * 72 / scale, widths)
+    widths = np.array([_name_width(_name(box)) for box in panel.boxes])
+    limits = np.stack([low, high]) * 72 / scale
+    offsets = label_offsets(centers * 72 / scale, arrow_tips * 72 / scale, widths, limits)
     for box, offset in zip(panel.boxes, offsets.tolist(), strict=True):
         _draw_box(ax, box, offset)
     if is_known(panel.poses):
@@ -183,14 +201,18 @@ def _draw_points(ax, points: np.ndarray, ground: Ground | None) -> None:
     bar.outline.set_visible(False)
 
 
-def label_offsets(centers: np.ndarray, arrow_tips: np.ndarray, widths: np.ndarray) -> np.ndarray:
-    """Offsets (B, 2) of names with widths (B,) from the centers (B, 2) of their boxes, all in pt: away from arrows with
-    tips (A, 2), other boxes and names placed before, else to the upper right."""
+def label_offsets(
+    centers: np.ndarray, arrow_tips: np.ndarray, widths: np.ndarray, limits: np.ndarray | None = None
+) -> np.ndarray:
+    """Offsets (B, 2) of names with widths (B,) from the centers (B, 2) of their boxes, all in pt: between the lower and
+    upper `limits` (2, 2), away from arrows with tips (A, 2), other boxes and names placed before, else to the upper
+    right."""
     angles = np.pi / 4 * (1 + np.arange(8))
     directions = np.stack([np.cos(angles), np.sin(angles)], -1).round(6)
-    effort = np.repeat(np.array(_LABEL_RADII) / _LABEL_RADII[0], 8) * 0.05
+    distance_effort = np.repeat(np.array(_LABEL_RADII) / _LABEL_RADII[0], 8) * 0.05
     widths = np.maximum(widths, _LABEL_SIZE)
     offsets = np.zeros((len(centers), 2))
+    low, high = (-np.inf, np.inf) if limits is None else limits
     for i, center in enumerate(centers):
         # a wide name moves aside by half of its additional width
         aside = np.sign(directions) * ((widths[i] - _LABEL_SIZE) / 2, 0)
@@ -200,6 +222,10 @@ def label_offsets(centers: np.ndarray, arrow_tips: np.ndarray, widths: np.ndarra
         other_widths[len(centers) - 1 : len(centers) - 1 + i] = widths[:i]
         apart = (others[:, None] - (center + candidates)) / _LABEL_SIZE
         apart[..., 0] *= (2 * _LABEL_SIZE / (widths[i] + other_widths))[:, None]
+        # a name that is cut off may read as another one: worse than any overlap
+        half_size = np.array([widths[i], _LABEL_SIZE]) / 2
+        cut_off = np.maximum(low - (center + candidates - half_size), center + candidates + half_size - high)
+        effort = distance_effort + _LABEL_SIZE * cut_off.clip(min=0).max(-1)
         offsets[i] = candidates[np.argmin(np.exp(-(apart**2).sum(-1)).sum(0).round(3) + effort)]
     return offsets
 
@@ -207,6 +233,15 @@ def label_offsets(centers: np.ndarray, arrow_tips: np.ndarray, widths: np.ndarra
 def _name(box: Box) -> str:
     """The name that is drawn beside a box."""
     return "" if box.id is None else shortened(str(box.id), LONGEST_NAME)
+
+
+def _name_width(name: str) -> float:
+    """Width of a drawn name, pt."""
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import text_to_path
+
+    font = FontProperties(size=_NAME_FONT, weight="bold")
+    return text_to_path.get_text_width_height_descent(name, font, ismath=False)[0]
 
 
 def _arrow_tip(box: Box) -> np.ndarray:
@@ -224,7 +259,7 @@ def _draw_box(ax, box: Box, offset: tuple[float, float]) -> None:
     )
     if box.id is not None:
         ax.annotate(
-            _name(box), box.center[:2], offset, textcoords="offset points", fontsize=9,
+            _name(box), box.center[:2], offset, textcoords="offset points", fontsize=_NAME_FONT,
             weight="bold", color=ALERT, zorder=7, parse_math=False,
             bbox={"fc": "white", "ec": "none", "alpha": 0.7, "pad": 0.8},
             ha="center", va="center", arrowprops={"arrowstyle": "-", "color": ALERT, "lw": 0.4, "shrinkB": 6},

@@ -1,11 +1,14 @@
 """Draws people from the front and from the side on one sheet: points, predicted and true skeletons.
 
-Uses matplotlib's Agg canvas through its object interface, so that no global state (backend, current figure) is changed;
-matplotlib is imported only when something is drawn.
+Uses matplotlib's Agg canvas through its object interface, so that no global state (backend, current figure) is changed,
+with its default settings; it is imported only when something is drawn.
 """
 
 import io
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import RLock
 from typing import Any
 
 import numpy as np
@@ -55,7 +58,22 @@ _REACH = 2.5  # m: maximum extent of a view around the person; the rest is clipp
 _TALLEST = 1.8  # m: minimum height of a view, so that most people on a sheet have the same scale
 _DEPTH_SPAN = 0.35  # m in front of and behind the middle that the points' gray levels cover
 
+_SETTINGS_LOCK = RLock()
 
+
+@contextmanager
+def default_settings() -> Iterator[None]:
+    """Draws with matplotlib's default settings instead of the user's, which may need LaTeX or draw white on black. They
+    are global, so one thread draws at a time."""
+    from matplotlib import style
+
+    with _SETTINGS_LOCK, style.context("default"), warnings.catch_warnings():
+        # characters that the font lacks become boxes, without a warning
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+        yield
+
+
+@default_settings()
 def draw_people(panels: list[Panel], *, title: str = "", per_row: int = _PER_ROW) -> bytes:
     """Draws people from the front and from the side on one sheet.
 
@@ -99,14 +117,11 @@ def draw_people(panels: list[Panel], *, title: str = "", per_row: int = _PER_ROW
 
 
 def png_of(figure) -> bytes:
-    """A matplotlib figure as the bytes of a PNG, independent of the user's savefig settings."""
+    """A matplotlib figure as the bytes of a PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     buffer = io.BytesIO()
-    with warnings.catch_warnings():
-        # characters that the font lacks become boxes, without a warning
-        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
-        FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
+    FigureCanvasAgg(figure).print_png(buffer, metadata={"Software": None})
     return buffer.getvalue()
 
 
@@ -126,7 +141,7 @@ def stack_pictures(pictures: list[bytes]) -> bytes:
 
 
 def _text(artist, x: float, y: float, text: str, *, size: float, color: str = INK, **style) -> None:
-    artist.text(x, y, text, fontsize=size, color=color, family="DejaVu Sans", parse_math=False, usetex=False, **style)
+    artist.text(x, y, text, fontsize=size, color=color, parse_math=False, **style)
 
 
 def shortened(words: str, limit: int) -> str:
@@ -159,7 +174,7 @@ def _draw_header(figure, panels: list[Panel], shown_panels: list[Panel], title: 
             handletextpad=0.5,
             columnspacing=1.3,
             labelcolor=INK,
-            prop={"family": "DejaVu Sans", "size": 8},
+            fontsize=8,
         )
 
 

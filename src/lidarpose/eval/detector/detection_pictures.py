@@ -10,7 +10,7 @@ from lidarpose.eval.detector.detection_scores import FALSE, REFERENCE, DetectorR
 from lidarpose.eval.detector.labeled_scans import LabeledScan, ScanSet
 from lidarpose.io.files import shorten
 from lidarpose.sample import Box
-from lidarpose.viz.draw import ALERT, BLUE, FAINT, INK, png_of
+from lidarpose.viz.draw import ALERT, BLUE, FAINT, INK, default_settings, png_of
 from lidarpose.viz.person_view import box_edges
 
 # crops per sheet and per row; half the edge of a crop's view, m
@@ -72,6 +72,7 @@ def _crop(scan: LabeledScan, box: Box, label_parts: Sequence[str]) -> _Crop:
     )
 
 
+@default_settings()
 def _sheet(crops: Sequence[_Crop], title: str) -> bytes | None:
     """Each crop seen from above with the sensor at the bottom, and below that seen from the sensor."""
     from matplotlib.figure import Figure
