@@ -1,13 +1,17 @@
 """`read_poses`: saved poses read back."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import lidarpose
 from lidarpose.errors import InputError
+from lidarpose.inference.result_panels import panels_of
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.sample import Box, Pose
 from lidarpose.skeleton import SKELETONS, WAYMO14, Skeleton
+from lidarpose.viz.person_view import describe, missing_pose
 
 
 def test_read_poses_restores_saved_results(tmp_path):
@@ -40,8 +44,14 @@ def test_read_poses_restores_saved_results(tmp_path):
     line = poses.to_dict()
     line["people"][0]["velocity"] = [1.0, 0.5, 0.0]
     np.testing.assert_array_equal(lidarpose.read_poses(line)["a"].velocity, [1.0, 0.5, 0.0])
-    # points are not stored, but results without them can be drawn
+    # points are not stored, but results without them can be drawn: with their numbers, without invented distances
     assert result.picture() and not len(result[0].points)
+    far, near = panels_of(result)[0]
+    assert describe(far) == f"7 points · confidence {pose.confidence.mean():.2f}" and not missing_pose(far)
+    assert describe(near) == "2 points" and missing_pose(near) == "no pose: under 5 points"
+    # of points that are not distinct there is no pose, either
+    (same,), _ = panels_of(replace(result, people=(replace(result[1], stored_points=9),)))
+    assert describe(same) == "9 points" and missing_pose(same) == "no pose"
 
 
 def test_read_poses_restores_skeleton_of_user():

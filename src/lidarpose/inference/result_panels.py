@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lidarpose.errors import counted
-from lidarpose.geometry import UP_AXES, axes_from_above, rotation_about, rotation_from_up
-from lidarpose.io.files import shorten
-from lidarpose.sample import Box, Pose, facing_yaw, person_note
+from lidarpose.geometry import UP_AXES, axes_from_above, rotation_from_up, rotation_of_boxes
+from lidarpose.sample import Box, Pose, person_note
 from lidarpose.viz.bird_eye import LONGEST_NAME, ScanPanel
+from lidarpose.viz.draw import shortened
 from lidarpose.viz.person_view import Panel
 
 if TYPE_CHECKING:
@@ -27,17 +27,18 @@ def panels_of(poses: "Poses") -> tuple[list[Panel], ScanPanel | None]:
             box=p.box,
             distance=_distance(person, poses.origin),
             note=person_note(person.pose, is_scored=person.score is not None),
+            num_points=person.num_points,
         )
         for p, person in zip(upright_people, poses.people, strict=True)
     ]
     return panels, None if poses.scan is None else _from_above(poses, upright_people)
 
 
-def _distance(person: "PersonPose", origin: np.ndarray | None) -> float | None:
-    """Distance of the person from the sensor, m; NaN if the sensor position is unknown, None without points."""
-    if not len(person.points):
-        return None
-    return np.nan if origin is None else float(np.linalg.norm(np.median(person.points, 0) - origin))
+def _distance(person: "PersonPose", origin: np.ndarray | None) -> float:
+    """Distance of the person from the sensor, m; NaN without points or if the sensor position is unknown."""
+    if origin is None or not len(person.points):
+        return np.nan
+    return float(np.linalg.norm(np.median(person.points, 0) - origin))
 
 
 def _from_above(poses: "Poses", people: "list[PersonPose]") -> ScanPanel:
@@ -50,9 +51,14 @@ def _from_above(poses: "Poses", people: "list[PersonPose]") -> ScanPanel:
         label += f", {len(posed)} with a pose"
     return ScanPanel(
         points=poses.scan @ R_level_input.T,
-        boxes=[box for person in people if (box := person.box or _box_around(person))],
+        boxes=[
+            # a box without an id has the number of its card
+            _level_box(box if box.id is not None else replace(box, id=person.id), poses.up)
+            for person in poses.people
+            if (box := person.box) is not None
+        ],
         poses=Pose(joints=np.stack([person.joints for person in posed]), skeleton=poses.skeleton) if posed else None,
-        names=[shorten(str(person.id), LONGEST_NAME) for person in posed],
+        names=[shortened(str(person.id), LONGEST_NAME) for person in posed],
         label=label,
         sensor=None if poses.origin is None else tuple((R_level_input @ poses.origin)[:2].tolist()),
         axes=axes_from_above(poses.up),
@@ -68,19 +74,17 @@ def _upright(person: "PersonPose", up: str) -> "PersonPose":
         person,
         points=person.points @ R_level_input.T,
         pose=pose and replace(pose, joints=pose.joints @ R_level_input.T),
-        box=box and replace(box, center=R_level_input @ box.center),
+        box=box and _level_box(box, up),
     )
 
 
-def _box_around(person: "PersonPose") -> Box | None:
-    """A box around the points of a person (z up), aligned with the heading of the pose; None without points."""
-    if not len(person.points):
-        return None
-    yaw = facing_yaw(person.pose)
-    R_level_local = rotation_about("z", yaw)
-    local_points = person.points @ R_level_local
-    low, high = local_points.min(0), local_points.max(0)
-    return Box(center=R_level_local @ ((low + high) / 2), size=high - low + 0.1, yaw=yaw, id=person.id)
+def _level_box(box: Box, up: str) -> Box:
+    """A box of the input rotated to z up. If `up` is a direction, the box keeps its size and is drawn upright."""
+    R_level_input = rotation_from_up(up)
+    # the inverse of how `detect` writes the headings of a tilted scan
+    R_boxes_level = rotation_of_boxes(up) @ R_level_input.T
+    x, y = np.linalg.solve(R_boxes_level[:2, :2], [np.cos(box.yaw), np.sin(box.yaw)])
+    return replace(box, center=R_level_input @ box.center, yaw=float(np.arctan2(y, x)))
 
 
 def person_label(id: str | int | None, score: float | None, mounted: bool | None) -> str:

@@ -27,6 +27,7 @@ class Panel:
         forward: (3,) facing of the person, see `facing`; the views are aligned with it. By default that of the pose,
             else of the truth.
         note: what is doubtful, printed after the caption.
+        num_points: number of points of a predicted person, which `points` may lack; by default that of `points`.
     """
 
     points: np.ndarray
@@ -39,6 +40,7 @@ class Panel:
     caption: str = ""
     forward: np.ndarray | None = None
     note: str | None = None
+    num_points: int | None = None
 
     def __post_init__(self):
         if self.points.ndim != 2 or self.points.shape[1] != 3:
@@ -51,6 +53,11 @@ class Panel:
                     f"Panel.{name} must hold one person, joints ({len(pose.skeleton)}, 3), got {pose.joints.shape}: "
                     "draw people one by one"
                 )
+
+
+def count_of(person: Panel) -> int:
+    """The person's number of points."""
+    return len(person.points) if person.num_points is None else person.num_points
 
 
 def facing_of(person: Panel) -> np.ndarray | None:
@@ -115,7 +122,7 @@ def describe(person: Panel) -> str:
     """The line under a person: the caption, by default number of points, distance from the origin, mean confidence."""
     if person.caption:
         return person.caption
-    words = [counted(len(person.points), "point")]
+    words = [counted(count_of(person), "point")]
     distance = person.distance
     if distance is None:
         center = middle(person)
@@ -132,9 +139,9 @@ def missing_pose(person: Panel) -> str:
     # a labeled person of a dataset was never predicted
     if is_known(person.pose) or (person.pose is None and is_known(person.truth)):
         return ""
-    if len(person.points) < MIN_POINTS:
+    if count_of(person) < MIN_POINTS:
         return f"no pose: under {MIN_POINTS} points"
-    return "" if person.pose is None else "no pose"
+    return "" if person.pose is None and person.num_points is None else "no pose"
 
 
 def finite(points: np.ndarray) -> np.ndarray:
