@@ -203,6 +203,23 @@ def test_fig5_draws_hardest_people_of_all_methods(finished, monkeypatch):
     for one, other in zip(drawn[::2], drawn[1::2], strict=True):
         np.testing.assert_array_equal(facing_of(one), facing_of(other))
         np.testing.assert_array_equal(facing_of(one), facing(one.truth))
+    # a missing pose is no error of 0 mm, and does not make a person easier
+    read = figures.read_poses
+
+    def read_without_poses(path):
+        predictions = read(path)
+        if path.parent == selected[0].evaluation.product(out):
+            for p in predictions.values():
+                p.pred[:] = np.nan
+        return predictions
+
+    with monkeypatch.context() as patch:
+        patch.setattr(figures, "read_poses", read_without_poses)
+        drawn.clear()
+        figures.draw("fig5", selected, out)
+    assert {panel.label for panel in drawn[::2]} == {f"{selected[0].row}: no pose"}
+    errors = [int(panel.label.rpartition(": ")[2].removesuffix(" mm")) for panel in drawn[1::2]]
+    assert errors == sorted(errors, reverse=True) and errors[-1] > 0
     assert figures.draw("fig5", cells(TABLES["fig5"], Options(people=96)), out) == []
     # one picture per column
     clips = [replace(cell, column="clips") for cell in selected]

@@ -1,8 +1,10 @@
 """Results of people: JSON, tables, pictures, ids."""
 
+import io
 from dataclasses import replace
 
 import numpy as np
+import pandas
 import pytest
 from matplotlib.axes import Axes
 
@@ -45,6 +47,15 @@ def test_poses_to_dataframe_has_person_probability():
     table = Poses(people=(person, person), skeleton=SMPL24).to_dataframe()
     assert (table["person_probability"] == 0.25).all() and (table["second_person"] == 0.75).all()
     assert table["person"].tolist() == [0] * 24 + [1] * 24
+
+
+def test_poses_to_csv_keeps_carriage_returns_of_ids():
+    pose = Pose(joints=np.zeros((24, 3)), skeleton=SMPL24)
+    people = [PersonPose(pose=pose, skeleton=SMPL24, points=np.zeros((7, 3)), id=id) for id in ("a\rb", "c\n", "d")]
+    poses = Poses(people=tuple(people), skeleton=SMPL24)
+    table = pandas.read_csv(io.StringIO(poses.to_csv()))
+    assert table["id"].tolist() == ["a\rb"] * 24 + ["c\n"] * 24 + ["d"] * 24 and table["score"].isna().all()
+    assert '"' not in poses[2:].to_csv()
 
 
 def test_picture_is_upright_for_any_up_axis(monkeypatch):

@@ -1,6 +1,7 @@
 """Results of a prediction: one person (`PersonPose`) or all people of a call (`Poses`), with JSON, file and picture
 output."""
 
+import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
@@ -312,7 +313,10 @@ class Poses(Sequence[PersonPose]):
 
     def to_csv(self) -> str:
         """`to_dataframe` as CSV text, with the decimals of `to_json`."""
-        return self.to_dataframe().round(_DECIMALS).to_csv(index=False)
+        # a carriage return, which `csv` does not quote by itself, would end the row
+        has_returns = any("\r" in str(person.id) for person in self.people)
+        quoting = csv.QUOTE_NONNUMERIC if has_returns else csv.QUOTE_MINIMAL
+        return self.to_dataframe().round(_DECIMALS).to_csv(index=False, quoting=quoting)
 
     def to_dict(self) -> dict:
         """A document with the schema lidarpose.poses/1. Its top-level "warnings" concern the whole input."""

@@ -74,9 +74,10 @@ def _side_by_side(cells: dict[str, Cell], out: Path) -> bytes:
     common_keys = sorted(set.intersection(*map(set, index_by_key)))
     tables = zip((p.errors() for p in predictions.values()), index_by_key, strict=True)
     errors = np.array([[table[index[key]] for key in common_keys] for table, index in tables])
-    # a person without labels has the error 0
-    mean = np.nansum(errors, -1) / np.maximum((~np.isnan(errors)).sum(-1), 1)
-    hardest_keys = [common_keys[k] for k in np.argsort(-mean.mean(0), kind="stable")[:HARDEST]]
+    mean = _mean(errors)
+    overall = _mean(mean.T)
+    # a person without labels, or without a pose by any method, has no error
+    hardest_keys = [common_keys[k] for k in np.argsort(-overall, kind="stable") if not np.isnan(overall[k])][:HARDEST]
     target = next(iter(cells.values())).target
     folder = target.test.product(out) if isinstance(target.test, Step) else target.test
     clouds = {(p.shard, p.row): p.points for p in open_eval_dataset(folder) if (p.shard, p.row) in set(hardest_keys)}
@@ -89,9 +90,16 @@ def _side_by_side(cells: dict[str, Cell], out: Path) -> bytes:
             )
             # viewed along the true facing, so that all columns show the same side whatever the predicted facing
             panel = Panel(points=clouds[key], pose=pose, truth=truth, forward=facing(truth))
-            label = f"{row}: {mean[k, common_keys.index(key)]:.0f} mm"
+            error = mean[k, common_keys.index(key)]
+            label = f"{row}: no pose" if np.isnan(error) else f"{row}: {error:.0f} mm"
             panels.append(replace(panel, label=label, distance=float(p.distance[row_index])))
     return draw_people(panels, title=f"{target.title}: the hardest people", per_row=len(predictions))
+
+
+def _mean(values: np.ndarray) -> np.ndarray:
+    """The mean of the values that are not NaN along the last axis; NaN if there are none."""
+    count = (~np.isnan(values)).sum(-1)
+    return np.where(count > 0, np.nansum(values, -1) / np.maximum(count, 1), np.nan)
 
 
 def draw_one_body(out: Path, *, motion: str | None = None, subjects: tuple[str, ...] | None = None) -> Path:
