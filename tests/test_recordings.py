@@ -22,12 +22,14 @@ import lidarpose
 from lidarpose import Box, Boxes, InputError
 from lidarpose.cli import main
 from lidarpose.geometry import UP_AXES, rigid_transform, rotation_about, rotation_from_up
+from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.io.sources import open_source
 from lidarpose.io.sources.frame import Frame, FrameSource, IndexedRecording, LazyFrame, Sweep
 from lidarpose.recording import output, page, picture, result_files
 from lidarpose.recording.coordinates import in_world
 from lidarpose.recording.frame_boxes import FrameBoxes
-from lidarpose.recording.predict_recording import FramePredictor, _one_ahead
+from lidarpose.recording.predict_recording import FramePoses, FramePredictor, _one_ahead
+from lidarpose.sample import Pose
 from lidarpose.skeleton import SMPL24
 from lidarpose.viz.bird_eye import draw_scan_and_people
 
@@ -723,9 +725,9 @@ class CountingRecording:
 
 def test_picture_and_page_read_their_frames_in_one_pass(monkeypatch):
     monkeypatch.setattr(page, "_MOST_FRAMES", 4)
-    views = picture.TrajectoryPicture("z"), page.RecordingPage("z")
+    views = picture.TrajectoryPicture(), page.RecordingPage()
     for k, view in product(range(36), views):
-        pose = {"T_world_sensor": np.eye(4).tolist(), "time": k / 10}
+        pose = {"T_world_sensor": np.eye(4).tolist(), "time": k / 10, "up": "z"}
         view.add(pose | {"error": None, "frame": k, "people": []})
     for read, shown in ((views[0]._points, 8), (partial(views[1].render, skeleton=SMPL24, title=""), 3)):
         recording = CountingRecording()
@@ -767,13 +769,13 @@ def test_recording_page_contains_all_frames(drive, tmp_path):
 
 def test_recording_page_of_crops_moves_points_with_the_person():
     """A crop is one person without a box: all of its points are the person's, none are surroundings."""
-    view = page.RecordingPage("z")
+    view = page.RecordingPage()
     frames = [np.full((5, 3), k + 1.0) for k in range(3)]
     for k in range(3):
         joints = (np.zeros((24, 3)) + k + 1).tolist()
-        person = {"id": 0, "track": 7, "joints": joints, "box": None, "confidence": None}
+        person = {"id": 0, "track": 7, "joints": joints, "box": None, "confidence": None, "filled": False}
         # times of a clock
-        pose = {"T_world_sensor": None, "time": 1.7e9 + k / 10}
+        pose = {"T_world_sensor": None, "time": 1.7e9 + k / 10, "up": "z"}
         view.add(pose | {"error": None, "frame": k, "people": [person]})
     text = view.render(FrameSource(Crops(frames)), SMPL24, title="").decode()
     (scan,) = json.loads(text.split('id="data">')[1].split("</script>")[0])["scans"]
@@ -797,26 +799,115 @@ class Crops:
             yield LazyFrame(str(k), k / 10, lambda k=k: Sweep(points=self.clouds[k], T_world_sensor=None))
 
 
+def line_of(*people, frame=0, T_world_sensor=None, is_tracked=False, up="z", **values):
+    """A line of a recording with people as arguments of `PersonPose`."""
+    poses = [PersonPose(**{"pose": None, "skeleton": SMPL24, "points": np.zeros((9, 3)), "up": up} | p) for p in people]
+    poses = Poses(people=tuple(poses), skeleton=SMPL24, up=up, **values)
+    about = {"index": frame, "id": str(frame), "time": frame / 10, "is_tracked": is_tracked}
+    return FramePoses(poses=poses, T_world_sensor=T_world_sensor, **about).to_dict()
+
+
+def drawn_of(lines, clouds, monkeypatch):
+    """The `ScanPanel` and the cards that the picture of lines over the points of their frames draws."""
+    drawn, view = [], picture.TrajectoryPicture()
+    monkeypatch.setattr(picture, "draw_scan_and_people", lambda scan, people, **_: drawn.append((scan, people)) or b"")
+    for line in lines:
+        view.add(json.loads(json.dumps(line)))
+    view.draw(FrameSource(Crops(clouds)), title="")
+    return drawn[0]
+
+
 def test_picture_of_recordings_names_axes_and_counts_poses(monkeypatch):
     """As the picture of one scan; the distance of a crop is not known."""
-    drawn = []
-    monkeypatch.setattr(picture, "draw_scan_and_people", lambda scan, people, **_: drawn.append((scan, people)) or b"")
     frames = [np.random.default_rng(0).normal(size=(9, 3))] * 3
-    for up, pose, count in (("-y", None, 3), ("-y", np.eye(4), 1)):
-        view = picture.TrajectoryPicture(up)
-        for k in range(count):
-            box = {"center": [1.0, 0, 9], "size": [1, 1, 2], "yaw": 0.0} if pose is not None else None
-            person = {"id": 0, "track": None, "joints": np.ones((24, 3)).tolist(), "box": box, "score": None}
-            view.add({"T_world_sensor": pose, "error": None, "frame": k, "people": [person | {"confidence": None}]})
-        view.draw(FrameSource(Crops(frames)), SMPL24, title="")
-    (moving, _), (in_world, _) = drawn
+    pose = Pose(joints=np.ones((24, 3)), skeleton=SMPL24)
+    box = Box(center=[1.0, 0, 9], size=[1, 1, 2])
+    moving, _ = drawn_of([line_of({"pose": pose}, up="-y", frame=k) for k in range(3)], frames, monkeypatch)
+    in_world, _ = drawn_of(
+        [line_of({"pose": pose, "box": box}, up="-y", T_world_sensor=np.eye(4))], frames, monkeypatch
+    )
     assert moving.axes == ("z", "-x") and moving.label == "3 poses in 3 frames"
     assert in_world.axes == ("x", "y") and in_world.label == "1 person in 1 frame"
-    view = picture.TrajectoryPicture("z")
-    person = {"id": 0, "track": None, "joints": np.ones((24, 3)).tolist(), "box": None, "score": None}
-    view.add({"T_world_sensor": None, "error": None, "frame": 0, "people": [person | {"confidence": None}]})
-    view.draw(FrameSource(Crops(frames)), SMPL24, title="")
-    assert drawn[-1][0].sensor is None and np.isnan(drawn[-1][1][0].distance)
+    scan, (card,) = drawn_of([line_of({"pose": pose})], frames, monkeypatch)
+    assert scan.sensor is None and np.isnan(card.distance)
+
+
+@pytest.mark.parametrize("is_world", [False, True])
+@pytest.mark.parametrize("frames", [1, 2])
+def test_picture_shows_sensor_at_given_position(is_world, frames, monkeypatch):
+    """Also where the points are in another frame than the sensor's, moved once more by a known pose."""
+    T = rigid_transform(np.eye(3), np.array([100.0, 0, 0])) if is_world else None
+    person = {"pose": Pose(joints=np.full((24, 3), 20.0), skeleton=SMPL24)}
+    person["box"] = Box(center=[20, 20, 20], size=[1, 1, 2])
+    lines = [line_of(person, frame=k, T_world_sensor=T, origin=np.array([20.0, 5, 20])) for k in range(frames)]
+    for convert in (lambda line: line, in_world):
+        scan, cards = drawn_of(map(convert, lines), [np.full((9, 3), 20.0)] * frames, monkeypatch)
+        assert scan.sensor == pytest.approx([120 if is_world else 20, 5])
+        assert [card.distance for card in cards] == pytest.approx([15] * (frames == 1))
+    lines = [line | {"sensor_origin": None} for line in lines]
+    scan, cards = drawn_of(lines, [np.full((9, 3), 20.0)] * frames, monkeypatch)
+    assert scan.sensor is None and all(np.isnan(card.distance) for card in cards)
+
+
+def test_picture_and_page_of_tilted_sensor_are_level(monkeypatch):
+    """As the picture of one scan: without the box, which is larger than the person, and with the person's points."""
+    rng = np.random.default_rng(0)
+    level = np.concatenate([rng.uniform(-0.2, 0.2, (40, 3)) * [1, 1, 4], [[0.7, 0.7, -0.8]] * 9, [[9.0, 0, 0]] * 9])
+    R_level_input = rotation_from_up("0.3,0,0.95")
+    pose = Pose(joints=np.linspace([0, 0, -0.8], [0, 0, 0.8], 24) @ R_level_input, skeleton=SMPL24)
+    person = {"pose": pose, "box": Box(center=[0, 0, 0], size=[2, 2, 2], score=0.7, id=0), "points": level[:40]}
+    lines = [line_of(person, frame=k, up="0.3,0,0.95", origin=np.array([0.3, 0, 0.95])) for k in range(2)]
+    scan, (card,) = drawn_of(lines[:1], [level @ R_level_input], monkeypatch)
+    assert scan.axes == ("x turned level", "y turned level") and card.box is None and card.label == "score 0.70"
+    np.testing.assert_allclose(card.points, level[:40], atol=1e-9)
+    np.testing.assert_allclose(card.pose.joints[:, :2], 0, atol=1e-4)
+    np.testing.assert_allclose(scan.points, level, atol=1e-9)
+    scan, _ = drawn_of(lines, [level @ R_level_input] * 2, monkeypatch)
+    assert scan.axes == ("x turned level", "y turned level")
+    np.testing.assert_allclose(scan.points, level, atol=1e-9)
+    np.testing.assert_allclose(scan.sensor, [0, 0], atol=1e-4)
+    view = page.RecordingPage()
+    view.add(lines[0])
+    text = view.render(FrameSource(Crops([level @ R_level_input])), SMPL24, title="").decode()
+    (scan,) = json.loads(text.split('id="data">')[1].split("</script>")[0])["scans"]
+    joints = np.array(scan["frames"][0]["poses"][0]["joints"])
+    assert np.ptp(joints, axis=0).tolist() == [0, 0, 1600] and len(scan["frames"][0]["points"]) == 3 * 40
+
+
+def test_picture_of_tracks_has_arrows_where_people_face(monkeypatch):
+    """A tracked crop has no box that tells its heading."""
+    joints = np.zeros((24, 3))
+    joints[SMPL24.index("left_hip")], joints[SMPL24.index("right_hip")] = [-0.1, 0, 0], [0.1, 0, 0]
+    facing, unknown = (Pose(joints=values, skeleton=SMPL24) for values in (joints, np.zeros((24, 3))))
+    for pose in (facing, unknown):
+        lines = [line_of({"pose": one, "id": 0}, frame=k, is_tracked=True) for k, one in enumerate((facing, pose))]
+        scan, _ = drawn_of(lines, [np.zeros((9, 3))] * 2, monkeypatch)
+        assert scan.headings == [pose is facing] and scan.boxes[0].yaw == pytest.approx(np.pi / 2 * (pose is facing))
+    turned = [replace(scan, boxes=[replace(scan.boxes[0], yaw=yaw, id=None)]) for yaw in (0.0, np.pi)]
+    pictures = [draw_scan_and_people(replace(panel, headings=[k]), []) for panel in turned for k in (False, True)]
+    assert pictures[0] == pictures[2] and pictures[1] != pictures[3]
+
+
+def test_cards_of_single_frame_state_doubts(monkeypatch):
+    pose = Pose(joints=np.zeros((24, 3)), skeleton=SMPL24, person=np.array(0.9), second_person=np.array(0.8))
+    nobody = replace(pose, person=np.array(0.01))
+    for box in (None, Box(center=[0, 0, 0], size=[1, 1, 2])):
+        _, cards = drawn_of(
+            [line_of({"pose": pose, "box": box}, {"pose": nobody, "box": box})], [np.zeros((9, 3))], monkeypatch
+        )
+        assert [card.note for card in cards] == ["two people?", "unlike a person"]
+
+
+def test_page_keeps_surroundings_where_smoothing_added_people():
+    """A person who was added in a frame has no box there, and does not take the points of all others."""
+    view, points = page.RecordingPage(), np.concatenate([np.ones((9, 3)), np.full((99, 3), 8.0)])
+    pose = Pose(joints=np.ones((24, 3)), skeleton=SMPL24)
+    line = line_of({"pose": pose, "id": 0, "box": Box(center=[1, 1, 1], size=[1, 1, 2])}, is_tracked=True)
+    line["people"].append(line["people"][0] | {"id": 1, "track": 1, "box": None, "num_points": 0, "filled": True})
+    view.add(line)
+    text = view.render(FrameSource(Crops([points])), SMPL24, title="").decode()
+    (scan,) = json.loads(text.split('id="data">')[1].split("</script>")[0])["scans"]
+    assert len(scan["points"]) == 3 * 99 and len(scan["frames"][0]["points"]) == 3 * 9
 
 
 def test_recording_page_limits_number_of_frames(drive, tmp_path, monkeypatch):
@@ -981,6 +1072,7 @@ def test_unknown_sensor_position_stays_unknown(model, stated, option, expected):
     boxes = {0: [[1, 1, 1, 1, 1, 2, 0]]}
     (result,) = lidarpose.predict_recording([frame], model=model, boxes=boxes, sensor_origin=option)
     assert (None if result.poses.origin is None else result.poses.origin.tolist()) == expected
+    assert result.to_dict()["sensor_origin"] == expected
 
 
 def test_first_frame_of_paths_has_warnings_about_source(model, tmp_path):

@@ -100,8 +100,8 @@ def _predict_recording(
         live=options.live,
         **posing_options,
     )
-    tracks_picture = None if picture is None else TrajectoryPicture(predictor.up)
-    frames_page = None if page is None else RecordingPage(predictor.up)
+    tracks_picture = None if picture is None else TrajectoryPicture()
+    frames_page = None if page is None else RecordingPage()
     views = [view for view in (tracks_picture, frames_page) if view is not None]
 
     def on_line(line: dict[str, Any]) -> None:
@@ -123,7 +123,7 @@ def _predict_recording(
     # read before the pictures below read single frames, which resets the counts in these warnings
     source_warnings = [f"{source.name}: {line}" for line in source.warnings]
     if tracks_picture is not None and picture is not None:
-        write_atomic(picture, tracks_picture.draw(source, predictor.wanted, title=Path(source.name).name))
+        write_atomic(picture, tracks_picture.draw(source, title=Path(source.name).name))
     if frames_page is not None and page is not None:
         write_atomic(page, frames_page.render(source, predictor.wanted, title=Path(source.name).name))
     outputs = [str(path) for path in (result, picture, page) if path is not None]

@@ -9,6 +9,7 @@ from lidarpose.geometry import (
     axes_from_above,
     inverse_transform,
     rigid_transform,
+    rotation_from_up,
     rotation_of_boxes,
     transform_points,
     upright_axis,
@@ -19,12 +20,13 @@ class FixedFrame:
     """The transform to the fixed frame, updated frame by frame. If the first frames have no sensor pose, the fixed
     frame stays that of these frames, as if the sensor had not moved until the first known pose.
 
-    up: up axis of the points, as in `predict`.
+    up: up axis of the points, as in `predict`. level: whether z of the fixed frame is exactly `up`, for drawing, and
+    not the axis nearest to it, along which boxes are upright.
     """
 
-    def __init__(self, up: str):
-        self._up = upright_axis(up)
-        self.R_upright = rotation_of_boxes(up)
+    def __init__(self, up: str, *, level: bool = False):
+        self._up = up if level else upright_axis(up)
+        self.R_upright = rotation_from_up(self._up)
         self.T_world_sensor: np.ndarray | None = None
         self.T_fixed_world: np.ndarray | None = None
         self._is_first = True
@@ -88,7 +90,9 @@ def in_world(line: dict[str, Any], up: str = "z") -> dict[str, Any]:
             yaw = round(moved_yaw(box["yaw"], T, rotation_of_boxes(up)), 4)
             changes["box"] = box | {"center": rounded_points(T, box["center"]), "yaw": yaw}
         people.append(person | changes)
-    return line | {"people": people, "coordinates": "world", "up": "z"}
+    origin = line.get("sensor_origin")
+    origin = None if origin is None else rounded_points(T, origin)
+    return line | {"people": people, "sensor_origin": origin, "coordinates": "world", "up": "z"}
 
 
 def rounded_points(T: np.ndarray, points: Any) -> list:

@@ -10,7 +10,7 @@ from lidarpose.errors import counted
 from lidarpose.geometry import transform_points
 from lidarpose.io.sources import Frame, FrameSource
 from lidarpose.recording.coordinates import FixedFrame
-from lidarpose.recording.picture import in_fixed_frame
+from lidarpose.recording.picture import in_fixed_frame, nearest_points
 from lidarpose.sample import Pose
 from lidarpose.skeleton import Skeleton
 from lidarpose.viz.bird_eye import ScanPanel
@@ -39,8 +39,8 @@ class _Track:
 class RecordingPage:
     """Collects the people of each line of a result, in the fixed frame; long recordings are subsampled."""
 
-    def __init__(self, up: str):
-        self._fixed = FixedFrame(up)
+    def __init__(self) -> None:
+        self._fixed: FixedFrame | None = None
         self._lines: list[tuple[dict[str, Any], np.ndarray, list[dict[str, Any]]]] = []
         self._count, self._every = 0, 1
         self._tracks: dict[int, _Track] = {}
@@ -48,7 +48,9 @@ class RecordingPage:
     def add(self, line: dict[str, Any]) -> None:
         if line["error"] is not None:
             return
-        T_fixed_sensor, people = in_fixed_frame(line, self._fixed)
+        # the up direction may have been estimated
+        self._fixed = self._fixed or FixedFrame(line["up"], level=True)
+        T_fixed_sensor, people, _ = in_fixed_frame(line, self._fixed)
         if self._count % self._every == 0:
             about = {name: line[name] for name in ("frame", "time")}
             self._lines.append((about, T_fixed_sensor, people))
@@ -96,13 +98,17 @@ class RecordingPage:
 
     def _of_people(self, points: np.ndarray, people: list[dict[str, Any]]) -> tuple[np.ndarray, np.ndarray]:
         """A subsample (m, 3) m of the points inside the boxes of people, and (n,) bool: which of the points (n, 3) are
-        outside all boxes and their margins. All points of a crop, whose person has no box, are the person's."""
-        if any(person["box"] is None for person in people):
+        outside all boxes and their margins. All points of a crop, whose person has no box, are the person's; people
+        who were added by smoothing have no box either, and no points."""
+        seen = [person for person in people if not person["filled"] or person["box"] is not None]
+        if any(person["box"] is None for person in seen):
             return points[evenly_spaced(len(points), _PERSON_POINTS)], np.zeros(len(points), bool)
         is_far, clouds = np.ones(len(points), bool), [np.zeros((0, 3))]
-        for box in (person["box"] for person in people):
-            is_far &= ~box.contains(points, margin=_NEAR)
-            own_points = points[box.contains(points)]
+        for person in seen:
+            is_far &= ~person["box"].contains(points, margin=_NEAR)
+            own_points = points[person["box"].contains(points)]
+            if person["joints"] is not None:
+                own_points = nearest_points(own_points, person["joints"], person["num_points"])
             clouds.append(own_points[evenly_spaced(len(own_points), _PERSON_POINTS)])
         return np.concatenate(clouds), is_far
 

@@ -67,12 +67,14 @@ class FramePoses:
             track = person.id if self.is_tracked else None
             people.append(entry | {"track": track, "velocity": velocity, "filled": False})
         T_world_sensor = None if self.T_world_sensor is None else self.T_world_sensor.tolist()
+        origin = self.poses.origin
         frame_entry = {
             "schema": SCHEMA,
             "frame": self.index,
             "id": self.id,
             "time": self.time,
             "T_world_sensor": T_world_sensor,
+            "sensor_origin": None if origin is None else np.asarray(origin, float).round(4).tolist(),
         }
         return document | frame_entry | {"people": people, "error": self.error}
 

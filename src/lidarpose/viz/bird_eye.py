@@ -46,6 +46,7 @@ class ScanPanel:
     Args:
         points: (n, 3).
         boxes: boxes of people; the id is printed beside a box, and an arrow marks its heading.
+        headings: whether the heading of each box is known; by default it is.
         poses: joints (P, J, 3); labeled: whether these are ground truth.
         tracks: positions (F, 2) or (F, 3) of each person over time.
         places: (K, 2) or (K, 3), positions of people without track ids.
@@ -58,6 +59,7 @@ class ScanPanel:
 
     points: np.ndarray
     boxes: Sequence[Box] = ()
+    headings: Sequence[bool] = ()
     poses: Pose | None = None
     labeled: bool = False
     tracks: Sequence[np.ndarray] = ()
@@ -108,7 +110,7 @@ def draw_scans(panels: Sequence[ScanPanel], *, title: str = "", panel_width: flo
     )
     tracks = "; dotted: path over the frames" if any(panel.tracks for panel in panels) else ""
     limbs = "; left limbs blue, right ones orange" if any(is_known(panel.poses) for panel in panels) else ""
-    arrows = "arrow: facing, of given boxes their heading" if any(panel.boxes for panel in panels) else ""
+    arrows = "arrow: facing, of given boxes their heading" if any(any(_is_headed(panel)) for panel in panels) else ""
     note = f"{arrows}{tracks}{limbs}".removeprefix("; ")
     figure.text(0.15 / width, 1 - 0.42 / height, note, fontsize=8, color=FAINT, va="top")
     for number, panel in enumerate(panels):
@@ -151,8 +153,8 @@ def _draw_panel(ax, panel: ScanPanel, size: np.ndarray) -> None:
     widths = np.array([_name_width(_name(box)) for box in panel.boxes])
     limits = np.stack([low, high]) * 72 / scale
     offsets = label_offsets(centers * 72 / scale, arrow_tips * 72 / scale, widths, limits)
-    for box, offset in zip(panel.boxes, offsets.tolist(), strict=True):
-        _draw_box(ax, box, offset)
+    for box, is_headed, offset in zip(panel.boxes, _is_headed(panel), offsets.tolist(), strict=True):
+        _draw_box(ax, box, offset, is_headed)
     if is_known(panel.poses):
         skeleton = panel.poses.skeleton
         bones = panel.poses.joints.reshape(-1, len(skeleton), 3)[:, bone_pairs(skeleton), :2]
@@ -244,19 +246,25 @@ def _name_width(name: str) -> float:
     return text_to_path.get_text_width_height_descent(name, font, ismath=False)[0]
 
 
+def _is_headed(panel: ScanPanel) -> list[bool]:
+    """Whether each box has an arrow."""
+    return list(panel.headings) or [True] * len(panel.boxes)
+
+
 def _arrow_tip(box: Box) -> np.ndarray:
     """Tip (2,) m of the arrow that shows the heading."""
     return box.center[:2] + np.array([np.cos(box.yaw), np.sin(box.yaw)]) * (box.size[0] / 2 + 0.6)
 
 
-def _draw_box(ax, box: Box, offset: tuple[float, float]) -> None:
-    """Draws a box's outline, its heading, and its id at `offset` pt from the center."""
+def _draw_box(ax, box: Box, offset: tuple[float, float], is_headed: bool) -> None:
+    """Draws a box's outline, its heading if it is known, and its id at `offset` pt from the center."""
     from matplotlib.collections import LineCollection
 
     ax.add_collection(LineCollection(list(box_edges(box)[..., :2]), colors=ALERT, lw=1.1, zorder=5))
-    ax.annotate(
-        "", _arrow_tip(box), box.center[:2], arrowprops={"arrowstyle": "->", "color": ALERT, "lw": 1.1}, zorder=5
-    )
+    if is_headed:
+        ax.annotate(
+            "", _arrow_tip(box), box.center[:2], arrowprops={"arrowstyle": "->", "color": ALERT, "lw": 1.1}, zorder=5
+        )
     if box.id is not None:
         ax.annotate(
             _name(box), box.center[:2], offset, textcoords="offset points", fontsize=_NAME_FONT,
