@@ -799,6 +799,18 @@ class Crops:
             yield LazyFrame(str(k), k / 10, lambda k=k: Sweep(points=self.clouds[k], T_world_sensor=None))
 
 
+def test_csv_keeps_ids_with_line_breaks(tmp_path):
+    ids = ["a\rb", "a\nb", "a\r\nb", "\r", 'a"b', "a,b", "7", "c"]
+    pose = Pose(joints=np.ones((24, 3)), skeleton=SMPL24)
+    for k, id in enumerate(ids):
+        result_files.write_result(tmp_path / f"{k}.csv", [line_of({"pose": pose, "id": id}, {"pose": pose, "id": "x"})])
+        table = pandas.read_csv(tmp_path / f"{k}.csv", dtype={"id": str})
+        assert table.id.tolist() == [id] * 24 + ["x"] * 24
+        assert table.filled.dtype == bool and table.frame.dtype == int and table.track.isna().all()
+    # quotes only where they are needed
+    assert '"' not in (tmp_path / "7.csv").read_text()
+
+
 def line_of(*people, frame=0, T_world_sensor=None, is_tracked=False, up="z", **values):
     """A line of a recording with people as arguments of `PersonPose`."""
     poses = [PersonPose(**{"pose": None, "skeleton": SMPL24, "points": np.zeros((9, 3)), "up": up} | p) for p in people]

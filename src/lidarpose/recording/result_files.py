@@ -1,5 +1,6 @@
 """Writes the lines of a recording to NAME.poses.jsonl, .csv or .parquet, completely or not at all."""
 
+import csv
 import json
 import os
 from collections.abc import Iterable, Iterator
@@ -32,7 +33,11 @@ def write_result(path: Path, lines: Iterable[dict[str, Any]]) -> None:
                 file.writelines(json.dumps(line) + "\n" for line in lines)
         elif suffix == ".csv":
             for number, table in enumerate(_tables(lines)):
-                table.to_csv(temporary, index=False, mode="a" if number else "w", header=not number)
+                # a carriage return, which `csv` does not quote by itself, would end the row
+                has_returns = any(table[name].str.contains("\r", regex=False).any() for name in ("id", "frame_id"))
+                quoting = csv.QUOTE_NONNUMERIC if has_returns else csv.QUOTE_MINIMAL
+                mode = "a" if number else "w"
+                table.to_csv(temporary, index=False, mode=mode, header=not number, quoting=quoting)
         else:
             _write_parquet(temporary, lines)
 
