@@ -15,7 +15,7 @@ from lidarpose.cli import main
 from lidarpose.errors import InputError
 from lidarpose.eval.detector.labeled_scans import heldout_scans
 from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
-from lidarpose.inference import detection, single_scan, verification
+from lidarpose.inference import detection, inputs, single_scan, verification
 from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.result_panels import panels_of
 from lidarpose.lidar.raycast import scan
@@ -114,9 +114,13 @@ def test_detect_ignores_duplicated_points(scene):
     for one, other in zip(boxes, again, strict=True):
         np.testing.assert_array_equal(one.center, other.center)
         assert one.score == other.score
+    # poses in boxes do not depend on them either
+    poses, same = lidarpose.predict(points, boxes=boxes), lidarpose.predict(copies, boxes=boxes)
+    np.testing.assert_allclose(same.to_numpy(), poses.to_numpy(), atol=1e-4)
+    assert [person.num_points for person in same] == [person.num_points for person in poses]
     # few copies are kept, and an empty scan stays empty
     few = np.concatenate([points, points[:5]])
-    assert detection._distinct(few) is few and len(detection._distinct(np.zeros((0, 3)))) == 0
+    assert inputs.distinct(few) is few and len(inputs.distinct(np.zeros((0, 3)))) == 0
 
 
 def test_detect_options_limit_people(scene):

@@ -7,6 +7,7 @@ import pytest
 
 import lidarpose
 from lidarpose.errors import InputError
+from lidarpose.geometry import rotation_from_up
 from lidarpose.inference.result_panels import panels_of
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.sample import Box, Pose
@@ -110,3 +111,16 @@ def test_read_poses_reports_wrong_values(tmp_path):
 def test_read_poses_names_missing_file(tmp_path):
     with pytest.raises(InputError, match=r"^\S*nope.json: no such file; expected a file of poses"):
         lidarpose.read_poses(tmp_path / "nope.json")
+
+
+@pytest.mark.parametrize("up", ["z", "y", "-x", "0.1,0,1"])
+def test_box_taken_out_of_a_result_keeps_the_up_axis(up):
+    rng, R_level_input = np.random.default_rng(0), rotation_from_up(up)
+    box = Box(center=np.array([5.0, 1.0, 0.0]) @ R_level_input, size=np.array([1.0, 1.0, 2.0]), yaw=0.3)
+    points = (rng.normal(size=(200, 3)) * [0.15, 0.15, 0.4] + [5, 1, 0]) @ R_level_input
+    poses = lidarpose.predict(points, boxes=[box], up=up)
+    for result in (poses, lidarpose.read_poses(poses.to_dict())):
+        assert [person.box.up for person in result] == [None if up == "z" else up]
+    again = lidarpose.predict(points, boxes=[person.box for person in poses])
+    assert again.up == up
+    np.testing.assert_allclose(again.to_numpy(), poses.to_numpy(), atol=1e-5)

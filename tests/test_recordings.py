@@ -20,6 +20,7 @@ from walking_people import FRAMES, PLACES, STEPS, moving_source, walking_clouds
 
 import lidarpose
 from lidarpose import Box, Boxes, InputError
+from lidarpose.body.rig import mean_adult_joints
 from lidarpose.cli import main
 from lidarpose.geometry import UP_AXES, rigid_transform, rotation_about, rotation_from_up
 from lidarpose.inference.results import PersonPose, Poses
@@ -29,11 +30,12 @@ from lidarpose.recording import output, page, picture, result_files
 from lidarpose.recording.coordinates import in_world
 from lidarpose.recording.frame_boxes import FrameBoxes
 from lidarpose.recording.predict_recording import FramePoses, FramePredictor, _one_ahead
-from lidarpose.sample import Pose
+from lidarpose.sample import Pose, facing
 from lidarpose.skeleton import SMPL24
 from lidarpose.viz.bird_eye import draw_scan_and_people
 
 DAMAGED = 4
+STATED_SKELETON = {"name": "smpl24", "joints": list(SMPL24.joints), "bones": [list(bone) for bone in SMPL24.bones]}
 
 
 @pytest.fixture(scope="module")
@@ -439,14 +441,29 @@ def test_in_world_converts_box_heading(up):
     R_level_input, R_world_level = UP_AXES[up], rotation_about("z", 0.4)
     T_world_sensor = rigid_transform(R_world_level @ R_level_input, np.array([1.0, 2.0, 3.0]))
     box = {"center": [4.0, 5.0, 6.0], "size": [0.5, 0.6, 1.8], "yaw": 0.3}
-    person = {"joints": None, "box": box, "velocity": [1, 2, 3], "facing": [0, 0, 1]}
-    line = in_world({"T_world_sensor": T_world_sensor.tolist(), "people": [person], "up": up}, up)
+    person = {"joints": None, "box": box, "velocity": [1, 2, 3], "facing": None}
+    line = in_world(
+        {"T_world_sensor": T_world_sensor.tolist(), "people": [person], "up": up, "skeleton": STATED_SKELETON}, up
+    )
     (person,), moved = line["people"], line["people"][0]["box"]
-    assert line["up"] == "z"
-    np.testing.assert_allclose(person["facing"], R_world_level @ R_level_input @ [0, 0, 1], atol=1e-4)
+    assert line["up"] == "z" and person["facing"] is None
     np.testing.assert_allclose(person["velocity"], R_world_level @ R_level_input @ [1, 2, 3], atol=1e-4)
     assert abs(moved["yaw"] - 0.7) < 1e-9
     np.testing.assert_allclose(moved["center"], R_world_level @ R_level_input @ [4, 5, 6] + [1, 2, 3], atol=1e-4)
+
+
+@given(st.floats(-0.4, 0.4), st.floats(-3, 3))
+def test_facing_in_world_is_that_of_the_joints(tilt, yaw):
+    """Also where the sensor is out of level: its horizontal is not the world's."""
+    T_world_sensor = rigid_transform(rotation_about("x", tilt) @ rotation_about("z", yaw), np.array([1.0, 2.0, 3.0]))
+    joints = mean_adult_joints()
+    own = facing(Pose(joints=joints, skeleton=SMPL24))
+    person = {"joints": joints.tolist(), "box": None, "facing": own.tolist()}
+    line = {"T_world_sensor": T_world_sensor.tolist(), "people": [person], "up": "z", "skeleton": STATED_SKELETON}
+    (moved,) = in_world(line)["people"]
+    expected = facing(Pose(joints=np.array(moved["joints"]), skeleton=SMPL24))
+    np.testing.assert_allclose(moved["facing"], expected, atol=1e-3)
+    assert moved["facing"][2] == 0 and np.linalg.norm(moved["facing"]) == pytest.approx(1, abs=1e-3)
 
 
 def test_recording_of_crops_without_search(clouds, model):

@@ -17,6 +17,7 @@ from lidarpose.errors import InputError, check_int, is_number
 from lidarpose.geometry import UP_AXES, rotation_about, up_text
 from lidarpose.inference.background import is_static, read_background
 from lidarpose.inference.checks import flat_along_another_axis, scan_unit_warning, unlikely_origin
+from lidarpose.inference.inputs import distinct
 from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.scan import Scan
 from lidarpose.inference.verification import rounded, verified
@@ -30,8 +31,6 @@ MOST_POSED = 60
 # than `_BEYOND` m beyond the range are dropped first. Points processed per chunk, and bins of the distance histogram
 _MOST_POINTS, _MOST_AROUND, _BEYOND = 1_500_000, 400_000, 15.0
 _CHUNK, _DISTANCES = 1_000_000, 4096
-# maximum fraction of duplicate points that may remain
-_FEW_COPIES = 0.01
 # number of points used to estimate the up direction
 _ENOUGH_FOR_UP = 250_000
 # minimum fraction of a scan's points on its background; below it, the background belongs to another sensor or frame
@@ -122,7 +121,7 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
     """The first half of `find_people`, which does not depend on other frames of a recording."""
     full_scan, count = scan, len(scan.points)
     input_scan, notes = _thinned(scan, search)
-    input_scan = replace(input_scan, points=_distinct(input_scan.points))
+    input_scan = replace(input_scan, points=distinct(input_scan.points))
     scan, warnings = input_scan, [*scan.warnings, *notes]
     if len(scan.points) < MIN_POINTS:
         scan = replace(scan, warnings=(*warnings, f"under {MIN_POINTS} points"))
@@ -300,19 +299,6 @@ def _thinned(scan: Scan, search: Search) -> tuple[Scan, list[str]]:
             "part of it"
         ]
     return replace(scan, points=points[rows]), notes
-
-
-def _distinct(points: np.ndarray) -> np.ndarray:
-    """Points (n, 3) m without duplicates: second returns mostly repeat the first, and the detector counts points."""
-    factors = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)
-    keys = np.zeros(len(points), np.uint64)
-    for axis, factor in zip(np.ascontiguousarray(points.T, np.float64).view(np.uint64), factors, strict=True):
-        # the upper bits are the ones that differ
-        keys = (keys ^ axis ^ (axis >> np.uint64(29))) * np.uint64(factor)
-    ordered = np.sort(keys)
-    if np.count_nonzero(ordered[1:] == ordered[:-1]) <= _FEW_COPIES * len(points):
-        return points
-    return points[np.sort(np.unique(keys, return_index=True)[1])]
 
 
 def _squared(points: np.ndarray, origin: np.ndarray) -> np.ndarray:

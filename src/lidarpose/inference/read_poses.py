@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -60,7 +61,7 @@ def _poses(document: Any) -> Poses:
     if not isinstance(schema, str) or schema.partition("/")[0] not in _SCHEMAS:
         actual = f"the schema {schema}" if schema else "a document without it"
         raise FormatError(f"expected {_EXPECTED}, got {actual}: give a file that lidarpose predict wrote")
-    skeleton = _skeleton(document["skeleton"])
+    skeleton = stated_skeleton(document["skeleton"])
     up, model = str(document.get("up", "z")), dict(document["model"])
     rotation_from_up(up)
     people = [_person(entry, skeleton, up, model) for entry in document["people"]]
@@ -75,7 +76,7 @@ def _poses(document: Any) -> Poses:
     )
 
 
-def _skeleton(stated: dict[str, Any]) -> Skeleton:
+def stated_skeleton(stated: dict[str, Any]) -> Skeleton:
     """The skeleton of a document: the package's own of that name, joints and bones, else the user's, from its bones."""
     name, joints = stated["name"], tuple(stated["joints"])
     known = SKELETONS.get(name)
@@ -91,7 +92,7 @@ def _skeleton(stated: dict[str, Any]) -> Skeleton:
 
 
 def _person(entry: dict[str, Any], skeleton: Skeleton, up: str, model: dict) -> PersonPose:
-    box = None if entry["box"] is None else read_boxes([entry])[0]
+    box = None if entry["box"] is None else replace(read_boxes([entry])[0], up=None if up == "z" else up)
     pose = None
     if entry["joints"] is not None:
         values: dict[str, Any] = {name: np.array(entry[name], float) for name in _PER_JOINT if entry[name]}

@@ -15,7 +15,7 @@ import numpy as np
 from lidarpose.errors import check_int
 from lidarpose.geometry import rotation_from_up, rotation_of_boxes, upright_axis
 from lidarpose.inference.checks import check_scan, origin_warning, rows_inside, unit_warning
-from lidarpose.inference.inputs import as_points, only_returns
+from lidarpose.inference.inputs import as_points, distinct, only_returns
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.io.files import file_error
 from lidarpose.io.point_cloud import Cloud, read_points
@@ -121,7 +121,7 @@ def pose_scan(
     """Poses of the scan's people in the input frame, with warnings; `timing_ms` has "crop", "predict" and
     "per_person"."""
     start = time.perf_counter()
-    clouds = scan.clouds()
+    clouds = [distinct(cloud) for cloud in scan.clouds()]
     crop_end = time.perf_counter()
     warnings = list(scan.warnings)
     if warning := origin_warning(scan):
@@ -181,4 +181,6 @@ def _named(people: Sequence[PersonPose], boxes: list[Box] | None) -> tuple[Perso
 def _in_input(person: PersonPose, scan: Scan) -> PersonPose:
     R_level_input = scan.R_level_input
     pose = person.pose and replace(person.pose, joints=person.pose.joints @ R_level_input)
-    return replace(person, pose=pose, points=person.points @ R_level_input, up=scan.up)
+    # a box taken out of the result keeps the up axis
+    box = person.box and replace(person.box, up=None if scan.up == "z" else scan.up)
+    return replace(person, pose=pose, box=box, points=person.points @ R_level_input, up=scan.up)

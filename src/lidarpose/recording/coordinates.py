@@ -14,6 +14,9 @@ from lidarpose.geometry import (
     transform_points,
     upright_axis,
 )
+from lidarpose.inference.read_poses import stated_skeleton
+from lidarpose.inference.results import facing_entry
+from lidarpose.sample import Pose
 
 
 class FixedFrame:
@@ -77,15 +80,18 @@ def in_world(line: dict[str, Any], up: str = "z") -> dict[str, Any]:
     frame."""
     if line["T_world_sensor"] is None:
         return line
-    T = np.array(line["T_world_sensor"])
+    T, skeleton = np.array(line["T_world_sensor"]), stated_skeleton(line["skeleton"])
     people = []
     for person in line["people"]:
         changes: dict[str, Any] = {}
         if person["joints"] is not None:
             changes["joints"] = rounded_points(T, person["joints"])
-        for name in ("velocity", "facing"):
-            if (direction := person.get(name)) is not None:
-                changes[name] = (T[:3, :3] @ direction).round(4).tolist()
+            if person.get("facing") is not None:
+                # horizontal in the world, also where the sensor is out of level
+                pose = Pose(joints=transform_points(T, np.array(person["joints"])), skeleton=skeleton)
+                changes["facing"] = facing_entry(pose, "z")
+        if (velocity := person.get("velocity")) is not None:
+            changes["velocity"] = (T[:3, :3] @ velocity).round(4).tolist()
         if (box := person["box"]) is not None:
             yaw = round(moved_yaw(box["yaw"], T, rotation_of_boxes(up)), 4)
             changes["box"] = box | {"center": rounded_points(T, box["center"]), "yaw": yaw}
