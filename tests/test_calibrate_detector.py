@@ -52,9 +52,13 @@ def test_match_assigns_each_person_once():
 
 def test_passing_score_gives_requested_false_positives():
     assert passing_score(np.array([0.2, 0.9, 0.6, 0.1]), 2) == pytest.approx(0.4)
-    # fewer than one false positive per scan
-    assert passing_score(np.array([0.7, 0.3]), 5) == pytest.approx(0.5)
+    # not more than one false positive per scan: all may pass
+    assert passing_score(np.array([0.7, 0.3]), 5) == 0.3
+    assert passing_score(np.array([0.9, 0.8]), 2) == 0.5
     assert passing_score(np.zeros(0), 5) == 0.5
+    # equal scores pass together
+    assert passing_score(np.array([0.9, 0.9, 0.9, 0.1]), 2) == pytest.approx(0.95)
+    assert passing_score(np.array([0.95, 0.8, 0.8, 0.1]), 2) == pytest.approx(0.875)
 
 
 def made_tables(rng, scans):

@@ -148,6 +148,15 @@ def test_score_scan_conditions_and_things_of_false_positives():
     assert false.thing.tolist() == ["part of a person", "pillar", "no points"]
 
 
+def test_conditions_of_things_need_labeled_things():
+    own = scan([{"x": 5}, {"x": 5.8, "height": 1.2}])
+    people, _ = score_scan(0, own, [], np.zeros(0), max_range=40)
+    assert [name for name in CONDITIONS if name in people] == ["person within 1 m", "under 1.4 m tall"]
+    result = score_detector(answers([(5.0, 0.9)]), scan_set([own]))
+    recall = {row["of"] for row in result.rows if (row["figure"], row["group"]) == ("recall", "condition")}
+    assert recall == {"person within 1 m", "under 1.4 m tall"}
+
+
 # ---- recall
 
 
@@ -331,6 +340,12 @@ def test_methods_find_single_person_on_plane(method):
 # ---- the command
 
 
+@pytest.mark.parametrize("method", run_module.METHODS)
+def test_methods_reject_infinite_range(method):
+    with pytest.raises(InputError, match="max_range: expected meters"):
+        run_module.run_detector(method, max_range=np.inf, limit=1)
+
+
 def write_scans(folder):
     """Two scans: one of two people and a stroller, one of a rider; both with a false positive."""
     rng = np.random.default_rng(0)
@@ -430,6 +445,23 @@ def test_evaluate_command_rejects_invalid_options(arguments, message, tmp_path, 
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_labeled_scans_take_null_as_absent_and_reject_other_types(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((1, 3), np.float32))
+
+    def read(person, **document):
+        people = [{"center": [0, 0, 0], "size": SIZE} | person]
+        (tmp_path / "a.json").write_text(json.dumps({"people": people} | document))
+        return labeled_scans(tmp_path).loaders[0]()
+
+    own = read({"category": None, "num_points": None}, sensor=None, kind=None)
+    assert own.is_person.tolist() == [True] and own.num_points.tolist() == [1] and own.sensor == own.kind == ""
+    for value in (3, ["PEDESTRIAN"]):
+        for name in ("category", "sensor", "kind"):
+            entry = {name: value}
+            with pytest.raises(InputError, match=rf"a\.json.*expected text as {name}, got"):
+                read(entry) if name == "category" else read({}, **entry)
 
 
 def test_labeled_scans_rejects_missing_scan_and_wrong_labels(tmp_path):

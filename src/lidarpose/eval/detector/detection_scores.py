@@ -112,16 +112,17 @@ def score_scan(
 
 
 def _conditions(scan: LabeledScan, positions: np.ndarray) -> dict[str, np.ndarray]:
-    """Conditions that may make people hard to find, each (P,) bool."""
+    """Conditions that may make people hard to find, each (P,) bool; those of things only if these are labeled."""
     distance = np.linalg.norm(positions[:, None] - positions[None], axis=-1)
     # a person is also within this distance of themselves
     has_company = (distance[:, scan.is_person] < _COMPANY).sum(1) > 1
+    is_low = np.array([box.size[2] < _LOW for box in scan.boxes], bool)
+    if scan.thing is None:
+        return {CONDITIONS[0]: has_company, CONDITIONS[2]: is_low}
     # larger to the sides, but shortened at both ends to leave out the ground and the ceiling
     margin = [2 * _TOUCHING, 2 * _TOUCHING, -2 * _TOUCHING]
     grown_boxes = [replace(box, size=np.maximum(box.size + margin, 0.1)) for box in scan.boxes]
-    thing_index = np.full(len(scan.points), -1) if scan.thing is None else scan.thing
-    is_touching = np.array([(thing_index[rows] >= 0).any() for rows in rows_inside(grown_boxes, scan.points)], bool)
-    is_low = np.array([box.size[2] < _LOW for box in scan.boxes], bool)
+    is_touching = np.array([(scan.thing[rows] >= 0).any() for rows in rows_inside(grown_boxes, scan.points)], bool)
     return dict(zip(CONDITIONS, (has_company, is_touching, is_low, ~(has_company | is_touching | is_low)), strict=True))
 
 
@@ -320,7 +321,7 @@ def _groups_of_people(people: pd.DataFrame) -> Iterator[tuple[str, str, np.ndarr
             for name in sorted(set(people[column]) - {""}):
                 yield f"{column}{suffix}", name, mask & (people[column] == name).to_numpy()
         yield f"kind{suffix}", "indoors", mask & people.kind.isin(INDOORS).to_numpy()
-        for name in CONDITIONS:
+        for name in (name for name in CONDITIONS if name in people):
             yield f"condition{suffix}", name, mask & people[name].to_numpy(bool)
         for name, rows in aggregate.span_rows(people.distance.to_numpy(), aggregate.DISTANCE_EDGES).items():
             yield f"distance, m{suffix}", name, mask & rows

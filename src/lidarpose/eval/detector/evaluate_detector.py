@@ -43,8 +43,10 @@ def detector_of(method: str, detector: Detector | None, *, max_range: float) -> 
     Args:
         detector: for the first two methods; None for the bundled one.
     """
+    # also checks the range for the other methods
+    search = Search(max_range=max_range, min_score=0.0, detector=detector)
     if method == "detector":
-        return partial(_detect, Search(max_range=max_range, min_score=0.0, detector=detector))
+        return partial(_detect, search)
     if method == "scorer":
         return partial(_scorer, detector or Detector(), max_range=max_range)
     return partial(_baseline, load("tiny", tta=1) if method == "pose" else None)

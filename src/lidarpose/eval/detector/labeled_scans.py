@@ -74,7 +74,7 @@ class ScanSet:
 
 
 def heldout_scans(limit: int | None = None) -> ScanSet:
-    """The frozen scenes, with kinds of things, rooms and poses that are not in any detector's training data."""
+    """The frozen scenes; some of their kinds of things and rooms are not in any detector's training data."""
     content = json.loads((resources.files("lidarpose.eval") / "assets" / _HELDOUT_FILE).read_text("utf-8"))
     rows = evenly_drawn(len(content["indices"]), limit)
     scenes = [(content["seed"], content["indices"][k], content["family"], content["sha256"][k]) for k in rows]
@@ -148,7 +148,7 @@ def _read_scan(labels: Path, cloud: Path) -> LabeledScan:
     boxes, people, kinds = [], [], []
     for box, entry in zip(labeled_boxes, document["people"], strict=True):
         entry = entry if isinstance(entry, dict) else {}
-        kind = _kind(str(entry.get("category", "pedestrian")))
+        kind = _kind(_text(entry, "category", labels) or "pedestrian")
         if box.mounted or kind in _ON_FOOT | _MOUNTED | _LIKE_PEOPLE:
             boxes.append(box)
             people.append(entry)
@@ -158,7 +158,8 @@ def _read_scan(labels: Path, cloud: Path) -> LabeledScan:
     points = only_returns(read_points(cloud).points)[0]
     point_counts = [len(rows) for rows in rows_inside(boxes, points)]
     try:
-        counts = [int(entry.get("num_points", count)) for entry, count in zip(people, point_counts, strict=True)]
+        given_counts = [entry.get("num_points") for entry in people]
+        counts = [b if a is None else int(a) for a, b in zip(given_counts, point_counts, strict=True)]
         num_points = np.array(counts, np.int64)
         if (num_points < 0).any():
             raise ValueError
@@ -177,9 +178,17 @@ def _read_scan(labels: Path, cloud: Path) -> LabeledScan:
         num_points=num_points,
         is_person=is_on_foot | is_mounted,
         mounted=is_mounted,
-        sensor=str(document.get("sensor", "")),
-        kind=str(document.get("kind", "")),
+        sensor=_text(document, "sensor", labels),
+        kind=_text(document, "kind", labels),
     )
+
+
+def _text(entry: dict[str, Any], name: str, labels: Path) -> str:
+    """An optional text of a label file, "" if it is absent or null. Raises InputError if it is not text."""
+    value = entry.get(name)
+    if not isinstance(value, str | None):
+        raise file_error(labels, f"expected text as {name}, got {shorten(repr(value))}")
+    return value or ""
 
 
 def _kind(category: str) -> str:

@@ -129,14 +129,16 @@ def fit(tables: Sequence[ScanTable]) -> dict:
 
 
 def passing_score(false: np.ndarray, scans: int) -> float:
-    """The score threshold at which `FALSE_PER_SCAN` false positives per scan pass.
+    """The score threshold that at most `FALSE_PER_SCAN` false positives per scan reach.
 
     false (D,): scores of all false positives in the given number of scans.
     """
-    false = np.sort(false)[::-1]
-    last = min(round(FALSE_PER_SCAN * scans), len(false) - 1)
-    # midway between the last false positive that passes and the first that does not
-    return float(false[last - 1 : last + 1].mean()) if last > 0 else 0.5
+    budget = round(FALSE_PER_SCAN * scans)
+    if len(false) <= budget:
+        return float(false.min(initial=0.5))
+    # midway between the first false positive beyond the budget and the next higher score: equal scores pass together
+    first = np.sort(false)[::-1][budget]
+    return float(first + false[false > first].min(initial=1.0)) / 2
 
 
 def logistic(features: np.ndarray, labels: np.ndarray) -> tuple[float, np.ndarray]:
