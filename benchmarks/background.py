@@ -37,11 +37,13 @@ def of_street(index: int, *, seed: int, scores: tuple[float | None, ...]) -> lis
         centers = np.array([box.center[:2] for box in frame.boxes])
         counts = np.bincount(frame.person[frame.person >= 0], minlength=len(centers))
         is_wanted = (counts >= LEAST_POINTS) & (np.linalg.norm(centers, axis=1) < 40)
+        # as in score_scan: a person without any point must not excuse a false positive
+        visible_centers = np.where((counts > 0)[:, None], centers, np.inf)
         for name, known in (("no", None), ("yes", background)):
             for score in scores:
                 boxes = lidarpose.detect(frame.points.astype(float), min_score=score, background=known)
                 found = np.array([box.center[:2] for box in boxes]).reshape(-1, 2)
-                person = match(found, np.array([box.score for box in boxes]), centers, is_wanted)
+                person = match(found, np.array([box.score for box in boxes]), visible_centers, is_wanted)
                 hits = np.isin(np.arange(len(centers)), person) & is_wanted
                 moving = is_wanted & (np.array(way) > MOVES)
                 rows.append(

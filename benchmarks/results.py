@@ -86,7 +86,11 @@ def _longest() -> dict[int, dict[str, float]]:
 
 
 def strays(**networks: str) -> str:
-    """The increase of errors by clusters of stray points, for networks by the name of their study."""
+    """The increase of errors by clusters of stray points, for networks by the name of their study. Rows say what they
+    are of if they are not all of one dataset and version."""
+    sources = {name: disturbed.source(name) for name in networks}
+    if len(set(sources.values())) > 1:
+        networks = {name: f"{what} ({sources[name]})" for name, what in networks.items()}
     header = ("", "undisturbed, mm", *(f"two of {amount} points" for amount in disturbed.amounts(next(iter(networks)))))
     return table(header, [(what, *disturbed.strays(name)) for name, what in networks.items()])
 

@@ -11,10 +11,19 @@ FOLDER = Path(__file__).parents[1] / "docs" / "scores" / "stability"
 
 
 @lru_cache
+def _document(name: str) -> dict:
+    return json.loads((FOLDER / f"{name}.json").read_text())
+
+
 def read(name: str) -> dict:
     """The stability study of a network."""
-    (study,) = json.loads((FOLDER / f"{name}.json").read_text())["studies"]
+    (study,) = _document(name)["studies"]
     return study
+
+
+def source(name: str) -> str:
+    """The dataset of a study, and the version of the package that made it."""
+    return f"{read(name)['setting']['dataset'].removeprefix('lidarpose-')}, version {_document(name)['version']}"
 
 
 def curves(name: str) -> list[tuple[str, ...]]:

@@ -155,12 +155,14 @@ def boxes_of_score(frame, least, below=1.1):
 
 
 def distances(frame, boxes):
-    """(P, B) m: horizontal distances between people and boxes."""
+    """(P, B) m: horizontal distances between people and boxes; of people without any point infinite, since these must
+    not excuse a false positive."""
     people, centers = (
         np.reshape(places, (-1, 3))[:, None, :2]
         for places in ([p["center"] for p in frame["people"]], [b.center for b in boxes])
     )
-    return np.linalg.norm(people - centers[:, 0], axis=-1)
+    is_seen = np.array(frame["points"]) > 0
+    return np.where(is_seen[:, None], np.linalg.norm(people - centers[:, 0], axis=-1), np.inf)
 
 
 class Nearest:

@@ -24,7 +24,8 @@ CLEAN = "clean"
 
 
 def compared(error: np.ndarray, hidden: np.ndarray, condition: np.ndarray, name: str) -> tuple[float, float, int]:
-    """Mean errors, mm, of a condition's people and of equally occluded clean people; number of the former."""
+    """Mean errors, mm, of a condition's people and of equally occluded clean people; number of the former. NaN
+    if no bin has enough of both."""
     bins = np.digitize(hidden, EDGES)
     condition_sum = clean_sum = 0.0
     people = 0
@@ -39,7 +40,7 @@ def compared(error: np.ndarray, hidden: np.ndarray, condition: np.ndarray, name:
                 clean_sum + clean_errors.mean() * len(condition_errors),
                 people + len(condition_errors),
             )
-    return condition_sum / people, clean_sum / people, people
+    return (condition_sum / people, clean_sum / people, people) if people else (np.nan, np.nan, 0)
 
 
 def main() -> None:
@@ -62,12 +63,15 @@ def main() -> None:
     entries = []
     for name in sorted(set(condition) - {CLEAN}):
         condition_error, clean_error, people = compared(error, hidden, condition, name)
+        if not people:
+            print(f"{name:<10} left out: no bin has {LEAST} of its people and {LEAST} clean ones")
+            continue
         ratios = []
         for _ in range(ROUNDS):
             sample_rows = rng.integers(len(error), size=len(error))
             a, b, _ = compared(error[sample_rows], hidden[sample_rows], condition[sample_rows], name)
             ratios.append(a / b)
-        low, high = np.percentile(ratios, [2.5, 97.5])
+        low, high = np.nanpercentile(ratios, [2.5, 97.5])
         entry = {
             "condition": name,
             "people": people,

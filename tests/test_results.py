@@ -7,10 +7,13 @@ from argparse import Namespace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from motion_files import a_clip, joints_of
 
 from lidarpose import evaluation
+from lidarpose.sample import Box
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
@@ -215,6 +218,52 @@ def test_collect_adds_new_runs_to_known_runs(changed, tmp_path):
 def test_scaling_reports_change_per_doubling(changed):
     _, rows = changed.scaling([run("base", 1, 200.0), run("base", 1, 180.0, 200), run("base", 1, 150.0, 800)])
     assert [row[2] for row in rows] == ["", "-20.0", "-15.0"]
+
+
+def test_strays_say_dataset_and_version_where_rows_differ(results):
+    rows = results.strays(paper="a", ours="b").splitlines()[2:]
+    assert rows[0].startswith("| a (bench-1.1, version 0.3.0.dev0) | ")
+    assert rows[1].startswith("| b (bench-1, version 0.1.0) | ")
+    assert results.strays(paper="a", small="b").splitlines()[2].startswith("| a | ")
+
+
+def test_visibility_leaves_out_conditions_without_comparable_people(tmp_path, monkeypatch, capsys):
+    rng = np.random.default_rng(0)
+    condition = ["clean"] * 40 + ["cluttered"] * 40 + ["occluded"] * 40
+    hidden = np.repeat([0.01, 0.01, 0.7], 40)
+    errors = rng.uniform(20, 60, (120, 3)).tolist()
+    columns = {"condition": condition, "hidden": hidden, "moving": [False] * 120, "error_mm": errors}
+    pq.write_table(pa.table(columns), tmp_path / "poses.parquet")
+    (tmp_path / "scores.json").write_text('{"weights": {"name": "x"}}')
+    module = benchmark("visibility")
+    monkeypatch.setattr(module, "ROUNDS", 20)
+    monkeypatch.setattr("sys.argv", ["visibility", str(tmp_path), "--out", str(tmp_path / "o.json")])
+    module.main()
+    (entry,) = json.loads((tmp_path / "o.json").read_text())["x"]
+    assert entry["condition"] == "cluttered" and entry["people"] == 40
+    assert "occluded   left out" in capsys.readouterr().out
+
+
+def test_background_benchmark_counts_detections_of_hidden_people_as_false(monkeypatch):
+    module = benchmark("background")
+    boxes = [Box(center=(x, 0.0, 0.0), size=(0.8, 0.8, 1.8), score=0.9) for x in (5.0, 9.0)]
+    # the second person has no points
+    frame = Namespace(boxes=boxes, person=np.zeros(20, int), points=np.zeros((20, 3)))
+    monkeypatch.setattr(module, "street", lambda *args, **named: Namespace(frames=[frame] * module.FRAMES))
+    monkeypatch.setattr(module, "learn_background", lambda frames: None)
+    monkeypatch.setattr(module.lidarpose, "detect", lambda *args, **named: boxes)
+    rows = module.of_street(0, seed=0, scores=(None,))
+    assert {(row["false"], row["found"], row["people"]) for row in rows} == {(1, 1, 1)}
+
+
+def test_tracks_benchmark_keeps_detections_of_hidden_people():
+    pytest.importorskip("trackeval")
+    module = benchmark("tracks")
+    boxes = [Box(center=(x, 0.0, 0.0), size=(0.8, 0.8, 1.8)) for x in (5.0, 9.0, 12.0)]
+    # the second person has no points, the third too few to count
+    frame = {"people": [box.to_dict() for box in boxes], "points": [50, 0, 5], "sensor": [0.0, 0.0, 0.0]}
+    given = module.evaluated([frame], [boxes], [[7, 8, 9]])
+    assert given["tracker_ids"][0].tolist() == [0, 1] and given["gt_ids"][0].tolist() == [0]
 
 
 def test_rejection_does_not_round_errors():
