@@ -316,6 +316,24 @@ def test_heldout_scans_are_labeled_and_changes_are_counted():
     assert row_of(result, "recall", "0.3")["value"] == 100 and result.changed == 1 and not result.things
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "number, scores",
+    [
+        (0, [0.999, 0.209, 0.998, 0.984, 0.999, 0.824, 0.999, 0.999, 0.999, 0.954, 0.13, 0.993]),
+        (7, [0.17, 0.633, 0.973]),
+        (184, [0.974, 0.985, 0.9]),
+        (205, [0.999, 0.999, 0.986, 0.995, 0.979, 0.999, 0.999, 0.999, 0.999, 0.999, 0.785]),
+    ],
+)
+def test_detector_scores_people_of_frozen_scenes_as_stored(number, scores):
+    # if these change, the tables of docs/results.md are out of date: run lidarpose evaluate detector again
+    scene = heldout_scans().loaders[number]()
+    boxes, found = run_module.detector_of("detector", None, max_range=40.0)(scene.points, scene.origin)
+    people, _ = score_scan(number, scene, boxes, found, max_range=40.0)
+    np.testing.assert_allclose(people.score, scores, atol=0.05)
+
+
 # ---- methods
 
 
