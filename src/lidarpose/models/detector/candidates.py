@@ -20,8 +20,8 @@ CONTEXT_CHANNELS, CONTEXT_SIDE, CONTEXT_CELL, _TALL = 4, 20, 0.5, 4.0
 RADIUS, _ROOM = 1.75, 0.2
 # heights above the ground between which points are used, m
 _USED = (-1.2, 3.2)
-# maximum number of points stored per candidate, and the unit of their coordinates, m
-_MOST_POINTS, UNIT = 1000, 5e-4
+# maximum number of points per candidate, stored for training and processed at once, and the unit of their coordinates, m
+_MOST_STORED, _MOST_POINTS, UNIT = 1000, 20_000, 5e-4
 # size of the cells by which points are sorted, m, and maximum number of cells in the table
 _INDEX_CELL, _MOST_INDEX_CELLS = 0.5, 4_000_000
 # maximum number of points kept per cell, and of points processed at once
@@ -41,9 +41,9 @@ class Candidates:
 
     centers (K, 3) m, level frame: x, y, and z of the ground; yaw (K,) rad of the view frames' x axes; distance (K,) m
     from the sensor; sensor_height (K,) m of the sensor above the ground at the candidate, both 0 if unknown; count
-    (K,): points within `RADIUS` at the heights of a person, of which xyz (3, n) int16 holds up to 1000 per candidate in
-    the view frame, in units of 0.5 mm, concatenated, `sizes` (K,) of each; range_views (K, 4, 34, 30) and contexts (K,
-    4, 20, 20) uint8: as rendered, before augmentation.
+    (K,): points within `RADIUS` at the heights of a person, of which xyz (3, n) int16 holds up to 1,000 per candidate
+    if they are stored, else 20,000, in the view frame, in units of 0.5 mm, concatenated, `sizes` (K,) of each;
+    range_views (K, 4, 34, 30) and contexts (K, 4, 20, 20) uint8: as rendered, before augmentation.
     """
 
     centers: np.ndarray
@@ -100,7 +100,7 @@ class SceneIndex:
         used_rows = np.flatnonzero((heights > _USED[0]) & (heights < _USED[1]))
         z = columns[2].astype(np.float32)
         # in pseudo-random order: subsampling in the file's order, beam by beam, would drop whole beams
-        used_rows = used_rows[np.argsort(_scrambled(x[used_rows], y[used_rows], z[used_rows]), kind="stable")]
+        used_rows = used_rows[_order(_scrambled(x[used_rows], y[used_rows], z[used_rows]))]
         cells = all_cells[used_rows]
         # very dense cells are subsampled, which limits the cost of each candidate
         selection, count = _thinned(np.bincount(cells, minlength=self._shape[0] * self._shape[1]), _MOST_IN_CELL)
@@ -141,7 +141,7 @@ class SceneIndex:
             distance, sensor_height = np.maximum(np.hypot(offset[:, 0], offset[:, 1]), _LEAST_DISTANCE), -offset[:, 2]
             range_views = self._image.views(offset, yaw, distance, margin)
         x, y, z, count = self._near(centers)
-        selection, sizes = _thinned(count, _MOST_POINTS)
+        selection, sizes = _thinned(count, _MOST_STORED if margin else _MOST_POINTS)
         x, y, z = x[selection], y[selection], z[selection]
         c, s = (np.repeat(values.astype(np.float32), sizes) for values in (np.cos(yaw), np.sin(yaw)))
         xyz = np.stack([x * c + y * s, y * c - x * s, z])
@@ -219,14 +219,14 @@ def _thinned(count: np.ndarray, limit: int) -> tuple[slice | np.ndarray, np.ndar
 
 
 def _scrambled(*columns: np.ndarray) -> np.ndarray:
-    """(n,) uint16 pseudo-random numbers that depend only on the values of each row of columns (n,) float32."""
+    """(n,) uint32 pseudo-random numbers that depend only on the values of each row of columns (n,) float32."""
     factors = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)
     hashes = sum(values.view(np.uint32) * np.uint32(factor) for values, factor in zip(columns, factors, strict=True))
-    return (np.asarray(hashes) >> 16).astype(np.uint16)
+    return np.asarray(hashes)
 
 
 def _order(cells: np.ndarray) -> np.ndarray:
-    """Rows that sort flat cells (n,), stable within a cell: by 16 bits at a time, which takes linear time."""
+    """Rows that sort integers (n,) below 2**32, such as flat cells, stably: by 16 bits at a time, in linear time."""
     order = np.argsort((cells & 0xFFFF).astype(np.uint16), kind="stable")
     if len(cells) and cells.max() > 0xFFFF:
         order = order[np.argsort((cells >> 16)[order].astype(np.uint16), kind="stable")]
