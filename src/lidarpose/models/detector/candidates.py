@@ -20,7 +20,8 @@ CONTEXT_CHANNELS, CONTEXT_SIDE, CONTEXT_CELL, _TALL = 4, 20, 0.5, 4.0
 RADIUS, _ROOM = 1.75, 0.2
 # heights above the ground between which points are used, m
 _USED = (-1.2, 3.2)
-# maximum number of points per candidate, stored for training and processed at once, and the unit of their coordinates, m
+# maximum number of points per candidate that are stored for training, and that are processed at once; unit of their
+# coordinates, m
 _MOST_STORED, _MOST_POINTS, UNIT = 1000, 20_000, 5e-4
 # size of the cells by which points are sorted, m, and maximum number of cells in the table
 _INDEX_CELL, _MOST_INDEX_CELLS = 0.5, 4_000_000
