@@ -465,6 +465,13 @@ def test_find_people_thins_large_maps(scene, monkeypatch):
     distance, kept = np.linalg.norm(points, axis=1), np.linalg.norm(searched.points, axis=1)
     assert (kept > 15).sum() == ((distance > 15) & (distance < 55)).sum() > 1000
     assert 0 < (kept < 6).sum() < 0.4 * (distance < 6).sum()
+    # whatever the order of the points
+    order = np.random.default_rng(1).permutation(len(wide))
+    (one, _), (other, _) = (
+        detection._thinned(detection.Scan(points=cloud, origin=np.zeros(3)), detection.Search())
+        for cloud in (wide, wide[order])
+    )
+    assert set(map(tuple, one.points)) == set(map(tuple, other.points)) and len(one.points) < len(points)
     # also if the range is far larger than the scan
     away = detection._thinned(detection.Scan(points=points, origin=np.zeros(3)), detection.Search(max_range=1e6))
     assert abs(len(away[0].points) - len(points) / 2) < 500 and away[1] == []

@@ -17,7 +17,7 @@ from lidarpose.errors import InputError, check_int, is_number
 from lidarpose.geometry import UP_AXES, rotation_about, up_text
 from lidarpose.inference.background import is_static, read_background
 from lidarpose.inference.checks import flat_along_another_axis, scan_unit_warning, unlikely_origin
-from lidarpose.inference.inputs import distinct
+from lidarpose.inference.inputs import distinct, hashes
 from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.scan import Scan
 from lidarpose.inference.verification import rounded, verified
@@ -285,13 +285,15 @@ def _thinned(scan: Scan, search: Search) -> tuple[Scan, list[str]]:
         histogram = sum(np.histogram(_squared(points[piece], origin), edges)[0] for piece in pieces)
         if (num_in_range := int(np.sum(histogram))) >= MIN_POINTS:
             num_searched, squared_dense_range = num_in_range, _dense_below(np.asarray(histogram), edges)
-    rng, kept_rows = np.random.default_rng(0), []
+    kept_rows = []
     for piece in pieces:
         share: np.ndarray | float = _MOST_POINTS / count
         if origin is not None and squared_dense_range is not None:
             squared = _squared(points[piece], origin)
             share = np.where(squared < squared_reach, squared / squared_dense_range, 0.0)
-        kept_rows.append(piece.start + np.flatnonzero(rng.random(len(points[piece])) < share))
+        # by the coordinates in mm, so that neither the order of the points nor their rounding decides
+        chance = hashes(np.rint(points[piece] * 1e3) + 0.0) / 2.0**64
+        kept_rows.append(piece.start + np.flatnonzero(chance < share))
     rows, notes = np.concatenate(kept_rows), []
     if len(rows) < num_searched and (squared_dense_range is None or squared_dense_range > search.max_range**2):
         notes = [

@@ -216,15 +216,21 @@ def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
 def distinct(points: np.ndarray) -> np.ndarray:
     """Points (n, 3) m without duplicates, if there are more than a few: second returns mostly repeat the first, and
     networks count points."""
+    keys = hashes(points)
+    ordered = np.sort(keys)
+    if np.count_nonzero(ordered[1:] == ordered[:-1]) <= _FEW_COPIES * len(points):
+        return points
+    return points[np.sort(np.unique(keys, return_index=True)[1])]
+
+
+def hashes(points: np.ndarray) -> np.ndarray:
+    """(n,) uint64, evenly distributed numbers that depend only on the coordinates of each of points (n, 3)."""
     factors = (0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9)
     keys = np.zeros(len(points), np.uint64)
     for axis, factor in zip(np.ascontiguousarray(points.T, np.float64).view(np.uint64), factors, strict=True):
         # the upper bits are the ones that differ
         keys = (keys ^ axis ^ (axis >> np.uint64(29))) * np.uint64(factor)
-    ordered = np.sort(keys)
-    if np.count_nonzero(ordered[1:] == ordered[:-1]) <= _FEW_COPIES * len(points):
-        return points
-    return points[np.sort(np.unique(keys, return_index=True)[1])]
+    return keys
 
 
 def rounding_warning(points: np.ndarray) -> str | None:
