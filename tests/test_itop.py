@@ -224,7 +224,7 @@ def test_itop_skips_unusable_frames_with_reasons(tmp_path, smpl):
 
 def test_itop_names_missing_extra(raw, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(MissingExtra, match=r"'.\[itop\]'"):
+    with pytest.raises(MissingExtra, match=r'"\.\[itop\]"'):
         reader("itop").check(raw[0], "side/test")
 
 
