@@ -1,7 +1,7 @@
 """People per second of each network, in a training step and in inference, on people synthesized for training.
 
     python benchmarks/baselines.py prn lpformer dapt paper-small ours lidarcap ne --threads 1
-    python benchmarks/baselines.py prn lpformer dapt --precision bf16     # training steps as with `--precision bf16`
+    python benchmarks/baselines.py prn dapt lidarcap ne --precision bf16     # training steps as with `--precision bf16`
 
 Names are model names or sizes. For networks that read clips, each frame counts as a person. Times are this process's
 processor time, on which other programs have little influence; with several threads, time on the clock of a machine that
