@@ -218,6 +218,10 @@ class Box:
         values = {"id": self.id, "score": self.score, "mounted": self.mounted, "up": self.up}
         return self.place_dict() | {name: value for name, value in values.items() if value is not None}
 
+    def with_up(self, up: str) -> "Box":
+        """The box with this up axis, so that it keeps it on its own; z is not stated."""
+        return self if (self.up or "z") == up else replace(self, up=up)
+
     def place_dict(self) -> dict[str, Any]:
         """center, size and yaw as JSON values."""
         return {"center": self.center.tolist(), "size": self.size.tolist(), "yaw": float(self.yaw)}

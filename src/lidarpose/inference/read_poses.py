@@ -2,7 +2,6 @@
 
 import json
 import os
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -92,7 +91,7 @@ def stated_skeleton(stated: dict[str, Any]) -> Skeleton:
 
 
 def _person(entry: dict[str, Any], skeleton: Skeleton, up: str, model: dict) -> PersonPose:
-    box = None if entry["box"] is None else replace(read_boxes([entry])[0], up=None if up == "z" else up)
+    box = None if entry["box"] is None else read_boxes([entry])[0].with_up(up)
     pose = None
     if entry["joints"] is not None:
         values: dict[str, Any] = {name: np.array(entry[name], float) for name in _PER_JOINT if entry[name]}

@@ -2,7 +2,7 @@
 output."""
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
 from pathlib import Path
@@ -313,10 +313,8 @@ class Poses(Sequence[PersonPose]):
 
     def to_csv(self) -> str:
         """`to_dataframe` as CSV text, with the decimals of `to_json`."""
-        # a carriage return, which `csv` does not quote by itself, would end the row
-        has_returns = any("\r" in str(person.id) for person in self.people)
-        quoting = csv.QUOTE_NONNUMERIC if has_returns else csv.QUOTE_MINIMAL
-        return self.to_dataframe().round(_DECIMALS).to_csv(index=False, quoting=quoting)
+        table = self.to_dataframe().round(_DECIMALS)
+        return table.to_csv(index=False, quoting=csv_quoting(table["id"]))
 
     def to_dict(self) -> dict:
         """A document with the schema lidarpose.poses/1. Its top-level "warnings" concern the whole input."""
@@ -384,6 +382,12 @@ class Poses(Sequence[PersonPose]):
         if path is not None:
             write_atomic(path, text.encode("utf-8", "replace"))
         return text
+
+
+def csv_quoting(texts: Iterable[object]) -> int:
+    """How to quote a CSV table with these texts: a carriage return, which `csv` does not quote by itself, would end the
+    row."""
+    return csv.QUOTE_NONNUMERIC if any("\r" in str(text) for text in texts) else csv.QUOTE_MINIMAL
 
 
 def facing_entry(pose: Pose | None, up: str) -> list | None:

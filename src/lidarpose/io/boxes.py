@@ -65,7 +65,7 @@ class Boxes(list[Box]):
         self.has_up = up is not None or any(box.up is not None for box in boxes)
         up = _common_up(boxes) if up is None else up
         # each box stores the up axis too, so that a box taken out of this list keeps it
-        super().__init__(box if (box.up or "z") == up else replace(box, up=up) for box in boxes)
+        super().__init__(box.with_up(up) for box in boxes)
         self.source, self.warnings, self.detector, self.up = source, tuple(warnings), detector, up
 
     @overload

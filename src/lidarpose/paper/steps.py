@@ -260,8 +260,12 @@ class _Watch:
             # signal would abort the saving
             if getattr(getattr(signal.getsignal(signal.SIGINT), "__self__", None), "number", None) == 0:
                 self.fit = fit
-                # on Windows os.kill ends the process; elsewhere it also wakes the main thread
-                (signal.raise_signal if os.name == "nt" else partial(os.kill, os.getpid()))(signal.SIGINT)
+                if os.name == "nt":
+                    # os.kill would end the process
+                    signal.raise_signal(signal.SIGINT)
+                else:
+                    # also wakes the main thread
+                    os.kill(os.getpid(), signal.SIGINT)
                 return
 
 

@@ -88,8 +88,7 @@ def in_world(line: dict[str, Any], up: str = "z") -> dict[str, Any]:
             changes["joints"] = rounded_points(T, person["joints"])
             if person.get("facing") is not None:
                 # horizontal in the world, also where the sensor is out of level
-                pose = Pose(joints=transform_points(T, np.array(person["joints"])), skeleton=skeleton)
-                changes["facing"] = facing_entry(pose, "z")
+                changes["facing"] = facing_entry(Pose(joints=np.array(changes["joints"]), skeleton=skeleton), "z")
         if (velocity := person.get("velocity")) is not None:
             changes["velocity"] = (T[:3, :3] @ velocity).round(4).tolist()
         if (box := person["box"]) is not None:

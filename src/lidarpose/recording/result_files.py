@@ -1,6 +1,5 @@
 """Writes the lines of a recording to NAME.poses.jsonl, .csv or .parquet, completely or not at all."""
 
-import csv
 import json
 import os
 from collections.abc import Iterable, Iterator
@@ -9,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarpose.errors import needs_extra
+from lidarpose.inference.results import csv_quoting
 from lidarpose.io.atomic import atomic_path
 from lidarpose.io.files import encodable
 from lidarpose.sample import JOINT_COLUMNS
@@ -33,10 +33,7 @@ def write_result(path: Path, lines: Iterable[dict[str, Any]]) -> None:
                 file.writelines(json.dumps(line) + "\n" for line in lines)
         elif suffix == ".csv":
             for number, table in enumerate(_tables(lines)):
-                # a carriage return, which `csv` does not quote by itself, would end the row
-                has_returns = any(table[name].str.contains("\r", regex=False).any() for name in ("id", "frame_id"))
-                quoting = csv.QUOTE_NONNUMERIC if has_returns else csv.QUOTE_MINIMAL
-                mode = "a" if number else "w"
+                mode, quoting = "a" if number else "w", csv_quoting((*table["id"], *table["frame_id"]))
                 table.to_csv(temporary, index=False, mode=mode, header=not number, quoting=quoting)
         else:
             _write_parquet(temporary, lines)

@@ -175,10 +175,10 @@ def _load_corpus(path: str | os.PathLike, entries: list, up: str | None, fps: fl
     any entry has a pose. Raises InputError if no entry remains."""
     # of each clip's entries: pose, position, and number in the sequence, which skipped entries have, too
     clips: dict[str, list[tuple[np.ndarray, np.ndarray, int]]] = {}
-    # clips in which any entry has a position: there, entries without one are skipped
-    placed = {_clip_of(path, entry) for entry in entries if isinstance(entry, dict) and _position(entry) is not None}
     counts: Counter[str] = Counter()
     entries = [entry for entry in entries if isinstance(entry, dict)]
+    # clips in which any entry has a position: there, entries without one are skipped
+    placed = {_clip_of(path, entry) for entry in entries if _position(entry) is not None}
     key = "gt" if any(entry.get("gt") is not None for entry in entries) else "gt_joint"
     for entry in entries:
         name = _clip_of(path, entry)

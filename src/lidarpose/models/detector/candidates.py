@@ -142,6 +142,7 @@ class SceneIndex:
             distance, sensor_height = np.maximum(np.hypot(offset[:, 0], offset[:, 1]), _LEAST_DISTANCE), -offset[:, 2]
             range_views = self._image.views(offset, yaw, distance, margin)
         x, y, z, count = self._near(centers)
+        # candidates with a margin are those that are stored
         selection, sizes = _thinned(count, _MOST_STORED if margin else _MOST_POINTS)
         x, y, z = x[selection], y[selection], z[selection]
         c, s = (np.repeat(values.astype(np.float32), sizes) for values in (np.cos(yaw), np.sin(yaw)))
