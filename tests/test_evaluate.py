@@ -17,6 +17,7 @@ import waymo_files
 from hypothesis import given
 from hypothesis import strategies as st
 from pyarrow import parquet
+from scipy.spatial import cKDTree
 from shard_files import write_shard
 
 import lidarpose
@@ -30,6 +31,7 @@ from lidarpose.eval import run as run_module
 from lidarpose.eval.dataset import evenly_drawn, load_bench, open_eval_dataset
 from lidarpose.eval.metric_rows import facing_flipped, metric_rows, triples
 from lidarpose.eval.metrics import aggregate
+from lidarpose.eval.predictions import num_nearby
 from lidarpose.eval.protocols import check_protocol, eval_setup, jittered
 from lidarpose.eval.run import evaluate_dataset
 from lidarpose.geometry import rotation_about
@@ -780,6 +782,18 @@ def test_notes_report_training_on_same_seed(made, recipe, noted):
     card = {"recipe": {"seed": 5, "scene": "wild"}, "init_card": {"recipe": recipe}}
     notes = evaluated(made.parent, made.name, Fake(standing, card=card)).result.notes
     assert any("of seed 0, like these" in note for note in notes) == noted
+
+
+def test_nearby_points_are_those_of_the_crop_within_15_cm_of_the_true_joint(made):
+    setup = eval_setup(Fake(standing), open_eval_dataset(made))
+    people = [person for person in map(setup.crop_sample, setup.dataset) if person[0] is not None]
+    predictions = setup.predict([person for person, _ in people])
+    for (person, _), true, nearby in zip(people, predictions.true, predictions.nearby, strict=True):
+        tree = cKDTree(person.points)
+        np.testing.assert_array_equal(nearby, [len(found) for found in tree.query_ball_point(true, 0.15)])
+    assert (predictions.nearby == 0).any() and (predictions.nearby > 20).any()
+    joints = np.array([[0, 0, 0], [np.nan, 0, 0], [0, 0, 0.2]])
+    np.testing.assert_array_equal(num_nearby(np.array([[0, 0, 0.1, 7], [0, 0, 0.14, 7]]), joints), [2, np.nan, 2])
 
 
 def test_predictions_hidden_is_complement_of_visible(made):

@@ -1,5 +1,7 @@
 """Metric rows of a few people with known errors, computed by hand, and the charts of these rows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -53,6 +55,28 @@ def test_metric_rows_match_values_by_hand():
     assert spans["distance, m"] == {"0 to 10": 2, "10 to 20": 2}
     assert spans["points"] == {"50 to 100": 1, "200 to 400": 3}
     assert spans["hidden share"] == {"0 to 0.1": 3, "0.3 to 0.5": 1}
+
+
+def test_rows_of_joints_by_points_near_them_count_each_joint_once():
+    people, setting = four()
+    assert not any(row.group == "points near the joint" for row in metric_rows.metric_rows(people, setting))
+    nearby = np.full((4, 15), 30.0)
+    # the third person is 25 cm off, the others' pelvises 5 cm
+    nearby[2], nearby[:2, 0], nearby[3] = 0, 4, np.nan
+    found = {
+        row.of: (row.value, row.people, row.joints, row.skipped)
+        for row in metric_rows.metric_rows(replace(people, nearby=nearby), setting)
+        if row.group == "points near the joint"
+    }
+    assert found == {
+        "0 to 1": (pytest.approx(250, abs=1e-3), 1, 15, 0),
+        "1 to 5": (pytest.approx(50, abs=1e-3), 2, 2, 0),
+        "20 and more": (pytest.approx(50, abs=1e-3), 2, 28, 0),
+    }
+    nearby[0, 1] = 0
+    rows = {(row.group, row.of): row.value for row in metric_rows.metric_rows(replace(people, nearby=nearby), setting)}
+    # 15 joints at 250 mm and one at 50, not the mean of two people
+    assert rows["points near the joint", "0 to 1"] == pytest.approx((15 * 250 + 50) / 16, abs=1e-3)
 
 
 def test_metrics_entry_adds_rows_and_changes_no_others(monkeypatch):

@@ -63,7 +63,10 @@ $ lidarpose table evaluation/small
 """
 _TABLE_SUFFIXES = {"markdown": (".md", ".markdown", ".txt"), "json": (".json",)}
 # groups of rows printed to the terminal; the others are only in scores.json
-_SHOWN = ("condition", "family", "sensor", "plain", "joints", "body", "joint", "distance, m", "points", "hidden share")
+_SHOWN = (
+    *("condition", "family", "sensor", "plain", "joints", "body", "joint"),
+    *("distance, m", "points", "hidden share", "points near the joint"),
+)
 # metrics that are printed for these groups; for all people together, all metrics are printed
 _GROUP_METRICS = ("mpjpe", "turned_round", "pck_10cm")
 _TITLES = {
@@ -208,7 +211,7 @@ def _progress(stack: ExitStack, unit: str = "people") -> Callable[[str, int, int
 
 def _lines(result) -> Iterator[str]:
     """The result for a terminal: the headline figure, its protocol, then all figures: of everybody, by condition,
-    joint, distance, points, hidden share."""
+    joint, distance, points, hidden share, points near the joint."""
     setting, counts = result.setting, result.counts
     mpjpe = result.line("mpjpe")
     headline = f"MPJPE {_value(mpjpe)} mm {_interval_text(mpjpe)}".rstrip()

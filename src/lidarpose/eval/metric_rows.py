@@ -6,7 +6,7 @@ the row's name, so no row depends on which other rows are reported. How to add a
 
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -32,6 +32,8 @@ from lidarpose.sample import CONFIDENCE_RADIUS, FEWEST_OF_SECOND, HIDDEN, SEEN, 
 # with fewer points than PLENTY the facing is often ambiguous, with fewer than FEW nearly always
 PLENTY, FEW = 100, 20
 _REPEATS = 1000
+# edges of the groups of joints by the number of points near them
+_NEARBY_EDGES = (0, 1, 5, 20, np.inf)
 # frames count as evenly spaced if two steps in time differ by less than this fraction
 _EVEN = 0.2
 # joints of each half of the body, without sides. Source: Haque et al. 2016, where the torso is in neither
@@ -232,6 +234,7 @@ def metric_rows(predictions: Predictions, setting: Setting, *, dapt_compat: bool
     """The rows of a dataset's people; dapt_compat: also rows with the released code's arithmetic."""
     people = predictions.select(~predictions.moving)
     rows = [*_mean_rows(people, setting, ("all", "dense", "joints", "conditions", "spans", "boxes", "itop"))]
+    rows += _nearby_rows(people, setting)
     for name, (summary, unit) in SUMMARIES.items():
         if (score := summary(people, setting)) is not None:
             rows.append(_row(score, setting, name, unit=unit, no_pose=int((~people.posed).sum())))
@@ -260,6 +263,17 @@ def _mean_rows(
                         tables[name] = METRICS[name].values(p)
                     table = tables[name][rows] if joints is None else tables[name][rows][:, joints]
                     yield _mean_row(table, setting, name, METRICS[name], group, of, clusters=clusters, no_pose=no_pose)
+
+
+def _nearby_rows(p: Predictions, setting: Setting) -> Iterator[MetricRow]:
+    """MPJPE of joints, each counting once, by the number of points near the true joint."""
+    errors, metric = p.errors(), replace(METRICS["mpjpe"], average="joint")
+    for of, is_inside in aggregate.span_rows(p.nearby, _NEARBY_EDGES).items():
+        is_scored = is_inside & ~np.isnan(errors)
+        rows = is_scored.any(1)
+        if rows.any():
+            table, clusters = np.where(is_scored, errors, np.nan)[rows], p.sequence[rows] if setting.clusters else None
+            yield _mean_row(table, setting, "mpjpe", metric, "points near the joint", of, clusters=clusters)
 
 
 def _mean_row(

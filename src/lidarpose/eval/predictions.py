@@ -15,6 +15,8 @@ A row is one person in one frame; columns:
     pred, true          x, y, z of the joints that the file's metadata names, m, in the dataset's frame; pred is null
                         without a pose, true NaN without a label
     labels              one per joint: 0 not labeled, 1 hidden or uncertain, 2 seen
+    nearby              one per joint: number of points that the network was given within 15 cm of the true joint, NaN
+                        without a label; null in files written before 0.3
     confidence, spread, visible         one per joint, null if the network does not predict it; spread in m
     person, second_person               probability that the cloud shows a person, and a second person; NaN if the
                         network does not predict it
@@ -38,6 +40,8 @@ from lidarpose.skeleton import Skeleton
 
 # key of the joints' names in the file's metadata
 METADATA = "lidarpose.poses"
+# radius about a true joint in which points are near it, m
+NEARBY = 0.15
 
 
 def _column(kind: type, *shape: int, null: bool = False) -> Any:
@@ -48,8 +52,8 @@ def _column(kind: type, *shape: int, null: bool = False) -> Any:
 @dataclass(frozen=True, kw_only=True)
 class Predictions:
     """N people with the J joints of `skeleton`. Columns as in poses.parquet: pred, true (N, J, 3) float32 m, pred NaN
-    without a pose; labels (N, J) uint8; confidence, spread, visible (N, J) float32, NaN if not predicted; box (N, 7),
-    NaN without a box; the others (N,)."""
+    without a pose; labels (N, J) uint8; nearby (N, J) float32, NaN if not known; confidence, spread, visible (N, J)
+    float32, NaN if not predicted; box (N, 7), NaN without a box; the others (N,)."""
 
     skeleton: Skeleton
     shard: np.ndarray = _column(np.int32)
@@ -71,6 +75,7 @@ class Predictions:
     pred: np.ndarray = _column(np.float32, -1, 3, null=True)
     true: np.ndarray = _column(np.float32, -1, 3)
     labels: np.ndarray = _column(np.uint8, -1)
+    nearby: np.ndarray = _column(np.float32, -1, null=True)
     confidence: np.ndarray = _column(np.float32, -1, null=True)
     spread: np.ndarray = _column(np.float32, -1, null=True)
     visible: np.ndarray = _column(np.float32, -1, null=True)
@@ -116,6 +121,12 @@ class Predictions:
 
 
 _COLUMNS = [column for column in fields(Predictions) if column.metadata]
+
+
+def num_nearby(points: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    """points (n, 3) m, joints (J, 3) m -> (J,): points within `NEARBY` of each joint; NaN for a joint that is NaN."""
+    count = np.array([(np.linalg.norm(points[:, :3] - joint, axis=1) < NEARBY).sum() for joint in joints], float)
+    return np.where(np.isfinite(joints).all(-1), count, np.nan)
 
 
 def stack(skeleton: Skeleton, rows: Sequence[dict[str, Any]]) -> Predictions:

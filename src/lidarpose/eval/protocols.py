@@ -15,7 +15,7 @@ import numpy as np
 from lidarpose.data.clips import consecutive
 from lidarpose.errors import InputError, check_int, check_name
 from lidarpose.eval.dataset import EvalDataset, EvalSample
-from lidarpose.eval.predictions import Predictions, stack
+from lidarpose.eval.predictions import Predictions, num_nearby, stack
 from lidarpose.eval.scores import Setting
 from lidarpose.inference.inputs import Clips
 from lidarpose.io.files import one_line, shorten
@@ -336,6 +336,7 @@ class EvalSetup:
     def _label_columns(self, person: EvalSample) -> dict[str, Any]:
         sample, box = person.sample, person.sample.box
         joint_indices = self.dataset.skeleton.map_to(self.joints)
+        true = sample.joints[joint_indices]
         return {
             **{
                 name: getattr(person, name)
@@ -346,8 +347,9 @@ class EvalSetup:
             "hidden": 1 - person.info.visible,
             "points": len(person.points),
             "box": None if box is None else [*box.center, *box.size, box.yaw],
-            "true": sample.joints[joint_indices],
+            "true": true,
             "labels": sample.joint_labels[joint_indices],
+            "nearby": num_nearby(person.points, true),
         }
 
 
