@@ -551,6 +551,7 @@ BAD = {
     "empty": ("a.pcd", b"", ["empty"]),
     "unknown suffix": ("a.las2", ROWS, ["'.las2'", *SUFFIXES]),
     "livox recording": ("a.lvx3", ROWS, ["'.lvx3'", "Livox Viewer"]),
+    "boxes": ("a.json", ROWS, ["'.json'", "--boxes"]),
     "ouster recording": ("a.osf", ROWS, ["'.osf'", "ouster-cli source FILE.osf save FILE.pcap"]),
     "e57": ("a.e57", ROWS, ["'.e57'", ".las or .ply"]),
     "no suffix": ("cloud", ROWS, ["suffix ''", ".pcd"]),

@@ -57,6 +57,7 @@ _FOREIGN = {
 }
 # how to convert files of other formats
 _CONVERTED = {".lvx3": "export it with Livox Viewer as .las or .csv"}
+_CONVERTED |= {".json": "give a point file; boxes are given by --boxes"}
 _CONVERTED |= {".osf": "convert it (ouster-cli source FILE.osf save FILE.pcap)"}
 _CONVERTED |= dict.fromkeys((".e57", ".ptx", ".fls"), "export it as .las or .ply (CloudCompare does)")
 _MAGIC = {
