@@ -272,7 +272,8 @@ def _nearby_rows(p: Predictions, setting: Setting) -> Iterator[MetricRow]:
         is_scored = is_inside & ~np.isnan(errors)
         rows = is_scored.any(1)
         if rows.any():
-            table, clusters = np.where(is_scored, errors, np.nan)[rows], p.sequence[rows] if setting.clusters else None
+            table = np.where(is_scored, errors, np.nan)[rows]
+            clusters = p.sequence[rows] if setting.clusters else None
             yield _mean_row(table, setting, "mpjpe", metric, "points near the joint", of, clusters=clusters)
 
 

@@ -55,7 +55,7 @@ _FOREIGN = {
     rb"(?i)\s*<(!doctype html|html|\?xml)": "is a web page or XML: expected a point cloud; download it again",
     rb"version https://git-lfs": "is a Git LFS pointer, not the data: run `git lfs pull`",
 }
-# how to convert files of other formats
+# what to do with files of other formats
 _CONVERTED = {".lvx3": "export it with Livox Viewer as .las or .csv"}
 _CONVERTED |= {".json": "give a point file; boxes are given by --boxes"}
 _CONVERTED |= {".osf": "convert it (ouster-cli source FILE.osf save FILE.pcap)"}
