@@ -9,7 +9,7 @@ from lidarpose.errors import InputError
 from lidarpose.lidar.presets import sensor
 from lidarpose.sample import Sample
 from lidarpose.skeleton import BODY26
-from lidarpose.synth import objects
+from lidarpose.synth import objects, simulate
 from lidarpose.synth.acquisition import Acquisition
 from lidarpose.synth.environment.mesh import Mesh, box
 from lidarpose.synth.environment.things import THINGS
@@ -69,6 +69,31 @@ def test_draw_object_uses_scan_conditions_of_people(name):
     same, other = draw_object(WILD, 1, 0)
     assert not sample.conditions and kind == other
     np.testing.assert_array_equal(sample.points, same.points)
+
+
+def test_beam_window_covers_crops_of_objects(monkeypatch):
+    """A crop with an empty rim around the thing would reveal that no person is present."""
+    scans = []
+    monkeypatch.setattr(
+        objects, "simulate_still", lambda *args, **options: scans.append((args, options)) or simulate_still(*args)
+    )
+    config = replace(scene_config("wide"), sensors=("os1-64",), distance=(3.0, 9.0)).changed(
+        [f"{name}=0" for name in ("merged", "accumulated", "crowded", "integration", "sparse", "inverted")]
+    )
+    counts = []
+    for index in range(16):
+        scans.clear()
+        sample, _ = draw_object(config, 1, index)
+        (scene, thing, _), options = scans[-1]
+        wider = replace(scene, config=replace(config, around=4.0))
+        for view, window in ((scene, None), (scene, options["box"]), (wider, None)):
+            hits, _ = simulate._cast(view, [thing, *scene.background], 0, box=window)
+            counts.append(np.count_nonzero(sample.box.contains(scene.place.to_level(hits.points))))
+    inside, window_inside, all_inside = np.sum(np.reshape(counts, (-1, 3)), 0)
+    assert window_inside > 0.995 * all_inside > inside
+    scans.clear()
+    draw_object(WILD, 1, 0)
+    assert scans[-1][1]["box"] is None
 
 
 def test_synthetic_source_objects_get_difficulty_of_people(monkeypatch):

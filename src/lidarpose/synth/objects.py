@@ -15,7 +15,7 @@ from lidarpose.synth.acquisition import ACQUISITION_DRAWS, SINGLE_SCAN, Acquisit
 from lidarpose.synth.environment.mesh import Mesh
 from lidarpose.synth.environment.surroundings import ground, surroundings
 from lidarpose.synth.environment.things import THINGS, draw_thing
-from lidarpose.synth.place import draw_place
+from lidarpose.synth.place import Place, draw_place
 from lidarpose.synth.scene import RandomStream, SceneConfig
 from lidarpose.synth.simulate import Scene, draw_conditions, simulate_still
 from lidarpose.synth.views import with_views
@@ -88,7 +88,9 @@ def _draw_sample(
         config=config, sensor=device, place=place, conditions=draw_conditions(config, device, rng),
         background=background, props=[], acquisition=acquisition,
     )  # fmt: skip
-    scan = simulate_still(with_views(scene, place_config, height, reach, nearer, rng), thing_mesh, rng)
+    window_box = _box_of_crops(thing, place) if config.box_window else None
+    scene = with_views(scene, place_config, height, reach, nearer, rng)
+    scan = simulate_still(scene, thing_mesh, rng, box=window_box)
     points, ring = scan.points, scan.ring
     center = place.feet + [0, 0, 1.0]
     thing_points = scan.points[scan.part > 0]
@@ -110,6 +112,14 @@ def _draw_sample(
         box=box,
         source=acquisition.source(config.name, device.name),
     )
+
+
+def _box_of_crops(thing: Mesh, place: Place) -> Box:
+    """A box around nearly all boxes that `_draw_box` could draw around points of a thing, level frame."""
+    low, high = thing.vertices.min(0).astype(float), thing.vertices.max(0).astype(float)
+    across = np.sqrt(2) * _WIDE[1] + 4 * _OFF
+    center = place.of_body(((low + high) / 2)[None])[0]
+    return Box(center=center, size=high - low + [across, across, 2 * _TALL[1]], yaw=place.yaw)
 
 
 def _draw_box(middle: np.ndarray, floor: float, rng: np.random.Generator) -> Box:

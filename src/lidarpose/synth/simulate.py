@@ -192,13 +192,14 @@ def simulate(
     return _added_up(scene.scans(bodies, row, frame), rng, box)
 
 
-def simulate_still(scene: Scene, thing: Mesh, rng: np.random.Generator) -> SimulatedScan:
+def simulate_still(scene: Scene, thing: Mesh, rng: np.random.Generator, *, box: Box | None = None) -> SimulatedScan:
     """The cloud of a thing that does not move, see `simulate`."""
     view_scans = ((view.scene, thing.moved(-view.at), -view.earlier, view.at) for view in scene.views)
     scans = [(scene, thing, 0, np.zeros(3)), *view_scans]
     return _added_up(
         ((view_scene, [mesh, *view_scene.background], frame, position) for view_scene, mesh, frame, position in scans),
         rng,
+        box,
     )
 
 
