@@ -29,18 +29,22 @@ _FEWEST = 20
 
 @default_settings()
 def draw_errors(result: Result) -> bytes:
-    """MPJPE by distance, number of points, hidden share and joint, with intervals and numbers of people."""
+    """MPJPE by distance, number of points, hidden share, joint and points near the joint, with intervals and numbers of
+    people."""
     panels = {
         "distance, m": ("by distance from the sensor, m", "the sensor's position is not known"),
         "points": ("by number of points", "nobody"),
         "hidden share": ("by hidden share", "the dataset has no labels of hidden points"),
         "joints": ("by joint", "nobody"),
+        "points near the joint": ("by number of points within 15 cm of the joint", "nobody"),
     }
+    layout = [["distance, m", "points", "hidden share"], ["joints", "joints", "points near the joint"]]
     setting = result.setting
-    figure = _figure(9.6, 6.6, f"{setting.dataset}: MPJPE of {setting.method}, mm", setting.summary)
+    figure = _figure(12.8, 6.6, f"{setting.dataset}: MPJPE of {setting.method}, mm", setting.summary)
     rows = [row for row in result.lines if row.figure == "mpjpe" and row.arithmetic == OURS and row.value is not None]
     overall_values = {row.method: row.value for row in rows if row.group == "all" and row.value is not None}
-    for axes, (group, (title, empty_text)) in zip(figure.subplots(2, 2).ravel(), panels.items(), strict=True):
+    for group, axes in figure.subplot_mosaic(layout).items():
+        title, empty_text = panels[group]
         axes.set_title(title, fontsize=10, loc="left", color=INK)
         group_rows = [row for row in rows if row.group == group and row.method == setting.method]
         if not group_rows:
