@@ -312,6 +312,14 @@ def test_predict_reads_kitti_calibration_from_calib_option(crop, tmp_path, out, 
     assert person["box"]["center"][0] == pytest.approx(8.41)
 
 
+def test_results_of_pcd_bin_files_are_named_like_frames(points, out):
+    """So that --boxes FOLDER finds them by the frames' ids."""
+    path = out.parent / "top.pcd.bin"
+    path.write_bytes(np.pad(points, ((0, 0), (0, 2))).astype(np.float32).tobytes())
+    assert run("predict", path, "--crop", "--out", out) == 0 and run("detect", path, "--out", out) == 0
+    assert sorted(file.name for file in out.iterdir()) == ["top.boxes.json", "top.poses.json"]
+
+
 # ---- errors
 
 

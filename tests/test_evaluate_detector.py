@@ -445,7 +445,10 @@ def test_labeled_scans_match_whole_category_names(tmp_path):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["detector", "bench"], "expected heldout or nothing as the detector's dataset, got bench: use --scans"),
+        (
+            ["detector", "heldout", "bench"],
+            "expected heldout or nothing as the detector's dataset, got bench: use --scans",
+        ),
         (["detector", "--protocol", "dapt"], "--protocol is an option for pose networks, got the detector: omit it"),
         (["detector", "--method", "yolo"], "method"),
         (["detector", "--limit", "0"], "limit must be a whole number of at least 1, got 0"),

@@ -287,6 +287,14 @@ def test_changed_boxes_file_restarts_prediction(form, stopped, drive, tmp_path, 
     assert "from another command (files changed): starting over" in capsys.readouterr().err
 
 
+def test_resume_with_result_in_folder_of_boxes_keeps_finished_frames(stopped, drive, tmp_path, capsys):
+    """The command's own unfinished files are no change of the boxes, and neither is stating the default of --every."""
+    (tmp_path / "0.json").write_text(json.dumps({"people": [{"center": [4.1, 1.5, 0], "size": [1, 1, 2]}]}))
+    words = stopped("--end", 0.2, "--boxes", tmp_path, "--out", tmp_path / "a.jsonl")
+    assert main(["predict", str(drive), *map(str, words), "--every", "1"]) == 0
+    assert "1 frames are in" in capsys.readouterr().err
+
+
 def test_printing_rejects_boxes_of_other_frames(drive, tmp_path, capsys):
     (tmp_path / "b.json").write_text('[{"frame": "elsewhere", "people": []}]')
     assert main(["predict", str(drive), "--end", "0.1", "--boxes", str(tmp_path / "b.json"), "--out", "-"]) == 2
@@ -574,6 +582,23 @@ def test_frame_boxes_match_frames_by_name_or_number(form, names, tmp_path):
     (box,) = boxes.of(frames[1])
     assert isinstance(box, Box) and box.center.tolist() == [1, 2, 3]
     boxes.check_used("c")
+
+
+def test_frame_boxes_prefer_json_and_refuse_two_files_of_a_frame(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((50, 3)))
+    for x, name in enumerate(("a.boxes.json", "b.json")):
+        (tmp_path / name).write_text(json.dumps({"people": [{"center": [x, 0, 0], "size": [1, 1, 2]}]}))
+    boxes = FrameBoxes(tmp_path)
+    for k, id in enumerate("ab"):
+        (box,) = boxes.of(Frame(points=np.zeros((0, 3)), index=k, id=id))
+        assert box.center[0] == k
+    (tmp_path / "b.poses.json").write_bytes((tmp_path / "b.json").read_bytes())
+    with pytest.raises(InputError, match="expected one file of boxes per frame, got b.json and b.poses.json: move"):
+        FrameBoxes(tmp_path)
+    (tmp_path / "b.poses.json").unlink()
+    (tmp_path / "a.txt").write_text("")
+    with pytest.raises(InputError, match="expected one file of boxes per frame, got a.npy and a.txt: move"):
+        FrameBoxes(tmp_path)
 
 
 def test_frame_boxes_do_not_confuse_numbers_and_names(tmp_path):
@@ -1116,7 +1141,8 @@ def test_predict_recording_checks_generators_and_their_options(model, tmp_path):
     assert len(list(lidarpose.predict_recording(tmp_path.glob("*.npy"), crop=True, model=model))) == 1
     with pytest.raises(InputError, match="expected paths or frames, got ndarray: make a lidarpose.Frame"):
         lidarpose.predict_recording(iter([np.zeros((9, 3))]), model=model)
-    for option in ({"every": 2}, {"start": 1.0}, {"end": 1.0}, {"rate": 5.0}):
+    reading = ({"columns": 4}, {"topic": "/x"}, {"meta": "none.json"})
+    for option in ({"every": 2}, {"start": 1.0}, {"end": 1.0}, {"rate": 5.0}, *reading):
         for source in (fed([np.ones((9, 3))]), lidarpose.open_source(tmp_path)):
             with pytest.raises(InputError, match=f"^{next(iter(option))} is for paths, got frames"):
                 lidarpose.predict_recording(source, model=model, **option)
@@ -1130,6 +1156,26 @@ def test_frame_rejects_pose_that_is_not_rigid(T):
         lidarpose.Frame(points=np.zeros((0, 3)), index=0, id="0", T_world_sensor=T)
     frame = lidarpose.Frame(points=np.zeros((0, 3)), index=0, id="0", T_world_sensor=np.eye(4).tolist())
     np.testing.assert_array_equal(frame.T_world_sensor, np.eye(4))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"origin": (0, 0)}, {"origin": "unknown"}, {"origin": [0, 0, np.nan]}, {"index": 0.5}, {"index": -1},
+        {"time": "a"}, {"time": np.nan}, {"time": np.datetime64("2026-01-01T00:00:00")},
+    ],
+)  # fmt: skip
+def test_frame_rejects_invalid_position_index_and_time(wrong):
+    (name,) = wrong
+    with pytest.raises(InputError, match=rf"^Frame\.{name}[^\n]*$"):
+        lidarpose.Frame(points=np.zeros((0, 3)), **({"index": 0, "id": "0"} | wrong))
+
+
+def test_results_of_frames_with_numpy_values_are_json(model):
+    frame = lidarpose.Frame(points=np.zeros((0, 3)), index=np.int64(3), id="3", time=np.float32(0.5), origin=(0, 0, 1))
+    (result,) = lidarpose.predict_recording([frame], model=model)
+    line = json.loads(json.dumps(result.to_dict()))
+    assert (line["frame"], line["time"]) == (3, 0.5) and frame.origin.tolist() == [0, 0, 1]
 
 
 def test_close_does_not_wait_for_next_frame(model):

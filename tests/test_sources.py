@@ -158,6 +158,9 @@ def test_folder_of_mixed_files_selects_format(tmp_path):
     np.savez(tmp_path / "2.npz", POINTS)
     source = open_source(tmp_path, rate=10)
     assert ids(source) == ["1", "2", "10"] and "only its 3 .npy files are read, not 2 .npz" in source.warnings[0]
+    np.savez(tmp_path / "10.npz", POINTS)
+    # as many .npy, which may be boxes
+    assert "only its 3 .npz files are read, not 3 .npy" in open_source(tmp_path, rate=10).warnings[0]
     for path in tmp_path.glob("*.[nN][pP]?"):
         path.unlink()
     source = open_source(tmp_path, rate=10)

@@ -120,10 +120,8 @@ def _evaluate_detector(options: argparse.Namespace) -> None:
     for name in option_names(_OPTIONS):
         if name not in _OF_BOTH and getattr(options, name) != options.defaults[name]:
             raise InputError(f"{flag(name)} is an option for pose networks, got the detector: omit it")
-    if set(options.datasets) - {HELDOUT}:
-        raise InputError(
-            f"expected {HELDOUT} or nothing as the detector's dataset, got {options.datasets[0]}: use --scans"
-        )
+    if others := [dataset for dataset in options.datasets if dataset != HELDOUT]:
+        raise InputError(f"expected {HELDOUT} or nothing as the detector's dataset, got {others[0]}: use --scans")
     folder = evaluation.new_folder(f"{DETECTOR}.onnx") if options.out is None else evaluation.check_folder(options.out)
     pictures = None if options.pictures is None else evaluation.check_folder(options.pictures)
     settings = {name: value for name in _OF_BOTH if (value := getattr(options, name)) is not None}

@@ -96,9 +96,10 @@ def add(commands) -> None:
 def _predict(options: argparse.Namespace) -> None:
     from lidarpose.inference.predict_scan import predict
     from lidarpose.io.atomic import write_all_atomic
+    from lidarpose.io.sources.folders import scan_id
 
     file = Path(options.source[0])
-    result, picture, page = output_paths(options, file.stem, ("json", "csv"))
+    result, picture, page = output_paths(options, scan_id(file), ("json", "csv"))
     poses = predict(options.source[0], **prediction_options(options), progress=True)
     outputs: dict[Path, bytes] = {}
     if result is not None:
@@ -173,8 +174,9 @@ def _detect(options: argparse.Namespace) -> None:
     from lidarpose.inference.single_scan import detect
     from lidarpose.io.atomic import check_writable
     from lidarpose.io.files import check_not_input
+    from lidarpose.io.sources.folders import scan_id
 
-    result = _result_path(options.out, Path(options.file).stem, "boxes", ".json")
+    result = _result_path(options.out, scan_id(Path(options.file)), "boxes", ".json")
     if result is not None:
         check_not_input(result, options.file, *(options.background or ()))
         check_writable(result)

@@ -1,6 +1,7 @@
 """`lidarpose predict` of folders and recordings: many frames, a line each."""
 
 import argparse
+import hashlib
 import json
 import os
 from collections.abc import Callable, Sequence
@@ -62,6 +63,7 @@ def _is_recording(options: argparse.Namespace) -> bool:
 def _name_of(paths: Sequence[str]) -> str:
     """What results are named after: the file's or folder's stem, of several files their folder's."""
     from lidarpose.io.files import common_folder
+    from lidarpose.io.sources.folders import scan_id
 
     path = paths[0] if len(paths) == 1 else common_folder(paths)
     if path is None:
@@ -70,7 +72,7 @@ def _name_of(paths: Sequence[str]) -> str:
         path = os.path.dirname(path.split("**")[0]) or "."
     path = os.path.realpath(path)
     name = os.path.basename(path)
-    return (name if os.path.isdir(path) else Path(name).stem) or "recording"
+    return (name if os.path.isdir(path) else scan_id(Path(name))) or "recording"
 
 
 def _predict_recording(
@@ -115,7 +117,7 @@ def _predict_recording(
             source,
             predictor,
             result,
-            command=_command(options),
+            command=_command(options, [path.name for path in (result, picture, page) if path is not None]),
             world=options.world,
             on_line=on_line,
             tell=lambda text: tell(f"lidarpose: {text}"),
@@ -162,18 +164,22 @@ def _report(options: argparse.Namespace, source_warnings: list[str], summary, ou
     tell(summary.text(options.track or options.live) + outputs)
 
 
-def _command(options: argparse.Namespace) -> dict[str, Any]:
-    """All that the poses of frames depend on."""
+def _command(options: argparse.Namespace, outputs: Sequence[str]) -> dict[str, Any]:
+    """All that the poses of frames depend on. outputs: names of the files that the command writes."""
     ignored_names = ("run", "command", "quiet", "out", "format", "picture", "html", "world", "source")
     command = {name: value for name, value in vars(options).items() if name not in ignored_names}
+    command["every"] = options.every or 1
     files = [options.weights, options.boxes, options.calib, options.meta, *(options.background or ())]
-    changed = {path: _changed(Path(path)) for path in files if path and os.path.exists(path)}
+    changed = {path: _changed(Path(path), outputs) for path in files if path and os.path.exists(path)}
     sources = [os.path.abspath(path) for path in options.source]
     return command | {"source": sources, "files changed": changed, "version": __version__}
 
 
-def _changed(path: Path) -> int:
-    """When a file, or one in a folder, was changed last, ns."""
-    files = [path, *(path.iterdir() if path.is_dir() else ())]
+def _changed(path: Path, outputs: Sequence[str]) -> str:
+    """When a file was changed last, ns; for a folder, a digest of that of its files. Files whose names begin as
+    `outputs` do, such as the unfinished result, are left out: the command itself changes them."""
+    if not path.is_dir():
+        return str(path.stat().st_mtime_ns)
     # a folder may contain broken links
-    return max(file.stat().st_mtime_ns for file in files if file.exists())
+    files = sorted(file for file in path.iterdir() if file.exists() and not file.name.startswith((".", *outputs)))
+    return hashlib.sha256(repr([(file.name, file.stat().st_mtime_ns) for file in files]).encode()).hexdigest()

@@ -25,7 +25,8 @@ class FrameBoxes:
 
     Args:
         given: a folder of files named like the frames (`ID.json`, `ID.npy`, KITTI's `ID.txt`, or `ID.boxes.json` and
-            `ID.poses.json`, as `lidarpose detect` and `predict` name them), or all by the frames' numbers; or a file of
+            `ID.poses.json`, as `lidarpose detect` and `predict` name them), or all by the frames' numbers, JSON before
+            other files of the same name, which may be the scans; or a file of
             JSON lines or a JSON list of `{"frame": 0, "people": [...]}`, where the frame is its number (an integer) or
             its id (text); or a mapping from frame numbers or ids to anything that `read_boxes` takes. Ids that are
             integers are compared by value.
@@ -50,9 +51,7 @@ class FrameBoxes:
             kind = type(given).__name__
             raise InputError(f"boxes of a recording: expected a folder, a file or a dict by frame, got {kind}")
         elif os.path.isdir(given):
-            for path in list_folder(Path(given)):
-                if path.suffix.lower() in _SUFFIXES:
-                    self._by_frame[path.stem.removesuffix(".boxes").removesuffix(".poses")] = path
+            self._by_frame = _files_by_frame(Path(given))
         else:
             self._by_frame = _by_frame(given)
         if not self._by_frame:
@@ -105,6 +104,21 @@ class FrameBoxes:
 def _value(id: str) -> int | None:
     """The value of an id that is an integer."""
     return int(id) if FRAME_NUMBER.fullmatch(id) else None
+
+
+def _files_by_frame(folder: Path) -> dict[int | str, Any]:
+    """The files of a folder by frame id. Raises InputError for two of one frame."""
+    paths = [path for path in list_folder(folder) if path.suffix.lower() in _SUFFIXES]
+    by_frame: dict[int | str, Any] = {}
+    # JSON last: it takes the place of other files
+    for path in sorted(paths, key=lambda path: path.suffix.lower() == ".json"):
+        id = path.stem.removesuffix(".boxes").removesuffix(".poses")
+        other = by_frame.get(id)
+        if other is not None and (path.suffix.lower() != ".json" or other.suffix.lower() == ".json"):
+            problem = f"expected one file of boxes per frame, got {other.name} and {path.name}"
+            raise file_error(folder, f"{problem}: move one elsewhere")
+        by_frame[id] = path
+    return by_frame
 
 
 def _by_frame(path: str | os.PathLike) -> dict[int | str, Any]:

@@ -144,14 +144,18 @@ def predict_recording(
     if unknown := set(posing) - set(PosingOptions.__annotations__):
         raise TypeError(f"predict_recording() got an unexpected keyword argument {min(unknown)!r}")
     choice: dict[str, Any] = {"rate": rate, "start": start, "end": end, "every": every}
+    reading: dict[str, Any] = {"columns": columns, "topic": topic, "meta": meta}
     paths, frames = _frames_among(source)
     name, opened = getattr(source, "name", None), None
     if frames is None:
-        opened = open_source(paths, columns=columns, topic=topic, meta=meta, **choice)
+        opened = open_source(paths, **reading, **choice)
         name, frames = opened.name, opened.frames()
-    elif options := [option for option, value in choice.items() if value != (1 if option == "every" else None)]:
-        raise InputError(f"{options[0]} is for paths, got frames: give it to open_source, or filter the frames")
-    predictor = FramePredictor(columns=columns, topic=topic, meta=meta, name=name, **posing)
+    else:
+        # scans of the background are read, too
+        refused = choice if posing.get("background") is not None else choice | reading
+        if options := [option for option, value in refused.items() if value != (1 if option == "every" else None)]:
+            raise InputError(f"{options[0]} is for paths, got frames: give it to open_source, or filter the frames")
+    predictor = FramePredictor(**reading, name=name, **posing)
     results = predictor.predict_all(frames)
     return results if opened is None else _with_warnings(results, opened)
 

@@ -58,7 +58,8 @@ def scan_files(folder: Path, other: Sequence[str] = ()) -> tuple[list[Path], lis
     files = next(filter(None, groups), [])
     if not files:
         raise file_error(folder, f"expected point files ({' '.join((*SUFFIXES, *other))}), got {describe(entries)}")
-    counts = Counter(suffixes[path] for path in files).most_common()
+    # of two equally frequent suffixes .npy is last: such files may be boxes
+    counts = sorted(Counter(suffixes[path] for path in files).items(), key=lambda item: (-item[1], item[0] == ".npy"))
     left_out = Counter(suffixes[path] for path in groups[1] if files is groups[0]).most_common()
     if files is groups[2] or len({scan_id(path) for path in files}) < len(files):
         counts, left_out = counts[:1], counts[1:] + left_out

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from lidarpose.errors import InputError, LidarPoseError, MissingExtra, check_finite, check_int
-from lidarpose.geometry import is_rotation, nearest_rotation
+from lidarpose.geometry import is_rotation, nearest_rotation, vector_of
 from lidarpose.io.files import FormatError, file_error, one_line, shorten
 
 # frames per second if a source has no times
@@ -54,7 +54,8 @@ class Frame(Sweep):
     `T_world_sensor` and `origin` are copied, and a rotation that is off by up to 1 % is made exact.
 
     Raises:
-        InputError: `T_world_sensor` is not a rigid transform (4, 4).
+        InputError: `T_world_sensor` is not a rigid transform (4, 4), `origin` not a position, or `index` or `time` not
+            a finite number.
     """
 
     index: int
@@ -66,8 +67,16 @@ class Frame(Sweep):
         return f"Frame({self.index}, {self.id!r}, {len(self.points):,} points{time})"
 
     def __post_init__(self):
+        object.__setattr__(self, "index", check_int("Frame.index", self.index, least=0))
+        if self.time is not None:
+            check_finite("Frame.time", self.time)
+            object.__setattr__(self, "time", float(self.time))
         if self.origin is not None:
-            object.__setattr__(self, "origin", np.array(self.origin, float))
+            origin = vector_of(self.origin)
+            if origin is None:
+                problem = f"expected three numbers, meters, got {shorten(repr(self.origin), 60)}"
+                raise InputError(f"Frame.origin: {problem}: give is_origin_unknown=True if it is not known")
+            object.__setattr__(self, "origin", origin)
         if self.T_world_sensor is None:
             return
         try:

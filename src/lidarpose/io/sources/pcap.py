@@ -116,15 +116,16 @@ class Capture:
             pending[key] = time, parts
         parts[offset] = data, has_more
         size = sum(len(part) for part, _ in parts.values())
+        last_offset = max(parts)
+        last, has_more = parts[last_offset]
+        if not has_more and last_offset + len(last) == size <= _MAX_DATAGRAM:
+            del pending[key]
+            return b"".join(parts[offset][0] for offset in sorted(parts))
         if size > _MAX_DATAGRAM or len(pending) > _MAX_PENDING:
             # fragments overlap, or the oldest datagram is given up
             pending.pop(key if size > _MAX_DATAGRAM else next(iter(pending)))
             self.num_cut += 1
-        last_offset = max(parts)
-        if parts[last_offset][1] or last_offset + len(parts[last_offset][0]) != size:
-            return b""
-        pending.pop(key, None)
-        return b"".join(parts[offset][0] for offset in sorted(parts))
+        return b""
 
 
 class Datagrams(Protocol):
