@@ -242,6 +242,20 @@ def test_pointnet_features_are_independent_of_batch(count, has_copies):
     torch.testing.assert_close(network(points, valid)[1:], alone, atol=1e-5, rtol=1e-5)
 
 
+@torch.no_grad()
+def test_pointnet_batch_norms_count_no_copies():
+    """A cloud smaller than the batch's padding repeats a center."""
+    points, valid = _cloud(4, (512, 40))
+    means = []
+    for size in (40, 512):
+        torch.manual_seed(0)
+        network = PointNet2(64, 8).train()
+        network(points[1:, :size], valid[1:, :size])
+        norms = [module for module in network.modules() if isinstance(module, torch.nn.modules.batchnorm._BatchNorm)]
+        means.append(torch.cat([norm.running_mean for norm in norms]))
+    torch.testing.assert_close(*means, atol=1e-6, rtol=1e-5)
+
+
 @pytest.mark.long
 @torch.no_grad()
 @pytest.mark.parametrize(

@@ -608,6 +608,10 @@ def test_named_configs_have_joints_of_released_networks():
         ({"zero_anchors": 1}, "zero_anchors must be true or false"),
         ({"neck": "giraffe"}, "unknown neck 'giraffe'"),
         ({"neck": "prn"}, "the neck prn has joints and parts of its own: leave bins, ranges and parts empty"),
+        (
+            {"neck": "prn", "bins": (), "ranges": (), "parts": 0, "coordinates": True, "zero_anchors": True},
+            "zero_anchors: the neck prn has no anchors, heatmaps or auxiliary head: omit it",
+        ),
     ],
 )
 def test_dapt_config_rejects_invalid_values(change, message):

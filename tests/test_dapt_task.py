@@ -202,9 +202,9 @@ def test_losses_of_the_released_code(seed):
     assert finetuning(bare, targets, replace(MENDED, squared_distance=True))["regression"].item() == pytest.approx(
         squared(outputs.coordinates), rel=1e-5
     )
-    assert prn(bare, targets, replace(MENDED, squared_distance=True))["vote"].item() == pytest.approx(
-        squared(bare.voted), rel=1e-5
-    )
+    terms = prn(bare, targets, replace(MENDED, squared_distance=True, ignore_background=True))
+    assert terms["vote"].item() == pytest.approx(squared(bare.voted), rel=1e-5)
+    assert terms["segmentation"].item() == pytest.approx(slow_segmentation(outputs.parts, on_body), rel=1e-5)
 
 
 @settings(max_examples=60, deadline=None)

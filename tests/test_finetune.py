@@ -339,6 +339,9 @@ def test_changes_of_scene_reach_people_that_are_mixed_in(datasets):
     assert changed.set == ("keep=0.3", "mask=1") and plain.set == ()
     counts = [sum(len(source.example(k).points) for k in range(12)) for source in (changed, plain)]
     assert counts[0] < 0.8 * counts[1]
+    # not the people that pre-training with the same seed began with
+    first, earlier = (source.example(0) for source in (plain, SyntheticSource(scene=plain.scene, seed=plain.seed)))
+    assert not np.array_equal(first.points, earlier.points)
     # the configuration of a run from before this setting
     old = {key: value for key, value in Finetune(data=("a",)).to_dict().items() if key != "set"}
     assert Finetune(**old) == Finetune(data=("a",))

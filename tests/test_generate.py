@@ -137,7 +137,8 @@ def test_generator_samples_are_valid(scene):
         assert kind == "synth" and device in SCENES[name].sensors and device == person.facts.sensor
         beams = sensor(device)
         rings = beams.rows if isinstance(beams, Sensor) else beams.frame(0).line.max() + 1
-        assert 0 <= sample.ring.min() and sample.ring.max() < rings
+        # points of clutter have no beam, and no part
+        assert -1 <= sample.ring.min() and sample.ring.max() < rings and not sample.part[sample.ring < 0].any()
 
 
 def test_generator_skeleton_is_inside_body_behind_surface():

@@ -342,6 +342,22 @@ def test_stacked_sensors_see_person_half_a_turn_apart(azimuth):
     np.testing.assert_allclose(2 * quick, slow, atol=1e-5)
 
 
+@pytest.mark.parametrize("left", [0.0, 1.0])
+def test_stacked_sensors_order_follows_person_across_seam(left):
+    """Behind the sensor, the lower sensor is half a turn late on one side of its x axis and early on the other."""
+    where, actor, way = scene("av2", 3.1, config=CLEAN), strider([0.4, 0.0, 0.0]), np.float32([0.0, left, 0.0])
+    aside = replace(
+        actor,
+        vertices=actor.vertices + way,
+        joints=actor.joints + way,
+        moved=lambda frame: tuple(array + way for array in actor.moved(frame)),
+    )
+    mesh, pelvis = where.meshes(aside, 0)[0], where.place.of_body(aside.joints[0, :1])[0]
+    assert (pelvis[1] < 0) == bool(left)
+    # the person walks away from the sensor, along -x
+    assert (mesh.later[:, 0].mean() < mesh.vertices[:, 0].mean()) == bool(left)
+
+
 @pytest.mark.parametrize("azimuth", [0.5, -0.5])
 def test_scan_window_covers_moving_body(azimuth):
     counts = []

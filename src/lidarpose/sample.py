@@ -267,8 +267,8 @@ class Sample:
 
     points (n, 3) float32 m in the sensor frame, n = 0 is legal; center (3,) m, the origin of the person's own frame,
     which has the axes of the sensor frame; part (n,) uint8, 0 = background, 1 + j = the bone of SMPL-24's joint j;
-    ring (n,) int, the beam; pose in the sensor frame; box of the person; source: where the sample comes from;
-    frame_id: name of its frame; second_person_points: number of points on other people, None if unknown.
+    ring (n,) int, the beam, -1 for none; pose in the sensor frame; box of the person; source: where the sample comes
+    from; frame_id: name of its frame; second_person_points: number of points on other people, None if unknown.
 
     Additional values for networks that read clips: rotations (24, 3) rad, axis-angles of SMPL's joints, each relative
     to its parent, the pelvis' from SMPL's rest frame (y up, facing +z) to the sensor frame; translation (3,) m, SMPL's

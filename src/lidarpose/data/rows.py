@@ -5,7 +5,8 @@ A row of people-*.parquet is one synthetic person in one frame:
     index, frame, track     number of the person, clip or street in the dataset; its frame; person in a street
     points                  x, y, z of all points, flattened, m: reshape to (n, 3); in the level frame at the sensor,
                             x forward, y left, z up
-    part, ring              one per point: 0 = background, 1 + j = the bone of SMPL-24's joint j; the beam
+    part, ring              one per point: 0 = background, 1 + j = the bone of SMPL-24's joint j; the beam, or
+                            -1 for a point of none
     joints                  x, y, z of the joints named in dataset.json, m
     center                  origin of the person's own frame, computed from the points
     box_center, box_size, box_yaw    a detector's box: m, m, rad

@@ -368,7 +368,7 @@ def _crop(
             most_points = min(config.noise.most_clutter, 20 + len(points) // 2)
             clusters = noise.noise_clusters(box.center, most=most_points, rng=rng)
         points = np.concatenate([points, clusters.astype(np.float32)])
-        ring = np.concatenate([ring, np.zeros(len(clusters), ring.dtype)])
+        ring = np.concatenate([ring, np.full(len(clusters), -1, ring.dtype)])
         part = np.concatenate([part, np.zeros(len(clusters), np.uint8)])
     is_inside = box.contains(points)
     points, ring, part = points[is_inside], ring[is_inside], part[is_inside]

@@ -98,7 +98,8 @@ def _draw_sample(
         points, ring = points[:0], ring[:0]
     elif name not in THINGS or rng.random() < config.noise.clutter * config.hard:
         clusters = noise.noise_clusters(center, most=_MOST_CLUTTER, rng=rng).astype(np.float32)
-        points, ring = np.concatenate([points, clusters]), np.concatenate([ring, np.zeros(len(clusters), ring.dtype)])
+        points = np.concatenate([points, clusters])
+        ring = np.concatenate([ring, np.full(len(clusters), -1, ring.dtype)])
     if len(thing_points):
         center = thing_points[rng.integers(len(thing_points))].astype(float)
     box = _draw_box(center, float(place.feet[2]), rng)

@@ -91,7 +91,8 @@ class Scene:
         """All triangles, level frame: body `row`, whose pose is that of the frame's middle, then its props, then the
         background. lag: time by which the body has moved on, as a share of `FRAME_TIME`."""
         place = self.body_place
-        states = [bodies.between(row, lag + time) for time in looks(self.sensor, self.place.to_sensor(self.place.feet))]
+        pelvis = self.place.to_sensor(place.of_body(bodies.joints[row, :1]))[0]
+        states = [bodies.between(row, lag + time) for time in looks(self.sensor, pelvis)]
         body_vertices = [place.of_body(vertices) for vertices, _ in states]
         meshes = [Mesh(body_vertices[0], bodies.faces, bodies.face_part, *body_vertices[1:])]
         for prop in self.props:
@@ -143,16 +144,16 @@ class SimulatedScan:
     part: np.ndarray
 
 
-def looks(device: Sensor | RayPattern, feet: np.ndarray) -> tuple[float, ...]:
-    """Times at which a sensor scans a person at `feet` (3,) m in its frame, in units of `FRAME_TIME` relative to the
-    middle of the scan: start and end of a rosette's frame; or when the first and the last ring of a laser stack pass.
-    (0,): at one time."""
+def looks(device: Sensor | RayPattern, position: np.ndarray) -> tuple[float, ...]:
+    """Times at which a sensor scans a person with the pelvis at `position` (3,) m in its frame, in units of
+    `FRAME_TIME` relative to the middle of the scan: start and end of a rosette's frame; or when the first and the last
+    ring of a laser stack pass. (0,): at one time."""
     if isinstance(device, RayPattern):
         half = device.duration / FRAME_TIME / 2
     else:
         # frames start behind the sensor: rings whose lag reaches into the next frame passed one turn earlier, in this
         # frame
-        is_ahead = np.arctan2(feet[1], feet[0]) / (2 * pi) + 0.5 + device.lag > 1
+        is_ahead = np.arctan2(position[1], position[0]) / (2 * pi) + 0.5 + device.lag > 1
         half = (device.lag - (is_ahead and device.lag > 0)) * device.turn_time / FRAME_TIME / 2
     return (-half, half) if half else (0.0,)
 

@@ -308,7 +308,8 @@ def _scan_turn(
 ) -> StreetFrame:
     people = []
     for bodies, place in walkers:
-        vertices = [place.of_body(bodies.between(frame, time)[0]) for time in looks(device, place.feet)]
+        pelvis = place.of_body(bodies.joints[frame, :1])[0]
+        vertices = [place.of_body(bodies.between(frame, time)[0]) for time in looks(device, pelvis)]
         people.append(Mesh(vertices[0], bodies.faces, bodies.face_part, *vertices[1:]))
     scene = union([*people, scenery])
     R_sensor_level = rotation_about("y", -device.tilt).astype(np.float32)

@@ -73,8 +73,8 @@ class SyntheticSource:
 
     easy: number of samples in which the maximum difficulty rises from zero to full. All difficulties below the maximum
     are sampled, harder ones more often; the paper's scenes use the maximum itself. motion, subjects, captured, body,
-    strays, noise, objects, set: see `recipes.Pretrain`; pelvis_centered: see `example`. Raises InputError, when built,
-    for an unknown scene and for clips that cannot be read.
+    strays, noise, objects, set: see `recipes.Pretrain`; pelvis_centered: see `example`; first: number of the first
+    person of the seed. Raises InputError, when built, for an unknown scene and for clips that cannot be read.
     """
 
     scene: str
@@ -89,6 +89,7 @@ class SyntheticSource:
     objects: float = 0.0
     set: tuple[str, ...] = ()
     pelvis_centered: float = PELVIS_CENTERED
+    first: int = 0
 
     def __post_init__(self):
         # errors are raised here, not in a worker, whose errors come wrapped in a traceback
@@ -107,17 +108,18 @@ class SyntheticSource:
         return Generator(scene=scene, bank=bank, captured=captured, rig=rig, measure=False)
 
     def example(self, index: int) -> Example:
-        rng = np.random.default_rng([self.seed, RandomStream.SYNTHETIC_AUGMENTATION, index])
+        number = self.first + index
+        rng = np.random.default_rng([self.seed, RandomStream.SYNTHETIC_AUGMENTATION, number])
         scene = self._generator.config
         if self.objects and rng.random() < self.objects:
             # crops of several scans are as frequent as among people, where their frequency depends on the difficulty
             difficulty = self._difficulty(index, rng) if scene.varied else None
-            object_sample, _ = draw_object(scene, self.seed, index, hard=difficulty)
+            object_sample, _ = draw_object(scene, self.seed, number, hard=difficulty)
             # disturbed as people are: otherwise every blurred crop would show a person
             object_sample = add_disturbances(object_sample, strays=self.strays, noise=self.noise, rng=rng)
             return object_example(object_sample, rng, pelvis_centered=self.pelvis_centered)
         difficulty = self._difficulty(index, rng)
-        sample = self._generator.person(self.seed, index, hard=difficulty).sample
+        sample = self._generator.person(self.seed, number, hard=difficulty).sample
         result = example(
             add_disturbances(sample, strays=self.strays, noise=self.noise, rng=rng),
             rng,
@@ -133,8 +135,9 @@ class SyntheticSource:
 
     def clip(self, index: int, *, trans_center: bool) -> ClipExample:
         """A clip of a person at the scene's difficulty."""
-        rng = np.random.default_rng([self.seed, RandomStream.SYNTHETIC_AUGMENTATION, index])
-        samples = [person.sample for person in self._generator.clip(self.seed, index)]
+        number = self.first + index
+        rng = np.random.default_rng([self.seed, RandomStream.SYNTHETIC_AUGMENTATION, number])
+        samples = [person.sample for person in self._generator.clip(self.seed, number)]
         return clip_example(samples, rng, trans_center=trans_center, pelvis_centered=self.pelvis_centered)
 
 

@@ -64,6 +64,8 @@ _LAG = 12
 _SCAN_USES = 12
 # share of crops without a person among the synthesized samples of fine-tuning, for networks with a person head
 _OBJECTS = 0.2
+# number of the first of them: pre-training with the same seed shows the people from 0 on
+_FIRST_MIXED = 1 << 40
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -308,7 +310,9 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
     source: Source = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=kind)
     if recipe.mix:
         objects = _OBJECTS if getattr(config, "person", False) else 0.0
-        synthetic_source = SyntheticSource(scene=recipe.scene, set=recipe.set, seed=recipe.seed, objects=objects)
+        synthetic_source = SyntheticSource(
+            scene=recipe.scene, set=recipe.set, seed=recipe.seed, objects=objects, first=_FIRST_MIXED
+        )
         source = MixedSource(main=source, other=synthetic_source, share=recipe.mix)
 
     def validation() -> list[Example]:

@@ -151,12 +151,13 @@ class LidarcapConfig(BaselineConfig):
 
     resample_with_replacement: every cloud has `most_points` points: smaller clouds are repeated in full, larger ones
     are drawn from with replacement, as published; else each point is used once; order_dependent_neighbors:
-    neighborhoods depend on the order of the points, as in its CUDA kernels; trans_center: in training, frames are
-    centered on SMPL's true trans, as published, so that the network need not learn where the pelvis is; else on the
-    points, or on an estimate of the pelvis; normalize_in_training: in training, the points of a frame are centered
-    horizontally on their mean, vertically on that of the clip, and divided by 1.2, as in the published training code;
-    evaluation does none of this, as published; stock_initialization: weights are initialized as by PyTorch's layers, as
-    published; else rotations start near the identity, and the layers of NE's encoders start as copies of their inputs.
+    neighborhoods depend on the order of the points, as in its CUDA kernels, and centers that repeat in small clouds
+    count in batch norms; trans_center: in training, frames are centered on SMPL's true trans, as published, so that the
+    network need not learn where the pelvis is; else on the points, or on an estimate of the pelvis;
+    normalize_in_training: in training, the points of a frame are centered horizontally on their mean, vertically on
+    that of the clip, and divided by 1.2, as in the published training code; evaluation does none of this, as published;
+    stock_initialization: weights are initialized as by PyTorch's layers, as published; else rotations start near the
+    identity, and the layers of NE's encoders start as copies of their inputs.
     """
 
     kind: ClassVar[str] = "lidarcap"

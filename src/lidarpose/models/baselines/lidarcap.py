@@ -103,7 +103,9 @@ class PointNet2(nn.Module):
         for layer in self.local:
             points, valid, features = layer(points, valid, features)
         rows = torch.cat([points, features], -1)
-        return self.all(rows.flatten(0, 1)).unflatten(0, rows.shape[:2]).amax(1)
+        values = self.all(rows[valid])
+        lowest = values.new_full((*valid.shape, values.shape[-1]), -torch.inf)
+        return lowest.masked_scatter(valid[..., None], values).amax(1)
 
 
 class SetAbstraction(nn.Module):
@@ -121,15 +123,15 @@ class SetAbstraction(nn.Module):
         index = ball_query(centers, points, valid, self.radius, 32, as_published=self.as_published)
         offsets = gather_points(points, index) - centers[:, :, None]
         rows = torch.cat([offsets, gather_points(features, index)], -1)
-        shape = rows.shape[:3]
-        center_features = self.layers(rows.flatten(0, 2)).unflatten(0, shape).amax(2)
         is_center = torch.ones_like(center_index, dtype=torch.bool)
         if not self.as_published:
-            # a small cloud repeats a center, or has copies of a point, of which a large batch would choose one; as
-            # neighbors of the next layer, copies would displace others
+            # a small cloud repeats a center, or has copies of a point, of which a large batch would choose one; copies
+            # would count in the statistics of batch norms, and displace other neighbors in the next layer
             x, y, z = (axis[:, :, None] == axis[:, None] for axis in centers.unbind(-1))
             is_center = ~(x & y & z).tril(-1).any(2)
-        return centers, is_center, center_features
+        values = self.layers(rows[is_center].flatten(0, 1)).unflatten(0, (-1, rows.shape[2])).amax(1)
+        center_features = values.new_zeros((*is_center.shape, values.shape[-1]))
+        return centers, is_center, center_features.masked_scatter(is_center[..., None], values)
 
 
 class StGcn(nn.Module):

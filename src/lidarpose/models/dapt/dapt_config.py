@@ -130,9 +130,13 @@ class DaptConfig(Config):
             )
         if self.parts == 1:
             raise InputError(f"parts must be 0 (no part head) or from 2 to {MOST}, got 1")
-        if self.neck == "prn" and (self.bins or self.parts or not self.coordinates):
-            reason = "the neck prn has joints and parts of its own"
-            raise InputError(f"{reason}: leave bins, ranges and parts empty and set coordinates=True")
+        if self.neck == "prn":
+            if self.bins or self.parts or not self.coordinates:
+                reason = "the neck prn has joints and parts of its own"
+                raise InputError(f"{reason}: leave bins, ranges and parts empty and set coordinates=True")
+            for name in ("zero_anchors", "unnormalized_heatmaps", "auxiliary_loss"):
+                if getattr(self, name):
+                    raise InputError(f"{name}: the neck prn has no anchors, heatmaps or auxiliary head: omit it")
 
     @property
     def min_tensors(self) -> int:

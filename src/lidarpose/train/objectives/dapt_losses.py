@@ -83,9 +83,12 @@ def prn(
     outputs: DaptOutputs, targets: DaptTargets, config: DaptConfig, *, share: Share = one_process
 ) -> dict[str, Tensor]:
     """Losses of the neck prn in either stage: distances of refined and of voted joints, and the cross entropy of each
-    voxel's nearest joint, with background as a class. The weights of 1 are ours; none are published."""
+    voxel's nearest joint, with background as a class unless `ignore_background`. The weights of 1 are ours; none are
+    published."""
     coordinates, voted, parts, part = outputs.coordinates, outputs.voted, outputs.parts, targets.part
     assert coordinates is not None and voted is not None and parts is not None and part is not None
+    if config.ignore_background:
+        part = part.masked_fill(part == 0, -1)
     people, labels, voxels = _divisors(targets, share, (part >= 0).sum())
     squared = config.squared_distance
     return {
