@@ -11,7 +11,7 @@ from shard_files import write_shard
 from lidarpose.body.rig import forward_kinematics
 from lidarpose.body.smpl import load_body
 from lidarpose.data.clips import MARGIN, MOST, consecutive, static_points, window_points, without_person
-from lidarpose.data.prepare import reader
+from lidarpose.data.prepare import prepare, reader
 from lidarpose.data.readers import base
 from lidarpose.data.readers.base import SceneClouds
 from lidarpose.data.rows import person_row, sample_of
@@ -146,11 +146,25 @@ def test_lidarhuman26m_scans_give_background_and_neighbors(tmp_path, smpl, monke
     items = list(source.read(tmp_path, "7"))
     # each file once for its frame, and once for the map of static points, if its scan is not damaged
     assert read == {".ply": 11, ".pcd": 12}
-    assert [item.background is None for item in items] == [False] * 5 + [True]
-    for item in items[:5]:
+    # the static points are known without the frame's own scan
+    assert [item.neighbors is None for item in items] == [False] * 5 + [True]
+    for item in items:
         assert len(item.background) > 50 and np.abs(item.background[:, 0] - 25).max() < 1e-3
+    for item in items[:5]:
         assert (item.neighbors[:, 0] < 24).sum() > 5
         assert np.linalg.norm(item.neighbors[:, None] - item.points, axis=-1).min() > 0
+
+
+def test_prepare_counts_people_without_whole_scans(tmp_path, smpl):
+    files.write_lidarhuman26m(tmp_path / "raw", smpl, sequences=("7",), frames=4)
+    warning = "the whole scans of 1 person are missing or damaged: their neighbors are not known"
+    summary = prepare("lidarhuman26m", tmp_path / "raw", tmp_path / "alone", smpl=smpl)
+    assert summary["without_scan"] is None and warning not in summary["warnings"]
+    for f, item in enumerate(reader("lidarhuman26m", smpl).read(tmp_path / "raw", "7")):
+        files.write_pcd(tmp_path / f"raw/pointclouds/7/{f + 1:06d}.pcd", item.points)
+    (tmp_path / "raw/pointclouds/7/000002.pcd").write_bytes(b"cut off")
+    summary = prepare("lidarhuman26m", tmp_path / "raw", tmp_path / "prepared", smpl=smpl)
+    assert summary["people"] == 4 and summary["without_scan"] == 1 and warning in summary["warnings"]
 
 
 def test_sloper4d_scans_are_found_by_time(tmp_path, smpl):
@@ -165,8 +179,8 @@ def test_sloper4d_scans_are_found_by_time(tmp_path, smpl):
         name = f"{row[8] + 0.004:.3f}".replace(".", "_")
         files.write_pcd(folder / f"lidar_data/lidar_frames_rot/{name}.pcd", np.concatenate([cloud, ground]))
     items = [item for item in reader("sloper4d", smpl).read(tmp_path, "seq001") if isinstance(item, LabeledSample)]
-    assert [item.background is None for item in items] == [False] * 3 + [True]
-    for item in items[:3]:
+    assert [item.neighbors is None for item in items] == [False] * 3 + [True]
+    for item in items:
         # the ground at z = 1.95 m, the sensor at z = 3.7 m
         assert len(item.background) > 20 and np.abs(item.background[:, 2] + 1.75).max() < 0.06
 

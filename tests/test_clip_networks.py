@@ -498,6 +498,19 @@ def test_evaluation_predicts_true_windows(predictor, folder, clips):
 
 
 @pytest.mark.long
+def test_evaluation_notes_unknown_surroundings(clips, tmp_path):
+    torch.manual_seed(0)
+    alone = [replace(sample, background=None, neighbors=None) for sample in clips[0][:5]]
+    folder = write_clips(tmp_path / "clips", [alone + clips[0][5:]])
+    notes = {}
+    for name, config in CONFIGS.items():
+        model = Predictor(ClipBackend(build(config), Header(config=config, card={})), name=name)
+        notes[name] = evaluation.run(model, [folder]).evaluations[0].result.notes
+    note = "surroundings of 5 of 16 people are not known: the network got none"
+    assert note in notes["ne"] and note not in notes["lidarcap"]
+
+
+@pytest.mark.long
 def test_evaluation_with_limit_predicts_frames_alone(predictor, folder, clips, monkeypatch):
     """Frames that are not consecutive form no window, even if evenly spaced. The same holds for the stability study."""
     result = evaluation.run(predictor, [folder], limit=8).evaluations[0].predictions

@@ -18,7 +18,9 @@ from lidarpose.eval.detector.detection_scores import (
     FALSE,
     MATCH_RADIUS,
     NEITHER,
+    OF_SCAN,
     PERSON,
+    _groups_of_people,
     average_precision,
     exclusive_thresholds,
     match,
@@ -483,6 +485,20 @@ def test_labeled_scans_take_null_as_absent_and_reject_other_types(tmp_path):
             entry = {name: value}
             with pytest.raises(InputError, match=rf"a\.json.*expected text as {name}, got"):
                 read(entry) if name == "category" else read({}, **entry)
+
+
+def test_labeled_scans_may_have_kind_indoors(tmp_path):
+    """It is also the name of all kinds of rooms together."""
+    people = pd.DataFrame(
+        {"mounted": False, "points": 60, "distance": 5.0, "activity": "", "kind": ["indoors", "room"]}
+    )
+    people = people.assign(**{name: "" for name in OF_SCAN if name != "kind"})
+    groups = [(group, of) for group, of, _ in _groups_of_people(people)]
+    assert len(groups) == len(set(groups)) and ("kind", "indoors") in groups
+    (mask,) = (
+        mask for group, of, mask in _groups_of_people(people.assign(kind="room")) if (group, of) == ("kind", "indoors")
+    )
+    assert mask.all()
 
 
 def test_labeled_scans_rejects_missing_scan_and_wrong_labels(tmp_path):

@@ -668,6 +668,7 @@ BAD = {
     "csv of feet": ("a.csv", "x,y,z\n5'30,2,3\n", ["5'30"]),
     "csv of short rows": ("a.csv", "x,y,z\n1,2\n3,4\n", ["'1,2'", "line 2"]),
     "csv open quote": ("a.csv", 'x,y,z\n1,2,"3\n', ["rows of numbers"]),
+    "csv quote over lines": ("a.csv", 'x,y,z,l\n1,2,3,"a\n1,2,3,b\n1,2,3,"c\n', ["a point per line", "several lines"]),
     "csv all missing": ("a.csv", "x,y,z\n,,\nNA,1,2\n", ["NaN", "all 2"]),
     "txt utf-16": ("a.txt", TEXT.encode("utf-16"), ["UTF-16", "UTF-8"]),
     "txt latin-1": ("a.txt", b"# \xe4\n1 2 3\n", ["UTF-8"]),

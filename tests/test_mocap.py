@@ -444,6 +444,24 @@ def test_load_motion_sloper4d_round_trip(tmp_path):
     check_same(motion.of("seq007_garden_001_labels_first"), other, path)
 
 
+def test_load_motion_cuts_sloper4d_at_missing_frames(tmp_path):
+    rotations, way = files.a_clip(8)
+    content = labels(rotations, way, frame_num=[0, 5, 10, 15, 500, 505, 510, 515])
+    name = "seq007_garden_001_labels_second"
+    assert load_motion(write_labels(tmp_path, content)).names == (name, f"{name}#2")
+    for other in ([0, 5], None, [0] * 8, ["a"] * 8):
+        assert load_motion(write_labels(tmp_path, content | {"frame_num": other})).names == (name,)
+
+
+def test_load_motion_reads_people_of_sloper4d_folders_once(tmp_path):
+    """Beside the labels, releases have masks without poses and the unrefined recording."""
+    write_labels(tmp_path, labels(*files.a_clip(4)))
+    (tmp_path / "seq007_garden_001_labels_mask.pkl").write_bytes(pickle.dumps({"masks": {}}))
+    (tmp_path / "mocap_data").mkdir()
+    (tmp_path / "mocap_data" / "seq007_garden_001_second.bvh").write_text("not read")
+    assert load_motion(tmp_path).names == ("seq007_garden_001_labels_second",)
+
+
 class Counter(dict):
     """A class that does not occur in label files."""
 

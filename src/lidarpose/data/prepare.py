@@ -21,7 +21,7 @@ from lidarpose.data.rows import labeled_row
 from lidarpose.data.shards import DatasetReader, open_dataset, read_rows, shard_path, shard_writer
 from lidarpose.data.splits import SplitRule, split_rule
 from lidarpose.data.writer import Counts, make_shards, open_folder
-from lidarpose.errors import InputError, check_int, check_name, first_names
+from lidarpose.errors import InputError, check_int, check_name, counted, first_names
 from lidarpose.io.files import file_error, one_line
 from lidarpose.progress import Progress
 from lidarpose.sample import HIDDEN, SEEN, UNLABELED, LabeledSample
@@ -221,17 +221,18 @@ def _summarize(
     labels, splits, sources, reasons = Counter[int](), Counter[str](), Counter[str](), Counter[str]()
     examples: dict[str, str] = {}
     frames: set[tuple[str, int]] = set()
-    trunks, offsets, part_rows = [], [], []
+    trunks, offsets, part_rows, num_in_scans = [], [], [], 0
     names = skeleton(dataset.card.skeleton).joints
     joint_pairs = [[names.index(f"{side}_{joint}") for side in ("left", "right")] for joint in ("hip", "shoulder")]
     for shard, part in enumerate(parts):
         people, skipped_rows = 0, list(read_rows(dataset.path(shard, "skipped"), "skipped"))
-        for row in read_rows(dataset.path(shard), "labelled", _SUMMARIZED):
+        for row in read_rows(dataset.path(shard), "labelled", (*_SUMMARIZED, "neighbors")):
             is_incomplete = any(row[name] is None for name in _SUMMARIZED if name != "split")
             if is_incomplete or len(row["joints"]) != 3 * len(names):
                 problem = "has a row that is not a sample; delete it and run the same command again"
                 raise file_error(dataset.path(shard), problem)
             people += 1
+            num_in_scans += row["neighbors"] is not None
             frames.add((row["sequence"], row["frame"]))
             splits[row["split"] or "none"] += 1
             sources[row["source"]] += 1
@@ -258,6 +259,8 @@ def _summarize(
         "trunk": [round(float(v), 3) for v in np.mean(trunks, 0)] if trunks else None,
         "joints_from_center_m": round(float(np.median(offsets)), 3) if offsets else None,
         "parts": part_rows,
+        # of datasets with whole scans
+        "without_scan": sum(splits.values()) - num_in_scans if num_in_scans else None,
     }
     return summary | {"warnings": _warnings(summary, absent_names, rule)}
 
@@ -271,6 +274,9 @@ def _warnings(summary: dict[str, Any], absent_names: dict[str, list[str]], rule:
     if offset is not None and offset > _FAR:
         problem = f"the median distance from joints to points is {offset:.2f} m"
         lines.append(f"{problem}: are labels and clouds from different releases?")
+    if summary["without_scan"]:
+        count = counted(summary["without_scan"], "person", "people")
+        lines.append(f"the whole scans of {count} are missing or damaged: their neighbors are not known")
     empty_parts = [part["part"] for part in summary["parts"] if not part["people"]]
     if empty_parts and summary["people"]:
         lines.append(f"no people in {first_names(empty_parts, 5)}")

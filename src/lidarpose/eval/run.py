@@ -60,7 +60,7 @@ def evaluate_dataset(
     dataset, setting = setup.dataset, setup.setting
     parts: list[Predictions] = []
     worst: list[tuple[float, int, EvalSample]] = []
-    num_people = num_unknown = 0
+    num_people = num_unknown = num_alone = 0
     progress(0, dataset.count)
     for chunk in _chunks(setup):
         chunk_predictions = setup.predict(chunk)
@@ -72,6 +72,7 @@ def evaluate_dataset(
         parts.append(chunk_predictions)
         num_people += len(chunk)
         num_unknown += sum(not person.sample.sensor_known for person in chunk)
+        num_alone += sum(person.sample.background is None or person.sample.neighbors is None for person in chunk)
         progress(num_people, dataset.count)
     if not parts:
         reasons = "; ".join(f"{reason}: {entry['first']}" for reason, entry in dataset.skipped.items())
@@ -87,7 +88,7 @@ def evaluate_dataset(
     counts = {"people": int(is_alone.sum()), "frames of clips": int((~is_alone).sum())}
     counts["without a pose"] = int((~predictions.posed & is_alone).sum())
     skipped = {reason: dict(entry) for reason, entry in dataset.skipped.items()}
-    notes = tuple(_notes(setup, setting, predictions))
+    notes = tuple(_notes(setup, setting, predictions, num_alone))
     result = Result(setting=setting, counts=counts, skipped=skipped, notes=notes, lines=lines)
     return Evaluation(result=result, predictions=predictions, worst=tuple((person, k) for _, k, person in worst))
 
@@ -141,13 +142,16 @@ def _person_rows(setup: EvalSetup, bench: Bench, predictions: Predictions, setti
     return tuple(person_rows(people, objects, bench.columns["others"][people.row], setting))
 
 
-def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions) -> Iterator[str]:
-    """Notes for the reader; setting: the setup's, with `sensor` updated to what the dataset knows."""
+def _notes(setup: EvalSetup, setting: Setting, predictions: Predictions, num_alone: int) -> Iterator[str]:
+    """Notes for the reader; setting: the setup's, with `sensor` updated to what the dataset knows; num_alone: number of
+    people whose surroundings are not known."""
     header = getattr(setup.model, "header", None)
     runs = runs_of(getattr(header, "card", {}))
     yield from dict.fromkeys(note for run in runs for note in _notes_of_run(run, setup.dataset))
     if getattr(getattr(header, "config", None), "trans_center", False) and setting.protocol != "dapt":
         yield "the network was trained about the labels' trans (trans_center): score it by the protocol dapt"
+    if num_alone and len(getattr(getattr(header, "config", None), "clouds", ())) > 1:
+        yield f"surroundings of {num_alone:,} of {len(predictions.pred):,} people are not known: the network got none"
     if setting.not_judged:
         yield f"scored joints: {', '.join(setting.joints)}; {setting.not_judged}"
     if setting.leaks:

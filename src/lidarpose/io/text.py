@@ -261,6 +261,8 @@ def _read_csv(text: str, columns: list[int], *, separator: str | None, decimal: 
         return np.empty((0, 3))
     except ValueError as error:
         raise _wrong_line(text.splitlines(), columns, error, num_skipped=num_skipped, **style) from None
+    if '"' in text and len(frame) < sum(1 for line in io.StringIO(text) if line.strip()):
+        raise FormatError("a point per line", "a quoted cell over several lines", "remove the quote without a partner")
     return frame[columns].to_numpy(np.float64)
 
 

@@ -42,8 +42,8 @@ FORMATS: dict[str, Callable[..., Motion]] = {
     ".pkl": load_pkl,
     ".json": load_lidarhuman26m,
 }
-# files without motion in AMASS's folders
-_NO_MOTION = ("shape.npz", "stagei.npz")
+# files without motion in the folders of AMASS and SLOPER4D
+_NO_MOTION = ("shape.npz", "stagei.npz", "_labels_mask.pkl")
 
 
 def load_motion(
@@ -104,6 +104,9 @@ def _sources(folder: Path) -> list[Path]:
         sources += [file for file in files if file.suffix.lower() in FORMATS.keys() - {".json"}]
         if pose_files(directory):
             sources.append(directory)
+    # SLOPER4D's labels are refined from the recordings in the folder beside them
+    refined_folders = {source.parent / "mocap_data" for source in sources if source.name.endswith("_labels.pkl")}
+    sources = [source for source in sources if source.parent not in refined_folders]
     # on Windows, paths themselves are compared without case
     return sorted(sources, key=Path.as_posix)
 

@@ -157,11 +157,23 @@ def _load_sloper4d(path: str | os.PathLike, labels: Any, up: str | None, fps: fl
         if pose_and_trans is not None:
             rate = fps or _frame_rate(path, labels.get("framerate"), "framerate")
             name = f"{Path(path).stem}_{person.removesuffix('_person')}"
-            motions.append(motion_from_smpl(path, *pose_and_trans, name=name, fps=rate, up=up, kind="SLOPER4D"))
+            number = _frame_numbers(labels.get("frame_num"), len(pose_and_trans[0]))
+            about: dict[str, Any] = {"name": name, "fps": rate, "up": up, "kind": "SLOPER4D", "number": number}
+            motions.append(motion_from_smpl(path, *pose_and_trans, **about))
     if not motions:
         keys = ", ".join(map(str, labels)) or "nothing"
         raise file_error(path, f"expected second_person with pose (n, 72) and trans (n, 3), got {keys}")
     return join(motions, source=f"SLOPER4D: {path}")
+
+
+def _frame_numbers(labels: Any, count: int) -> np.ndarray | None:
+    """SLOPER4D's frame_num (F,) in units of its smallest step; None unless it has `count` rising numbers."""
+    try:
+        number = np.array(labels, float)
+    except (TypeError, ValueError):
+        return None
+    steps = np.diff(number) if number.shape == (count,) else np.zeros(1)
+    return number / steps.min() if len(steps) and (steps > 0).all() else None
 
 
 def load_pkl(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:

@@ -283,13 +283,18 @@ class SceneClouds:
         self, frame: int, person: np.ndarray, R_sensor_scan: np.ndarray, origin: np.ndarray | None = None
     ) -> dict[str, Any]:
         """The fields background and neighbors of the sample of a frame's person, points (n, 3) m, turned by
-        R_sensor_scan (3, 3) about the sensor at origin (3,) m, by default 0; empty if there is no scan."""
-        scan = self._others(frame, person)
-        if scan is None:
+        R_sensor_scan (3, 3) about the sensor at origin (3,) m, by default 0. Without a scan of the frame there are no
+        neighbors, without any scan no background."""
+        clouds = {"background": self._static, "neighbors": self._others(frame, person)}
+        if clouds["neighbors"] is None and not len(self._static):
             return {}
         origin = np.zeros(3) if origin is None else origin
-        person, scan, static_map = ((x - origin) @ R_sensor_scan.T for x in (person, scan, self._static))
-        return {"background": window_points(static_map, person), "neighbors": window_points(scan, person)}
+        person = (person - origin) @ R_sensor_scan.T
+        return {
+            name: window_points((cloud - origin) @ R_sensor_scan.T, person)
+            for name, cloud in clouds.items()
+            if cloud is not None
+        }
 
 
 def box_of_joints(joints: np.ndarray, id: str) -> Box:

@@ -320,7 +320,9 @@ def _groups_of_people(people: pd.DataFrame) -> Iterator[tuple[str, str, np.ndarr
         for column in (*OF_SCAN, "activity"):
             for name in sorted(set(people[column]) - {""}):
                 yield f"{column}{suffix}", name, mask & (people[column] == name).to_numpy()
-        yield f"kind{suffix}", "indoors", mask & people.kind.isin(INDOORS).to_numpy()
+        # the user's labels may have a kind of this name
+        if "indoors" not in set(people.kind):
+            yield f"kind{suffix}", "indoors", mask & people.kind.isin(INDOORS).to_numpy()
         for name in (name for name in CONDITIONS if name in people):
             yield f"condition{suffix}", name, mask & people[name].to_numpy(bool)
         for name, rows in aggregate.span_rows(people.distance.to_numpy(), aggregate.DISTANCE_EDGES).items():
