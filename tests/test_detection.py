@@ -106,7 +106,7 @@ def test_predict_of_file_equals_predict_with_detected_boxes(model, scene, file):
     np.testing.assert_array_equal(in_memory.to_numpy(), poses.to_numpy())
 
 
-def test_detect_ignores_duplicated_points(scene):
+def test_detect_ignores_duplicated_points(scene, monkeypatch):
     points, _ = scene
     rng = np.random.default_rng(0)
     copies = np.concatenate([points, points[rng.permutation(len(points))[: len(points) // 2]]])
@@ -118,6 +118,13 @@ def test_detect_ignores_duplicated_points(scene):
     poses, same = lidarpose.predict(points, boxes=boxes), lidarpose.predict(copies, boxes=boxes)
     np.testing.assert_allclose(same.to_numpy(), poses.to_numpy(), atol=1e-4)
     assert [person.num_points for person in same] == [person.num_points for person in poses]
+    # nor does which points a large scan is thinned to
+    monkeypatch.setattr(detection, "_MOST_AROUND", len(points) // 2)
+    thinned, of_copies = (
+        detection.detect_places(detection.Scan(points=cloud, origin=np.zeros(3)), detection.Search()).scan.points
+        for cloud in (points, copies)
+    )
+    np.testing.assert_array_equal(of_copies, thinned)
     # few copies are kept, and an empty scan stays empty
     few = np.concatenate([points, points[:5]])
     assert inputs.distinct(few) is few and len(inputs.distinct(np.zeros((0, 3)))) == 0
@@ -205,6 +212,25 @@ def test_given_up_axis_is_exact(scene, fake):
     searches = [FramePredictor(up=up)._search for up in ("z", None, "-y")]
     assert [search.exact_up for search in searches] == [True, False, False]
     assert not FramePredictor()._search.exact_up
+
+
+def test_tilted_scan_uses_places_of_earlier_frames(scene, monkeypatch):
+    """Its boxes are not reused, but people near tracks may have low scores."""
+    up, given = "0.342,0,0.94", []
+    monkeypatch.setattr(detection, "verified", lambda *of: given.append(of[6]) or verification.verified(*of))
+    scan = detection.Scan(points=scene[0] @ rotation_from_up(up), up=up, origin=np.zeros(3))
+    search = detection.search_options(None, None, None, None, None, None, None, up=up)
+    places = detection.detect_places(scan, search)
+    known = KnownPlaces(
+        boxes=[Box(center=(5, 0, 0), size=(1, 1, 2))],
+        pelvises=np.zeros((1, 3)),
+        tracks=np.array([[5.0, 0, 0], [0, 6, 0]]),
+        reach=np.ones(2),
+        rejected=np.zeros((0, 3)),
+    )
+    found = detection.verify_people(places, search, known)
+    assert given[0].boxes == [] and len(given[0].pelvises) == 0 and len(found.pelvises) == len(found.boxes) > 0
+    np.testing.assert_allclose(given[0].tracks, known.tracks @ rotation_from_up(up).T)
 
 
 @pytest.mark.long

@@ -6,6 +6,8 @@ from test_proposals import column, nearest, plane
 
 from lidarpose.models.detector import detector, proposals
 from lidarpose.models.detector.detector import SAME, Detector
+from lidarpose.models.detector.ground import estimate_ground
+from lidarpose.models.detector.map_ground import ground_under
 from lidarpose.synth.street import street
 
 ORIGIN = np.zeros(3)
@@ -159,6 +161,22 @@ def test_detector_columns_beyond_the_range_do_not_displace_others(points, monkey
     crowd = [column(-42 - 0.2 * k, 3.0 * k - 20, seed=k, count=900) for k in range(12)]
     detections = Detector(upright).detect(np.concatenate([points, *crowd]), ORIGIN)
     assert [nearest(detections.centers, *place) < 0.3 for place in ((5, 0), (5, 0.5), (-8, 3))] == [True] * 3
+
+
+@pytest.mark.parametrize("terrain", [lambda x: 3 * np.sin(2 * np.pi * x / 400), lambda x: 0.04 * x])
+def test_ground_under_map_follows_terrain(terrain):
+    """Also where nothing is observed, and farther from the middle than a scan reaches."""
+    rng = np.random.default_rng(0)
+    xy = np.stack([rng.uniform(-700, 700, 200_000), rng.uniform(-30, 30, 200_000)], 1)
+    xy = xy[np.sin(xy[:, 0] / 9) + np.sin(xy[:, 1] / 7) > -0.6]
+    points = np.column_stack([xy, terrain(xy[:, 0]) + rng.normal(0, 0.02, len(xy))])
+    places = np.stack([rng.uniform(-690, 690, 2000), rng.uniform(-25, 25, 2000)], 1)
+    error = np.abs(ground_under(points, None).at(places) - terrain(places[:, 0]))
+    assert error.mean() < 0.05 and error.max() < 0.6
+    # a scan's own ground, as before
+    near = points[np.abs(points[:, 0]) < 150]
+    np.testing.assert_array_equal(ground_under(near, None).heights, estimate_ground(near).heights)
+    assert ground_under(np.zeros((0, 3)), None) is None
 
 
 def test_detector_works_without_ground():

@@ -301,6 +301,14 @@ def test_candidates_accept_strays_and_flat_crops():
     assert len(candidates(np.array([[0.0, 0, 0], [1e8, 0, 0]]))) == 1
 
 
+def test_predict_counts_duplicates_once(model, points):
+    """As second returns are; invalid rows are counted as given."""
+    rows = np.concatenate([points[:60].repeat(2, 0), np.zeros((5, 3))])
+    pose, expected = model.predict(rows), model.predict(points[:60])
+    np.testing.assert_array_equal(pose.joints, expected.joints)
+    assert pose.num_points == 60 and any(line.startswith("dropped 5 ") for line in pose.warnings), pose.warnings
+
+
 def test_predict_thins_million_points_with_warning(model, points):
     rng = np.random.default_rng(0)
     cloud = points[rng.integers(len(points), size=1_000_000)] + rng.normal(0, 0.005, (1_000_000, 3))

@@ -797,6 +797,9 @@ def test_recording_page_contains_all_frames(drive, tmp_path):
     for shown, line in zip(scan["frames"], lines, strict=True):
         assert [pose["name"] for pose in shown["poses"]] == [str(person["track"]) for person in line["people"]]
         assert shown["label"].startswith(f"{line['time']:.2f} s")
+        # bones of unsure joints are drawn faintly
+        for pose, person in zip(shown["poses"], line["people"], strict=True):
+            assert pose["confidence"] == pytest.approx(person["confidence"] or [1] * len(pose["joints"]))
         joints = [np.array(pose["joints"]) for pose in shown["poses"]]
         for own in joints:
             points = np.reshape(shown["points"], (-1, 3))

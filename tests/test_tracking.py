@@ -172,6 +172,17 @@ def test_weak_boxes_continue_tracks_but_start_none():
     assert tracker.update(0.3, [person(0.32, score=0.9)], [person(0.3, score=0.2)]) == [0, -1]
 
 
+def test_weak_boxes_alone_continue_tracks_only_for_a_while():
+    """They may show something else that stands where a person was last seen."""
+    tracker = Tracker(max_gap=1.0)
+    for k in range(3):
+        assert tracker.update(0.1 * k, [person(0, score=0.9)]) == [0]
+    ids = [tracker.update(0.3 + 0.1 * k, [], [person(0, score=0.2)])[0] for k in range(20)]
+    # seen last at 0.2 s
+    assert ids == [0] * 14 + [-1] * 6 and not tracker.predicted(2.2)
+    assert tracker.update(2.3, [person(0, score=0.9)]) == [1]
+
+
 def test_tracker_matches_textbook_kalman_filter():
     rng, tracker = np.random.default_rng(2), Tracker()
     sd, speed, change = np.diag(POSITION_SD**2), SPEED_SD**2, SPEED_CHANGE**2

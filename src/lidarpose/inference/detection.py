@@ -23,6 +23,7 @@ from lidarpose.inference.scan import Scan
 from lidarpose.inference.verification import rounded, verified
 from lidarpose.models.detector.detector import MAX_RANGE, Detections, Detector
 from lidarpose.models.detector.ground import estimate_up
+from lidarpose.models.detector.map_ground import MOST_EXTENT
 from lidarpose.sample import FARTHEST, MIN_POINTS, Box
 
 # maximum number of detections that are verified and posed
@@ -31,6 +32,8 @@ MOST_POSED = 60
 # than `_BEYOND` m beyond the range are dropped first. Points processed per chunk, and bins of the distance histogram
 _MOST_POINTS, _MOST_AROUND, _BEYOND = 1_500_000, 400_000, 15.0
 _CHUNK, _DISTANCES = 1_000_000, 4096
+# maximum number of points of which duplicates are removed before they are thinned
+_MOST_SORTED = 4_000_000
 # number of points used to estimate the up direction
 _ENOUGH_FOR_UP = 250_000
 # minimum fraction of a scan's points on its background; below it, the background belongs to another sensor or frame
@@ -120,6 +123,9 @@ class DetectedScan:
 def detect_places(scan: Scan, search: Search) -> DetectedScan:
     """The first half of `find_people`, which does not depend on other frames of a recording."""
     full_scan, count = scan, len(scan.points)
+    if _MOST_AROUND < count <= _MOST_SORTED:
+        # before the points are thinned: copies are kept or dropped together
+        scan = replace(scan, points=distinct(scan.points))
     input_scan, notes = _thinned(scan, search)
     input_scan = replace(input_scan, points=distinct(input_scan.points))
     scan, warnings = input_scan, [*scan.warnings, *notes]
@@ -157,6 +163,11 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
     far_warning = None if origin is None or frame_warning else _far_from_most(full_scan, scan, search)
     if far_warning is not None:
         warnings.append(far_warning)
+    if origin is None and np.ptp(level[:, :2], axis=0).max() > MOST_EXTENT:
+        warnings.append(
+            f"the scan extends over more than {MOST_EXTENT / 1e3:.0f} km, beyond which people are hardly found: give "
+            "parts of it"
+        )
     if origin is None and search.max_range != MAX_RANGE:
         warnings.append("the sensor position is unknown, so max_range (--range) is not applied")
     is_moving = None
@@ -218,10 +229,11 @@ def verify_people(places: DetectedScan, search: Search, known: KnownPlaces | Non
     scan, input_scan, detections = places.scan, places.given, places.detections
     if detections is None:
         return replace(scan, boxes=[], detected_rows=[])
-    # boxes of a tilted scan are larger than the people in them and cannot be reused, so people are detected again
-    is_tilted = not np.allclose(input_scan.R_boxes_input, scan.R_level_input)
+    if known is not None and not np.allclose(input_scan.R_boxes_input, scan.R_level_input):
+        # boxes of a tilted scan are larger than the people in them and cannot be reused, so people are detected again
+        known = replace(known, boxes=[], pelvises=np.zeros((0, 3)))
     origin = scan.level_origin
-    known_level = None if known is None or is_tilted else known.level(scan.R_level_input)
+    known_level = None if known is None else known.level(scan.R_level_input)
     detector = search.detector or _detector()
     detect_beside = partial(detector.detect_beside, places.level, origin, detections.ground, moving=places.moving)
     people = verified(

@@ -28,6 +28,7 @@ from lidarpose.inference.inputs import (
     as_points,
     clean,
     clip_times,
+    distinct,
     is_few,
     is_many,
     only_returns,
@@ -397,13 +398,16 @@ class Predictor(PoseEstimator):
         return Poses(people=people, skeleton=target_skeleton, model=self.model)
 
     def _predict_clouds(self, clouds, origin, skeleton, progress, clips) -> Poses:
-        """Poses of clouds given by the user, with a warning for each cloud with rounded coordinates. People cropped
-        from a scan get no such warning; their scan does."""
-        poses = self.predict_in(clouds, origin, skeleton, progress, clips=clips)
+        """Poses of clouds given by the user, without duplicate points, and with a warning for each cloud with rounded
+        coordinates. Of people cropped from a scan, these belong to the scan."""
+        cleaned_clouds = [clean(cloud) for cloud in clouds]
+        distinct_clouds = [points if is_few(points) else distinct(points) for points, _ in cleaned_clouds]
+        poses = self.predict_in(distinct_clouds, origin, skeleton, progress, clips=clips)
         people = list(poses)
-        for i, cloud in enumerate(clouds):
+        for i, (cloud, (_, notes)) in enumerate(zip(clouds, cleaned_clouds, strict=True)):
             if warning := rounding_warning(cloud[within_reach(cloud)]):
-                people[i] = replace(people[i], warnings=(warning, *people[i].warnings))
+                notes.insert(0, warning)
+            people[i] = replace(people[i], warnings=(*notes, *people[i].warnings))
         return replace(poses, people=tuple(people))
 
     def _best(

@@ -7,10 +7,10 @@ import numpy as np
 
 from lidarpose.errors import counted
 from lidarpose.geometry import UP_AXES, axes_from_above, rotation_from_up, rotation_of_boxes
-from lidarpose.sample import Box, Pose, person_note
+from lidarpose.sample import Box, person_note
 from lidarpose.viz.bird_eye import LONGEST_NAME, ScanPanel
 from lidarpose.viz.draw import shortened
-from lidarpose.viz.person_view import Panel
+from lidarpose.viz.person_view import Panel, joined_poses
 
 if TYPE_CHECKING:
     from lidarpose.inference.results import PersonPose, Poses
@@ -57,7 +57,7 @@ def _from_above(poses: "Poses", people: "list[PersonPose]") -> ScanPanel:
             for person in poses.people
             if (box := person.box) is not None
         ],
-        poses=Pose(joints=np.stack([person.joints for person in posed]), skeleton=poses.skeleton) if posed else None,
+        poses=joined_poses([(person.joints, person.confidence) for person in posed], poses.skeleton),
         names=[shortened(str(person.id), LONGEST_NAME) for person in posed],
         label=label,
         sensor=None if poses.origin is None else tuple((R_level_input @ poses.origin)[:2].tolist()),

@@ -11,10 +11,10 @@ from lidarpose.geometry import transform_points
 from lidarpose.io.sources import Frame, FrameSource
 from lidarpose.recording.coordinates import FixedFrame
 from lidarpose.recording.picture import in_fixed_frame, nearest_points
-from lidarpose.sample import Pose
 from lidarpose.skeleton import Skeleton
 from lidarpose.viz.bird_eye import ScanPanel
 from lidarpose.viz.html import render_report
+from lidarpose.viz.person_view import joined_poses
 
 # maximum number of frames shown, and of points per person and frame
 _MOST_FRAMES, _PERSON_POINTS = 300, 200
@@ -116,12 +116,11 @@ class RecordingPage:
         self, about: dict[str, Any], points: np.ndarray, people: list[dict[str, Any]], skeleton: Skeleton
     ) -> ScanPanel:
         posed = [person for person in people if person["joints"] is not None]
-        joints = np.stack([person["joints"] for person in posed]) if posed else None
         time = f"frame {about['frame']}" if about["time"] is None else f"{about['time'] - self._start():.2f} s"
         return ScanPanel(
             points=points,
             boxes=[person["box"] for person in people if person["box"] is not None],
-            poses=None if joints is None else Pose(joints=joints, skeleton=skeleton),
+            poses=joined_poses([(person["joints"], person["confidence"]) for person in posed], skeleton),
             names=[str(person["id"] if person["track"] is None else person["track"]) for person in posed],
             label=f"{time}, {counted(len(people), 'person', 'people')}",
         )

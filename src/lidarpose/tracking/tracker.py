@@ -36,6 +36,8 @@ _REPEATED = 0.5
 _SMOOTHING = 0.5
 # a track seen only once, with a score below _SURE, is dropped after _UNSURE_GAP s
 _SURE, _UNSURE_GAP = 0.6, 0.6
+# maximum time that weak boxes alone continue a track, as a multiple of `max_gap`: what they show may be something else
+_MOST_WEAK = 1.5
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -56,8 +58,8 @@ class TrackState:
 @dataclass(kw_only=True, eq=False)
 class _Tracks:
     """All tracks: id (N,), -1 without an id yet; state (N, 3, 2): position m and velocity m/s along x, y, z; covariance
-    (N, 3, 2, 2); heading (N, 2): mean of cos and sin of yaw; size (N, 3) m; age (N,) s since last seen; sightings (N,);
-    sure (N,) bool: seen twice, or with a high score."""
+    (N, 3, 2, 2); heading (N, 2): mean of cos and sin of yaw; size (N, 3) m; age (N,) s since last seen, weak_age (N,) s
+    since last seen in a box that is not weak; sightings (N,); sure (N,) bool: seen twice, or with a high score."""
 
     id: np.ndarray
     state: np.ndarray
@@ -65,6 +67,7 @@ class _Tracks:
     heading: np.ndarray
     size: np.ndarray
     age: np.ndarray
+    weak_age: np.ndarray
     sightings: np.ndarray
     sure: np.ndarray
 
@@ -91,7 +94,7 @@ class _Tracks:
         later_tracks = self.take(np.arange(len(self)))
         later_tracks.state = self.state @ transition.T
         later_tracks.covariance = transition @ self.covariance @ transition.T + noise * SPEED_CHANGE[:, None, None] ** 2
-        later_tracks.age = self.age + seconds
+        later_tracks.age, later_tracks.weak_age = self.age + seconds, self.weak_age + seconds
         return later_tracks
 
 
@@ -124,7 +127,8 @@ class Tracker:
             time: s, from any origin. A time earlier than the last one is counted in `jumps_back`; if it is earlier by
                 more than `max_gap`, all tracks are dropped.
             boxes: of all people that are seen.
-            weak_boxes: detections of low score: they continue tracks but do not start any.
+            weak_boxes: detections of low score: they continue tracks, alone for at most 1.5 times `max_gap`, but do not
+                start any.
 
         Returns:
             The track id of each of `boxes`: a known person's, or the next new one, from 0; ids are never reused. Then
@@ -142,6 +146,7 @@ class Tracker:
         detections, is_weak = detections.take(kept_rows), is_weak[kept_rows]
         rows, columns = assign(_costs(tracks, detections))
         _correct(tracks, rows, detections, columns)
+        tracks.weak_age[rows[~is_weak[columns]]] = 0
         new_rows = np.setdiff1d(np.arange(len(detections)), columns)
         track_rows = np.empty(len(detections), int)
         track_rows[columns], track_rows[new_rows] = rows, len(tracks) + np.arange(len(new_rows))
@@ -161,7 +166,7 @@ class Tracker:
         if seconds > self.max_gap:
             return []
         tracks = self._tracks.after(seconds)
-        tracks = tracks.take((tracks.age <= self.max_gap) & tracks.is_expected)
+        tracks = tracks.take((tracks.age <= self.max_gap) & self._is_supported(tracks) & tracks.is_expected)
         deviations = np.sqrt(tracks.covariance[:, :2, 0, 0].max(1))
         return [
             TrackState(
@@ -226,7 +231,11 @@ class Tracker:
         tracks = self._tracks.after(max(seconds, 0.0))
         # at low frame rates, a track seen in the previous frame is kept for this one
         gap = np.where(tracks.is_expected, self.max_gap, min(self.max_gap, max(_UNSURE_GAP, seconds)))
-        return tracks.take(tracks.age <= gap)
+        return tracks.take((tracks.age <= gap) & self._is_supported(tracks))
+
+    def _is_supported(self, tracks: _Tracks) -> np.ndarray:
+        """(N,) bool: tracks that have not been continued by weak boxes alone for too long."""
+        return tracks.weak_age <= _MOST_WEAK * self.max_gap
 
 
 def _checked(boxes: Iterable[Box]) -> list[Box]:
@@ -253,6 +262,7 @@ def _of_boxes(boxes: Sequence[Box]) -> _Tracks:
         heading=np.stack([np.cos(yaw), np.sin(yaw)], 1),
         size=np.reshape([box.size for box in boxes], (-1, 3)).astype(float),
         age=np.zeros(count),
+        weak_age=np.zeros(count),
         sightings=np.ones(count, int),
         sure=scores >= _SURE,
     )

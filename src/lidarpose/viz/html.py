@@ -137,7 +137,8 @@ def _frame_data(panel: ScanPanel, points: np.ndarray, center: np.ndarray) -> dic
     entries = []
     if panel.poses is not None:
         for k, joints in enumerate(panel.poses.joints):
-            data = _pose_data(Pose(joints=joints, skeleton=panel.poses.skeleton), center)
+            confidence = None if panel.poses.confidence is None else panel.poses.confidence[k]
+            data = _pose_data(Pose(joints=joints, skeleton=panel.poses.skeleton, confidence=confidence), center)
             if data is not None:
                 entries.append(data | ({"name": panel.names[k]} if panel.names else {}))
     return {"points": _millimeters(points, center), "poses": entries}

@@ -1,7 +1,8 @@
 """A person to draw, and helpers shared by pictures and reports: facing, views, sides, captions."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeGuard
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -104,6 +105,15 @@ def box_edges(box: Box) -> np.ndarray:
     corner = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * box.size / 2
     corner = corner @ rotation_about("z", box.yaw).T + box.center
     return np.array([corner[[i, i | bit]] for i in range(8) for bit in (1, 2, 4) if not i & bit])
+
+
+def joined_poses(people: Sequence[tuple[np.ndarray, Any]], skeleton: Skeleton) -> Pose | None:
+    """The poses of people in one, from joints (J, 3) m and confidence (J,), which may be None or empty, of each; None
+    without people."""
+    if not people:
+        return None
+    confidence = np.stack([values if values is not None and len(values) else np.ones(len(j)) for j, values in people])
+    return Pose(joints=np.stack([joints for joints, _ in people]), skeleton=skeleton, confidence=confidence)
 
 
 def confidences(pose: Pose) -> np.ndarray:

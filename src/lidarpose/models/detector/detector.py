@@ -14,7 +14,8 @@ from lidarpose.models import weights_file
 from lidarpose.models.decode import sigmoid
 from lidarpose.models.detector.candidates import CHUNK, SceneIndex, suppress_near
 from lidarpose.models.detector.detector_config import INPUTS, OUTPUT, DetectorConfig
-from lidarpose.models.detector.ground import Ground, estimate_ground, without_ground
+from lidarpose.models.detector.ground import Ground, without_ground
+from lidarpose.models.detector.map_ground import ground_under
 from lidarpose.models.detector.proposals import heights_above, propose
 from lidarpose.models.detector.range_image import SIDE, SLICES
 from lidarpose.models.detector.render import render
@@ -122,7 +123,7 @@ class Detector:
             columns = [values[rows] for values in columns]
         # each axis contiguous in memory, since every step reads one axis at a time
         points = np.ascontiguousarray(columns).T
-        ground = estimate_ground(points, origin)
+        ground = ground_under(points, origin)
         has_ground = ground is not None
         ground = ground or without_ground(points, origin)
         heights = heights_above(points, ground)

@@ -141,12 +141,12 @@ def estimate_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Gro
     if is_floor.sum() < max(_LEAST_CELLS, _LEAST_SHARE * is_seen.sum()):
         return None
     residual = np.where(is_floor, residual, np.nan)
-    surface = _fill(residual)
+    surface = fill_holes(residual)
     # nothing can stand below the ground: for example a person's feet where no ground is visible
     depth = surface - (floors.heights - height)
     is_lower = ~is_floor & (depth > _LEAST_DEPTH) & (depth < _MOST_DEPTH) & (floors.counts >= _SOLID)
     if is_lower.any():
-        surface = _fill(np.where(is_lower, floors.heights - height, residual))
+        surface = fill_holes(np.where(is_lower, floors.heights - height, residual))
     heights = surface + (slope[0] * x + slope[1] * y + height)
     return Ground(corner=floors.corner, heights=heights.astype(np.float32))
 
@@ -159,7 +159,7 @@ def without_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Grou
     heights = np.where(np.isnan(floors.heights), np.inf, floors.heights)
     heights = _spread_minimum(heights, 0.0, 2)
     median = np.median(heights[np.isfinite(heights)])
-    heights = _fill(np.where(np.isfinite(heights), heights - median, np.nan)) + median
+    heights = fill_holes(np.where(np.isfinite(heights), heights - median, np.nan)) + median
     return Ground(corner=floors.corner, heights=heights.astype(np.float32))
 
 
@@ -355,7 +355,7 @@ def _spread_minimum(heights: np.ndarray, rise: float, reach: int) -> np.ndarray:
     return lowest
 
 
-def _fill(heights: np.ndarray) -> np.ndarray:
+def fill_holes(heights: np.ndarray) -> np.ndarray:
     """Heights (X, Y) with NaN filled by means of ever larger squares, in which 0 counts as `_PLANE_WEIGHT` cells."""
     is_known = np.isfinite(heights)
     values, weight = np.where(is_known, heights, 0.0), is_known.astype(float)
