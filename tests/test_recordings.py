@@ -515,14 +515,21 @@ def test_known_people_are_not_verified_again(clouds, model, monkeypatch):
     assert all(line == scores[-1] for line in scores[2:])
 
 
-def test_people_without_hips_are_posed_as_if_untracked(clouds, model):
-    """Their joints do not tell where the pelvis is, on which the network is centered."""
+@pytest.mark.parametrize("name", ["waymo14", "ankles"])
+def test_tracked_joints_do_not_depend_on_skeleton(name, clouds, model):
+    """Known people are centered on the network's pelvis, which skeletons may lack."""
     ankles = lidarpose.Skeleton(name="ankles", joints=("left_ankle", "right_ankle"), parents=(-1, 0))
-    predict = partial(lidarpose.predict_recording, model=model, skeleton=ankles)
-    frames = (predict(moving_source(clouds[:4]), track=is_tracked) for is_tracked in (True, False))
-    for tracked, alone in zip(*frames, strict=True):
-        assert tracked.error is None and sorted(person.id for person in tracked.poses) == [0, 1]
-        np.testing.assert_array_equal(tracked.poses.to_numpy(), alone.poses.to_numpy())
+    frames = [
+        lidarpose.predict_recording(moving_source(clouds[:4]), model=model, track=True, skeleton=skeleton)
+        for skeleton in (ankles if name == "ankles" else name, None)
+    ]
+    for own, default in zip(*frames, strict=True):
+        assert own.error is None and sorted(person.id for person in own.poses) == [0, 1]
+        for person, expected in zip(own.poses, default.poses, strict=True):
+            for joint in ("left_ankle", "right_ankle"):
+                np.testing.assert_array_equal(
+                    person.joints[person.skeleton.index(joint)], expected.joints[expected.skeleton.index(joint)]
+                )
 
 
 def test_folder_of_crops_gives_one_track(clouds, folder, model):

@@ -55,6 +55,10 @@ class PoseEstimator:
         self.uses_box_centers = self._averaged
         self._middle = list(self.skeleton.middle)
 
+    def _pelvis_of(self, pose: Pose) -> np.ndarray:
+        """(..., 3) m: the pelvis of poses of the network, or the middle of the hips if its skeleton has none."""
+        return pose.joints[..., self._middle, :].mean(-2)
+
     def outputs(
         self,
         clouds: list[np.ndarray],
@@ -147,7 +151,7 @@ class PoseEstimator:
             first_passes = [self._transformed(self._first, clouds, centers, origin, clip)]
             if box_centers is not None and self._averaged and first_passes[0].confidence is not None:
                 centers, first_passes = self._passes_about_boxes(clouds, centers, box_centers, origin, first_passes[0])
-            root = first_passes[0].joints[:, self._middle].mean(1)
+            root = self._pelvis_of(first_passes[0])
             # NaN stays NaN
             shift = np.round(np.clip(root, -WINDOW / 2, WINDOW / 2) / _CENTER_STEP) * _CENTER_STEP
             centers = centers + shift
@@ -179,7 +183,7 @@ class PoseEstimator:
             The centers (B, 3), and the poses about them: the first passes, in which the repeated pass replaces one that
             posed another person, and the repeated passes that agree, with confidence 0 where there is none.
         """
-        confidence, pelvis = _mean_confidence(first_pass), centers + first_pass.joints[:, self._middle].mean(1)
+        confidence, pelvis = _mean_confidence(first_pass), centers + self._pelvis_of(first_pass)
         shows_two = _shows_two(first_pass)
         distance = np.hypot(*(pelvis - box_centers)[:, :2].T)
         rows = np.flatnonzero(shows_two | (distance > _SAME_PERSON) | (confidence < _SURE))
@@ -187,7 +191,7 @@ class PoseEstimator:
             return centers, [first_pass]
         new_centers = np.round(box_centers[rows], _CENTER_DECIMALS)
         repeated = self._transformed(self._first, [clouds[row] for row in rows], new_centers, origin, None)
-        new_confidence, new_pelvis = _mean_confidence(repeated), new_centers + repeated.joints[:, self._middle].mean(1)
+        new_confidence, new_pelvis = _mean_confidence(repeated), new_centers + self._pelvis_of(repeated)
         is_apart = np.linalg.norm(new_pelvis - pelvis[rows], axis=1) > _SAME_PERSON
         # beside another person a correct pose may be less certain than that of the other
         required = np.where(_shows_two(repeated), _LESS_SURE, 1.0) * confidence[rows]

@@ -391,9 +391,17 @@ class Predictor(PoseEstimator):
         if len(flipped_warnings) >= least:
             for i, warning in flipped_warnings.items():
                 cleaned_clouds[i][1].append(warning)
+        own_pelvises = {i: self._pelvis_of(pose) for i, (pose, _) in best_poses.items()}
         people = tuple(
-            PersonPose(pose=pose, skeleton=target_skeleton, points=points, warnings=tuple(notes), model=self.model)
-            for pose, (points, notes) in zip(poses, cleaned_clouds, strict=True)
+            PersonPose(
+                pose=poses[i],
+                skeleton=target_skeleton,
+                points=points,
+                warnings=tuple(notes),
+                model=self.model,
+                pelvis=own_pelvises.get(i),
+            )
+            for i, (points, notes) in enumerate(cleaned_clouds)
         )
         return Poses(people=people, skeleton=target_skeleton, model=self.model)
 

@@ -50,6 +50,8 @@ class PersonPose:
         up: up axis of the input frame, used for drawing.
         stored_points: number of points of the crop if `points` does not hold them, see `read_poses`.
         velocity: (3,) m/s of a tracked person over ground, along the axes of the input frame; None if unknown.
+        pelvis: (3,) m, the pelvis that the network predicts, which `skeleton` may lack; None without a pose and for
+            people read from files.
     """
 
     pose: Pose | None
@@ -62,6 +64,7 @@ class PersonPose:
     up: str = "z"
     stored_points: int | None = None
     velocity: np.ndarray | None = None
+    pelvis: np.ndarray | None = None
 
     @property
     def has_pose(self) -> bool:

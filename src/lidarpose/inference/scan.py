@@ -181,6 +181,7 @@ def _named(people: Sequence[PersonPose], boxes: list[Box] | None) -> tuple[Perso
 def _in_input(person: PersonPose, scan: Scan) -> PersonPose:
     R_level_input = scan.R_level_input
     pose = person.pose and replace(person.pose, joints=person.pose.joints @ R_level_input)
+    pelvis = None if person.pelvis is None else person.pelvis @ R_level_input
     # a box taken out of the result keeps the up axis
     box = person.box and person.box.with_up(scan.up)
-    return replace(person, pose=pose, box=box, points=person.points @ R_level_input, up=scan.up)
+    return replace(person, pose=pose, pelvis=pelvis, box=box, points=person.points @ R_level_input, up=scan.up)

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from lidarpose.errors import InputError
 from lidarpose.geometry import inverse_transform, transform_points
 from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.results import PersonPose, Poses
@@ -108,7 +107,7 @@ class KnownPeople:
             self._rejected = np.concatenate([self._rejected, np.insert(places, 3, time, axis=1)])
         # detected and given people all have boxes
         sensor_boxes = [cast(Box, person.box) for person in poses]
-        pelvises = [_pelvis(person.pose) for person in poses]
+        pelvises = [person.pelvis for person in poses]
         is_verified = np.zeros(len(sensor_boxes), bool) if scan.verified is None else scan.verified
         if scan.verified is not None and scan.pelvises is not None:
             # the box of a known person, which is only expected, is moved with the predicted pelvis
@@ -193,12 +192,3 @@ def _trusted(number: Any) -> Any:
     cm."""
     shortest, longest = _TRUSTED
     return shortest + (longest - shortest) * (number % 5) / 4
-
-
-def _pelvis(pose: Pose | None) -> np.ndarray | None:
-    """The pelvis (3,) m, or the midpoint of the hips if the skeleton has no pelvis; None without a pose or these
-    joints, so that the person is verified and posed anew in each frame."""
-    try:
-        return None if pose is None else pose.joints[list(pose.skeleton.middle)].mean(0)
-    except InputError:
-        return None
