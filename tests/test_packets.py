@@ -278,6 +278,14 @@ def test_ouster_skips_packets_of_other_sensors(tmp_path):
     assert "from the sensor 5" in source.warnings[0] and "123456789" in source.warnings[0]
 
 
+def test_ouster_reads_sensor_of_metadata_of_two_on_one_port(tmp_path):
+    mine, other = packets_of([0, 1]), packets_of([5, 6], serial=5)
+    ips = [ip for a, b in zip(mine, other, strict=True) for ip in (*ip4(b, source=bytes([10, 0, 0, 9])), *ip4(a))]
+    source = ouster(tmp_path / "a.pcap", ips)
+    assert np.allclose(decoded(list(source)[1]), expected_points(ranges_of(1)), rtol=0, atol=1e-9)
+    assert source.warnings == ("8 lidar packets of another sensor are left out",)
+
+
 def test_ouster_column_window_expects_only_its_columns(tmp_path):
     for window, firsts in (((8, 20), (8, 16)), ((26, 9), (24, 0, 8))):
         data = metadata()

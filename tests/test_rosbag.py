@@ -82,8 +82,9 @@ def transform(stamp, parent, child, translation, yaw=0.0, store=ROS2):
     return types[TF](transforms=[stamped])
 
 
-def write(path, messages, *, compression=None):
-    """Writes (topic, message, ns); the suffix selects the container. Returns the path to open."""
+def write(path, messages, *, compression=None, empty=()):
+    """Writes (topic, message, ns); the suffix selects the container; empty: topics of clouds without messages. Returns
+    the path to open."""
     store = ROS1 if path.suffix == ".bag" else ROS2
     if path.suffix == ".bag":
         writer = Writer1(path)
@@ -98,6 +99,8 @@ def write(path, messages, *, compression=None):
             writer.set_compression(mode, CompressionFormat.ZSTD)
     connections = {}
     with writer:
+        for topic in empty:
+            writer.add_connection(topic, CLOUD, typestore=store)
         for topic, message, time in messages:
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=store)
@@ -366,6 +369,48 @@ def test_ouster_packets_of_messages_become_frames(tmp_path, suffix):
     assert np.array_equal(first.points, frames[0].points)
     with pytest.raises(InputError, match="expected lidar packets of"):
         open_source(path, topic="/ouster/imu_packets")
+
+
+def test_two_ouster_sensors_are_decoded_with_their_own_metadata(tmp_path):
+    left = ouster_messages(ROS2, text=json.dumps(metadata()))
+    right = ouster_messages(
+        ROS2, text=json.dumps(metadata(beam_azimuth_angles=[90.0] * len(metadata()["beam_azimuth_angles"])))
+    )
+    messages = [
+        (topic.replace("/ouster", f"/{name}"), content, time)
+        for name, sensor in (("left", left), ("right", right))
+        for topic, content, time in sensor
+    ]
+    path = write(tmp_path / "two.mcap", messages)
+    source = open_source(path)
+    for frame, number in zip(source, (7, 8), strict=True):
+        np.testing.assert_allclose(decoded(frame), expected_points(ranges_of(number)), atol=1e-9)
+    assert any("read the sensor /left, not /right: give the topic" in line for line in source.warnings)
+    named, other = (list(open_source(path, topic=f"/{name}/lidar_packets"))[0].points for name in ("left", "right"))
+    assert np.array_equal(named, list(source)[0].points) and not np.allclose(named, other)
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".db3"])
+def test_topic_without_clouds_does_not_hide_packets(tmp_path, suffix):
+    messages = ouster_messages(store_of(suffix), text=json.dumps(metadata()))
+    path = write(tmp_path / f"walk{suffix}", messages, empty=("/costmap",))
+    assert len(list(open_source(path))) == 2
+
+
+def test_transforms_of_other_times_are_named(tmp_path):
+    """As of a sensor whose clock counts from its start."""
+    moves = [("/tf", transform(START + k * 10**8, "map", "lidar", (k, 0, 0)), START + k * 10**8) for k in range(6)]
+    own = [("/p", cloud(points_of(k), stamp=50 * 10**9 + k * 10**8), START + k * 10**8) for k in range(6)]
+    source = open_source(write(tmp_path / "a.mcap", sorted([*moves, *own], key=lambda message: message[2])))
+    assert [frame.T_world_sensor for frame in source] == [None] * 6
+    assert source.warnings == ("no cloud has a sensor pose: the transforms to map are of other times than the clouds",)
+
+
+def test_folder_of_scans_may_have_metadata_yaml(tmp_path):
+    (tmp_path / "metadata.yaml").write_text("sensor: OS1")
+    for name in "ab":
+        np.save(tmp_path / f"{name}.npy", points_of(1))
+    assert len(list(open_source(tmp_path, rate=10))) == 2
 
 
 def test_invalid_returns_are_dropped_with_their_rings(tmp_path):

@@ -146,8 +146,11 @@ def _are_parts(paths: Sequence[Path]) -> bool:
 
 
 def _open_folder(folder: Path, options: ReadingOptions) -> Recording:
-    # rosbag2 writes metadata.yaml
-    if any(path.name == "metadata.yaml" for path in list_folder(folder)):
+    # rosbag2 writes metadata.yaml, but a folder of scans may have a file of this name, too
+    entries = list_folder(folder)
+    suffixes = {path.suffix.lower() for path in entries}
+    is_bag = any(_READERS.get(suffix) == "rosbag" for suffix in suffixes) or not suffixes & set(SUFFIXES)
+    if is_bag and any(path.name == "metadata.yaml" for path in entries):
         return _open_recording(folder, options, "rosbag")
     dataset = open_kitti(folder, options) or open_nuscenes(folder, options)
     if dataset is not None:

@@ -210,18 +210,21 @@ class OusterRecording(PacketRecording):
         self._serial: int | None = None
 
     def _find_flow(self) -> tuple[bytes, int]:
-        """The flow whose packets are read: the one to the port in the metadata, else the first with lidar packets."""
+        """The flow whose packets are read: best of the sensor and to the port that the metadata states, else of the
+        sensor, else to the port, else the first with lidar packets."""
         sizes: Counter[int] = Counter()
-        flow = None
+        flow, best = None, -1
         # a capture that is cut off raises InputError at its end
         with suppress(InputError):
             for k, datagram in enumerate(self.capture):
                 sizes[len(datagram.payload)] += 1
                 if len(datagram.payload) == self.packet_bytes:
-                    flow = flow or datagram.flow
-                    if datagram.flow[1] == self.format.port:
-                        return datagram.flow
-                if flow and (k >= _NUM_PEEKED or not self.format.port):
+                    serial = self.format.header(datagram.payload)[1]
+                    is_own = serial is None or not self.format.serial or str(serial) == str(self.format.serial)
+                    match = 2 * is_own + (datagram.flow[1] == self.format.port or not self.format.port)
+                    if match > best:
+                        flow, best = datagram.flow, match
+                if best == 3 or flow and k >= _NUM_PEEKED:
                     break
         if flow is None:
             size = f"lidar packets of {self.packet_bytes} bytes"

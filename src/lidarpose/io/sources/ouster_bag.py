@@ -1,5 +1,6 @@
 """Packets of Ouster sensors in ROS recordings."""
 
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -15,29 +16,51 @@ from lidarpose.io.sources.ros_messages import FRAME_TYPES, TEXT_TYPES, decoders
 
 def open_packets(name: str, files: list[RecordFile | SqliteFile], options: ReadingOptions) -> Recording | None:
     """The packets of an Ouster sensor as a recording; None if there are none, or clouds instead. The metadata is the
-    file `meta`, else the last text in a topic whose name ends in "metadata"."""
+    file `meta`, else the last text in a topic whose name ends in "metadata", if possible beside the packets' topic."""
     topics = {key: entry for file in files for key, entry in file.topics.items() if entry.encoding in decoders()}
-    has_clouds = any(entry.type in FRAME_TYPES for entry in topics.values())
+    counts = Counter({key: sum(file.topics[key].count for file in files if key in file.topics) for key in topics})
     packet_topics = {key for key, entry in topics.items() if entry.type in ouster.PACKET_TYPES}
+    # recorders store topics without messages, too; in a damaged file, all counts may be 0
+    has_packets = any(counts[key] for key in packet_topics)
+    has_clouds = any(entry.type in FRAME_TYPES and (counts[key] or not has_packets) for key, entry in topics.items())
     if options.topic is not None or has_clouds:
         packet_topics &= {options.topic}
     if not packet_topics:
         return None
-    datagrams = MessageDatagrams(files, {key: topics[key].encoding for key in packet_topics})
     if options.meta is not None:
+        datagrams = MessageDatagrams(files, {key: topics[key].encoding for key in packet_topics})
         return ouster.OusterRecording(Path(name), options.meta, datagrams=datagrams)
     text_topics = {key for key, entry in topics.items() if entry.type in TEXT_TYPES and key.endswith("metadata")}
-    texts = []
+    # by topic
+    texts: dict[str, str] = {}
     with suppress(InputError):
         for message in all_messages(files, text_topics):
             # a damaged text is no metadata
             with suppress(Exception):
                 decode = decoders()[topics[message.topic].encoding]
-                texts.append(decode(unpacked_message(message.data), TEXT_TYPES[0]).data)
+                texts[message.topic] = decode(unpacked_message(message.data), TEXT_TYPES[0]).data
     if not texts:
         problem = "has packets of an Ouster sensor, but no topic with its metadata"
         raise file_error(name, f"{problem}: give the sensor's JSON file (--meta)")
-    return ouster.OusterRecording(Path(name), Path(name), content=texts[-1], datagrams=datagrams)
+    notes = []
+    own_texts = {_namespace(key): text for key, text in texts.items()}
+    if namespaces := sorted({_namespace(key) for key in packet_topics} & set(own_texts)):
+        content = own_texts[namespaces[0]]
+        packet_topics = {key for key in packet_topics if _namespace(key) == namespaces[0]}
+        if len(namespaces) > 1:
+            others = ", ".join(namespaces[1:])
+            notes = [f"read the sensor {namespaces[0]}, not {others}: give the topic of its packets to read another"]
+    else:
+        content = list(texts.values())[-1]
+    datagrams = MessageDatagrams(files, {key: topics[key].encoding for key in packet_topics})
+    recording = ouster.OusterRecording(Path(name), Path(name), content=content, datagrams=datagrams)
+    recording.notes += notes
+    return recording
+
+
+def _namespace(topic: str) -> str:
+    """A topic without its last part, in which a driver's topics of one sensor agree."""
+    return topic.rpartition("/")[0]
 
 
 class MessageDatagrams:

@@ -110,6 +110,8 @@ class BagRecording:
         self._world: str | None = None
         self._has_stamps = True
         self._num_frames = self._num_posed = 0
+        # world frames that transforms connect with the clouds' frame at some time, if no cloud has a pose
+        self._linked_worlds: list[str] = []
         self._damage: InputError | None = None
 
     def _choose(self, topic: str | None) -> str:
@@ -146,6 +148,9 @@ class BagRecording:
         if 0 < self._num_posed < self._num_frames:
             unposed_clouds = f"{self._num_frames - self._num_posed} of {self._num_frames} clouds"
             lines.append(f"{unposed_clouds} have no sensor pose in the frame {self._world}")
+        elif self._num_frames and not self._num_posed and self._linked_worlds:
+            problem = f"the transforms to {' and '.join(self._linked_worlds)} are of other times than the clouds"
+            lines.append(f"no cloud has a sensor pose: {problem}")
         for file in self.files:
             if file.num_damaged:
                 lines.append(f"{file.path.name}: {file.num_damaged} chunks are left out: one {file.damage}")
@@ -207,6 +212,8 @@ class BagRecording:
             available_worlds = [world for world in _WORLDS if world in poses]
             if available_worlds and (is_last or available_worlds[0] == _WORLDS[0]):
                 self._world = available_worlds[0]
+            elif is_last:
+                self._linked_worlds = [world for world in _WORLDS if world in transforms.ancestors(cloud.frame_id)]
         return None if self._world is None else poses.get(self._world)
 
     def _frame(self, cloud: "_Cloud", T_world_sensor: np.ndarray | None) -> LazyFrame:
@@ -278,6 +285,13 @@ class TransformTree:
                 times.insert(k, time)
             placements.insert(k, placement)
             self._edges[child] = parent, times[-_MAX_KEPT:], placements[-_MAX_KEPT:]
+
+    def ancestors(self, frame: str) -> list[str]:
+        """The frame and those that transforms of any time connect it with, towards the root."""
+        frames = [frame]
+        while frames[-1] in self._edges and (parent := self._edges[frames[-1]][0]) not in frames:
+            frames.append(parent)
+        return frames
 
     def poses(self, frame: str, time: int) -> dict[str, np.ndarray]:
         """T_parent_frame (4, 4) of the frame in itself and in each of its ancestors, at a time in ns. Ancestors beyond
