@@ -179,6 +179,17 @@ def test_ground_under_map_follows_terrain(terrain):
     assert ground_under(np.zeros((0, 3)), None) is None
 
 
+def test_ground_under_map_is_not_a_roof():
+    """In the middle of a block, and of 17 % of its area."""
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(0, 600, (400_000, 2))
+    roof = (np.abs(xy - 340) < 40).all(1)
+    points = np.column_stack([xy, np.where(roof, 12.0, 0.0) + rng.normal(0, 0.02, len(xy))])
+    ring = np.abs(xy - 340).max(1)
+    heights = ground_under(points, None).at(xy[(ring > 41) & (ring < 70)])
+    assert np.abs(heights).max() < 0.2
+
+
 def test_detector_works_without_ground():
     detections = Detector(upright).detect(column(4, 1), ORIGIN)
     assert not detections.has_ground

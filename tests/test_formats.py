@@ -260,7 +260,8 @@ def test_read_npy_number_types_and_records(folder, dtype):
     "name, text, expected",
     [
         *(("a.csv", f"x,y,z\n{q}1.5{q},{q}-2{q},{q}3{q}\n4,{q}5{q},6\n", [[1.5, -2, 3], [4, 5, 6]]) for q in "'\""),
-        # separators within quotes are ignored
+        # separators and comments within quotes are ignored
+        ("a.csv", 'x,y,z,l\n1,2,3,"a#b"\n4,5,6,c # "d\n', [[1, 2, 3], [4, 5, 6]]),
         *(
             (
                 f"a.{suffix}",

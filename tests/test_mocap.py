@@ -449,7 +449,8 @@ def test_load_motion_cuts_sloper4d_at_missing_frames(tmp_path):
     content = labels(rotations, way, frame_num=[0, 5, 10, 15, 500, 505, 510, 515])
     name = "seq007_garden_001_labels_second"
     assert load_motion(write_labels(tmp_path, content)).names == (name, f"{name}#2")
-    for other in ([0, 5], None, [0] * 8, ["a"] * 8):
+    # uneven steps are no gaps
+    for other in ([0, 5], None, [0] * 8, ["a"] * 8, [0, 1, 3, 4, 6, 7, 9, 10], [0, 1, 6, 11, 16, 21, 26, 31]):
         assert load_motion(write_labels(tmp_path, content | {"frame_num": other})).names == (name,)
 
 

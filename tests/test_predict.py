@@ -306,6 +306,11 @@ def test_predict_counts_duplicates_once(model, points):
     rows = np.concatenate([points[:60].repeat(2, 0), np.zeros((5, 3))])
     pose, expected = model.predict(rows), model.predict(points[:60])
     np.testing.assert_array_equal(pose.joints, expected.joints)
+    # before many points are thinned
+    many = points[:60].repeat(MAX_POINTS // 100, 0)
+    many = many + np.random.default_rng(0).normal(0, 0.01, many.shape)
+    pose_of_many = model.predict(np.concatenate([many, many]))
+    assert pose_of_many.num_points == len(many) and not any("thinned" in line for line in pose_of_many.warnings)
     assert pose.num_points == 60 and any(line.startswith("dropped 5 ") for line in pose.warnings), pose.warnings
 
 

@@ -290,9 +290,10 @@ def test_changed_boxes_file_restarts_prediction(form, stopped, drive, tmp_path, 
 def test_resume_with_result_in_folder_of_boxes_keeps_finished_frames(stopped, drive, tmp_path, capsys):
     """The command's own unfinished files are no change of the boxes, and neither is stating the default of --every."""
     (tmp_path / "0.json").write_text(json.dumps({"people": [{"center": [4.1, 1.5, 0], "size": [1, 1, 2]}]}))
-    words = stopped("--end", 0.2, "--boxes", tmp_path, "--out", tmp_path / "a.jsonl")
-    assert main(["predict", str(drive), *map(str, words), "--every", "1"]) == 0
-    assert "1 frames are in" in capsys.readouterr().err
+    for name in ("a.jsonl", "results/a.jsonl"):
+        words = stopped("--end", 0.2, "--boxes", tmp_path, "--out", tmp_path / name)
+        assert main(["predict", str(drive), *map(str, words), "--every", "1"]) == 0
+        assert "1 frames are in" in capsys.readouterr().err
 
 
 def test_printing_rejects_boxes_of_other_frames(drive, tmp_path, capsys):
@@ -602,10 +603,11 @@ def test_frame_boxes_prefer_json_and_refuse_two_files_of_a_frame(tmp_path):
     (tmp_path / "b.poses.json").write_bytes((tmp_path / "b.json").read_bytes())
     with pytest.raises(InputError, match="expected one file of boxes per frame, got b.json and b.poses.json: move"):
         FrameBoxes(tmp_path)
+    # a label beside a scan
     (tmp_path / "b.poses.json").unlink()
-    (tmp_path / "a.txt").write_text("")
-    with pytest.raises(InputError, match="expected one file of boxes per frame, got a.npy and a.txt: move"):
-        FrameBoxes(tmp_path)
+    np.save(tmp_path / "c.npy", np.zeros((50, 3)))
+    (tmp_path / "c.txt").write_text("")
+    assert FrameBoxes(tmp_path).of(Frame(points=np.zeros((0, 3)), index=2, id="c")) == []
 
 
 def test_frame_boxes_do_not_confuse_numbers_and_names(tmp_path):

@@ -178,6 +178,9 @@ def test_weak_boxes_alone_continue_tracks_only_for_a_while():
     for k in range(3):
         assert tracker.update(0.1 * k, [person(0, score=0.9)]) == [0]
     ids = [tracker.update(0.3 + 0.1 * k, [], [person(0, score=0.2)])[0] for k in range(20)]
+    state = tracker.state()
+    del state["tracks"]["weak_age"]
+    assert Tracker.from_state(state).predicted(2.3) == tracker.predicted(2.3)
     # seen last at 0.2 s
     assert ids == [0] * 14 + [-1] * 6 and not tracker.predicted(2.2)
     assert tracker.update(2.3, [person(0, score=0.9)]) == [1]

@@ -180,6 +180,6 @@ def _changed(path: Path, outputs: Sequence[str]) -> str:
     `outputs` do, such as the unfinished result, are left out: the command itself changes them."""
     if not path.is_dir():
         return str(path.stat().st_mtime_ns)
-    # a folder may contain broken links
-    files = sorted(file for file in path.iterdir() if file.exists() and not file.name.startswith((".", *outputs)))
+    # neither folders, in which the result may be, nor broken links
+    files = sorted(file for file in path.iterdir() if file.is_file() and not file.name.startswith((".", *outputs)))
     return hashlib.sha256(repr([(file.name, file.stat().st_mtime_ns) for file in files]).encode()).hexdigest()

@@ -163,11 +163,12 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
     far_warning = None if origin is None or frame_warning else _far_from_most(full_scan, scan, search)
     if far_warning is not None:
         warnings.append(far_warning)
-    if origin is None and np.ptp(level[:, :2], axis=0).max() > MOST_EXTENT:
-        warnings.append(
-            f"the scan extends over more than {MOST_EXTENT / 1e3:.0f} km, beyond which people are hardly found: give "
-            "parts of it"
-        )
+    if origin is None:
+        # without stray points, which the detector leaves out, too
+        reach = np.quantile(level[:: 1 + len(level) // 20_000, :2], (0.001, 0.999), axis=0)
+        if np.ptp(reach, axis=0).max() > MOST_EXTENT:
+            problem = f"the scan extends over more than {MOST_EXTENT / 1e3:.0f} km"
+            warnings.append(f"{problem}, beyond which people are hardly found: give parts of it")
     if origin is None and search.max_range != MAX_RANGE:
         warnings.append("the sensor position is unknown, so max_range (--range) is not applied")
     is_moving = None

@@ -32,7 +32,6 @@ from lidarpose.inference.inputs import (
     is_few,
     is_many,
     only_returns,
-    rounding_warning,
 )
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.inference.scan import Scan, pose_scan
@@ -43,7 +42,7 @@ from lidarpose.models import BUNDLED, DEFAULT, weights_name, weights_path
 from lidarpose.models.checkpoint import read_header
 from lidarpose.models.decode import decoder
 from lidarpose.models.voxelize import WINDOW
-from lidarpose.sample import MIN_POINTS, PER_PERSON, Box, Pose, within_reach
+from lidarpose.sample import MIN_POINTS, PER_PERSON, Box, Pose
 from lidarpose.skeleton import SMPL24, Skeleton, as_skeleton
 from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.live import filter_track
@@ -408,15 +407,12 @@ class Predictor(PoseEstimator):
     def _predict_clouds(self, clouds, origin, skeleton, progress, clips) -> Poses:
         """Poses of clouds given by the user, without duplicate points, and with a warning for each cloud with rounded
         coordinates. Of people cropped from a scan, these belong to the scan."""
-        cleaned_clouds = [clean(cloud) for cloud in clouds]
-        distinct_clouds = [points if is_few(points) else distinct(points) for points, _ in cleaned_clouds]
+        returns = [only_returns(cloud) for cloud in clouds]
+        distinct_clouds = [points if is_few(points) else distinct(points) for points, _ in returns]
         poses = self.predict_in(distinct_clouds, origin, skeleton, progress, clips=clips)
-        people = list(poses)
-        for i, (cloud, (_, notes)) in enumerate(zip(clouds, cleaned_clouds, strict=True)):
-            if warning := rounding_warning(cloud[within_reach(cloud)]):
-                notes.insert(0, warning)
-            people[i] = replace(people[i], warnings=(*notes, *people[i].warnings))
-        return replace(poses, people=tuple(people))
+        people = zip(poses, returns, strict=True)
+        people_with_notes = (replace(person, warnings=(*notes, *person.warnings)) for person, (_, notes) in people)
+        return replace(poses, people=tuple(people_with_notes))
 
     def _best(
         self, cleaned_clouds, is_usable, is_placed, origin, progress, clips, pelvises, box_centers

@@ -105,9 +105,9 @@ def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
     """x y z (n, 3) and the column names; raises FormatError."""
     text = re.sub(_COUNT, r"\1\n", _with_plain_nan(decode(data)))
     names, num_skipped, has_header, separator, decimal = _find_columns(text)
-    # lines with only a comment would count as rows without values; the lookbehind keeps the regular expression from
-    # starting at every blank of a long run
-    text = re.sub(r"(?m)^[ \t]+$", "", re.sub(r"(?<![ \t])[ \t]*#.*", "", text))
+    # comments, but not in quotes; lines with only a comment would count as rows without values; the lookbehind keeps
+    # the regular expression from starting at every blank of a long run
+    text = re.sub(r"(?m)^[ \t]+$", "", re.sub(r'("[^"\n]*")|(?<![ \t])[ \t]*#.*', r"\1", text))
     parts = text.split("\n", num_skipped)
     # pandas supports only double quotes, so single quotes around cells are removed, but not those within a cell
     body = re.sub(r"(?<![^,;\s])'|'(?![^,;\s])", "", parts[num_skipped]) if len(parts) > num_skipped else ""

@@ -17,7 +17,7 @@ from lidarpose.io.sources import DamagedFrame, Frame
 from lidarpose.io.sources.folders import list_folder
 
 _FORM = '{"frame": 0, "people": [{"center": [x, y, z], "size": [l, w, h]}]}'
-_SUFFIXES = (".json", ".npy", ".txt")
+_SUFFIXES = (".npy", ".txt", ".json")
 
 
 class FrameBoxes:
@@ -25,11 +25,11 @@ class FrameBoxes:
 
     Args:
         given: a folder of files named like the frames (`ID.json`, `ID.npy`, KITTI's `ID.txt`, or `ID.boxes.json` and
-            `ID.poses.json`, as `lidarpose detect` and `predict` name them), or all by the frames' numbers, JSON before
-            other files of the same name, which may be the scans; or a file of
-            JSON lines or a JSON list of `{"frame": 0, "people": [...]}`, where the frame is its number (an integer) or
-            its id (text); or a mapping from frame numbers or ids to anything that `read_boxes` takes. Ids that are
-            integers are compared by value.
+            `ID.poses.json`, as `lidarpose detect` and `predict` name them), or all by the frames' numbers; of one
+            frame's files JSON is read, else `.txt`, since the others may be the scans; or a file of JSON lines or a
+            JSON list of `{"frame": 0, "people": [...]}`, where the frame is its number (an integer) or its id (text);
+            or a mapping from frame numbers or ids to anything that `read_boxes` takes. Ids that are integers are
+            compared by value.
         calib: KITTI calibration, see `read_boxes`.
 
     Raises:
@@ -110,11 +110,11 @@ def _files_by_frame(folder: Path) -> dict[int | str, Any]:
     """The files of a folder by frame id. Raises InputError for two of one frame."""
     paths = [path for path in list_folder(folder) if path.suffix.lower() in _SUFFIXES]
     by_frame: dict[int | str, Any] = {}
-    # JSON last: it takes the place of other files
-    for path in sorted(paths, key=lambda path: path.suffix.lower() == ".json"):
+    # those that are more likely boxes take the place of others, which may be the scans
+    for path in sorted(paths, key=lambda path: _SUFFIXES.index(path.suffix.lower())):
         id = path.stem.removesuffix(".boxes").removesuffix(".poses")
         other = by_frame.get(id)
-        if other is not None and (path.suffix.lower() != ".json" or other.suffix.lower() == ".json"):
+        if other is not None and path.suffix.lower() == other.suffix.lower():
             problem = f"expected one file of boxes per frame, got {other.name} and {path.name}"
             raise file_error(folder, f"{problem}: move one elsewhere")
         by_frame[id] = path

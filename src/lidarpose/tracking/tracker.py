@@ -204,7 +204,8 @@ class Tracker:
                     name: np.array(values, getattr(empty_tracks, name).dtype).reshape(
                         -1, *getattr(empty_tracks, name).shape[1:]
                     )
-                    for name, values in state["tracks"].items()
+                    # states of earlier versions have no weak_age
+                    for name, values in ({"weak_age": state["tracks"]["age"]} | state["tracks"]).items()
                 }
             )
             if len({len(getattr(tracker._tracks, field.name)) for field in fields(_Tracks)}) > 1:

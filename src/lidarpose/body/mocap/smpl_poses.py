@@ -167,13 +167,16 @@ def _load_sloper4d(path: str | os.PathLike, labels: Any, up: str | None, fps: fl
 
 
 def _frame_numbers(labels: Any, count: int) -> np.ndarray | None:
-    """SLOPER4D's frame_num (F,) in units of its smallest step; None unless it has `count` rising numbers."""
+    """SLOPER4D's frame_num (F,) as numbers that follow each other except where frames are missing, which is where a
+    step is over twice the usual one; None unless it has `count` rising numbers."""
     try:
         number = np.array(labels, float)
     except (TypeError, ValueError):
         return None
     steps = np.diff(number) if number.shape == (count,) else np.zeros(1)
-    return number / steps.min() if len(steps) and (steps > 0).all() else None
+    if not (len(steps) and (steps > 0).all()):
+        return None
+    return np.cumsum(np.append(0, 1 + (steps > 2 * np.median(steps))))
 
 
 def load_pkl(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:

@@ -34,8 +34,8 @@ _MANY_LEVEL, _LEVEL_REACH, _LEVEL = 12, 3, 0.2
 _LEVEL_SHARE = 0.1
 # slopes of the plane: the maximum, and the width of the bins for finding the most common one
 _STEEPEST, _SLOPE_BIN = 0.9, 0.06
-# distance at which a cell has half its weight for the plane, m; minimum depth of its cells below the sensor, m, which
-# is also the maximum height of the fitted plane above the sensor
+# distance from the sensor at which a cell has half its weight for the plane, m; minimum depth of its cells below the
+# sensor, m, which is also the maximum height of the fitted plane above the sensor
 _NEAR, _BELOW_SENSOR = 10.0, 0.1
 # number of the most common slopes that are tried, and the slope that halves a plane's score
 _SLOPES, _COMMON_SLOPE = 6, 0.5
@@ -90,12 +90,13 @@ class _Floors:
         return x[:, None], y[None]
 
 
-def estimate_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Ground | None:
+def estimate_ground(points: np.ndarray, origin: np.ndarray | None = None, *, near: float = _NEAR) -> Ground | None:
     """The ground under points (n, 3) m, z up.
 
     Args:
         points: (n, 3) m, in any order; points more than 512 m from the middle are ignored.
         origin: (3,) m, sensor position, which is the middle; if None, the points' median is.
+        near: distance from the middle at which a cell has half its weight for the shared plane, m.
 
     Returns:
         The ground, or None if the lowest points of too few cells form a surface.
@@ -103,7 +104,7 @@ def estimate_ground(points: np.ndarray, origin: np.ndarray | None = None) -> Gro
     floors = _lowest(points, origin)
     if floors is None:
         return None
-    plane = _common_plane(floors, origin)
+    plane = _common_plane(floors, origin, near)
     if plane is None:
         return None
     slope, height = plane[:2], plane[2]
@@ -241,17 +242,17 @@ def _lowest(points: np.ndarray, origin: np.ndarray | None, *, least: int = 2) ->
     return _Floors(corner=corner, heights=heights.reshape(shape), counts=counts.reshape(shape))
 
 
-def _common_plane(floors: _Floors, origin: np.ndarray | None) -> np.ndarray | None:
+def _common_plane(floors: _Floors, origin: np.ndarray | None, near: float = _NEAR) -> np.ndarray | None:
     """(a, b, c) of the plane z = a x + b y + c that most cells share, weighted toward near cells.
 
-    None if no plane is shared. If the sensor position `origin` (3,) m is known, the plane passes below it, with a
-    tolerance of `_BELOW_SENSOR`.
+    None if no plane is shared. near: as for `estimate_ground`. If the sensor position `origin` (3,) m is known, the
+    plane passes below it, with a tolerance of `_BELOW_SENSOR`.
     """
     h = floors.heights
     x, y = (np.broadcast_to(values, h.shape) for values in floors.positions())
     middle = np.array([np.nanmedian(np.where(np.isfinite(h), v, np.nan)) for v in (x, y)]) if origin is None else origin
     x, y = x - middle[0], y - middle[1]
-    weight = 1 / (1 + (x**2 + y**2) / _NEAR**2)
+    weight = 1 / (1 + (x**2 + y**2) / near**2)
     max_height = np.inf if origin is None else origin[2] - _BELOW_SENSOR
     planes, weights = [np.zeros((0, 3))], [np.zeros(0)]
     for lag in (2, 4):

@@ -12,6 +12,8 @@ from lidarpose.models.detector.ground import CELL, Ground, estimate_ground, fill
 _MAP = 400.0
 # side of a block, and the margin in which its neighbors' points are used, too, m
 _BLOCK, _MARGIN = 128, 32
+# as `near` of `estimate_ground`, m: no sensor is in the middle of a block, but perhaps a roof
+_NEAR = 40.0
 # maximum extent of the height map, m: beyond it, the ground has the height of its border
 MOST_EXTENT = 4096
 
@@ -20,15 +22,15 @@ def ground_under(points: np.ndarray, origin: np.ndarray | None) -> Ground | None
     """The ground under a scan or a map, points (n, 3) m. Arguments and result: as for `estimate_ground`."""
     if origin is not None or not len(points) or np.ptp(points[:, :2], axis=0).max() < _MAP:
         return estimate_ground(points, origin)
-    middle = np.median(points[:, :2], axis=0)
     low, high = (f(points[:, :2], axis=0).astype(float) for f in (np.min, np.max))
+    middle = (low + high) / 2
     low = np.floor(np.maximum(low, middle - MOST_EXTENT / 2) / CELL) * CELL
     shape = np.ceil((np.minimum(high, middle + MOST_EXTENT / 2) - low) / CELL).astype(int).clip(min=1)
     heights = np.full(shape, np.nan, np.float32)
     for i in range(0, shape[0], _BLOCK):
         row_points = points[_is_within(points[:, 0], low[0] + i * CELL)]
         for j in range(0, shape[1], _BLOCK):
-            ground = estimate_ground(row_points[_is_within(row_points[:, 1], low[1] + j * CELL)])
+            ground = estimate_ground(row_points[_is_within(row_points[:, 1], low[1] + j * CELL)], near=_NEAR)
             if ground is not None:
                 block = heights[i : i + _BLOCK, j : j + _BLOCK]
                 x = low[0] + CELL * (i + np.arange(block.shape[0]) + 0.5)
