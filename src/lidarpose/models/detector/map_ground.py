@@ -11,9 +11,9 @@ from lidarpose.models.detector.ground import CELL, Ground, estimate_ground, fill
 # points that extend farther than this along x or y are a map, not a scan, m
 _MAP = 400.0
 # side of a block, and the margin in which its neighbors' points are used, too, m
-_BLOCK, _MARGIN = 128, 32
+_BLOCK, _MARGIN = 64, 48
 # as `near` of `estimate_ground`, m: no sensor is in the middle of a block, but perhaps a roof
-_NEAR = 40.0
+_NEAR = 20.0
 # maximum extent of the height map, m: beyond it, the ground has the height of its border
 MOST_EXTENT = 4096
 
