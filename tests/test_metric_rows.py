@@ -96,13 +96,16 @@ def test_metrics_entry_adds_rows_and_changes_no_others(monkeypatch):
 
 def test_charts_draw_metric_rows(monkeypatch):
     predictions, setting = four()
+    nearby = np.arange(predictions.labels.size).reshape(predictions.labels.shape) % 30
+    predictions = replace(predictions, nearby=nearby.astype(float))
     rows = metric_rows.metric_rows(predictions, setting)
     result = Result(setting=setting, counts={}, skipped={}, notes=(), lines=rows)
     figures = []
     monkeypatch.setattr(charts, "png_of", lambda figure: figures.append(figure) or b"")
     charts.draw_errors(result)
     charts.draw_reliability(predictions, result)
-    by_group = dict(zip(("distance, m", "points", "hidden share", "joints"), figures[0].axes, strict=True))
+    groups = ("distance, m", "points", "hidden share", "joints", "points near the joint")
+    by_group = dict(zip(groups, figures[0].axes, strict=True))
     for group, axes in by_group.items():
         due = [row for row in rows if (row.figure, row.group) == ("mpjpe", group)]
         np.testing.assert_allclose([bar.get_height() for bar in axes.patches], [row.value for row in due])
