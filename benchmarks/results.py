@@ -576,6 +576,7 @@ def tables() -> dict[str, Callable[[], str]]:
     }
     makers["bench-2 persons"] = persons
     makers |= {f"paper-small {what}": partial(paper_small, what) for what in ("figures", "curve")}
+    makers["paper fig7 curves"] = lambda: table(*disturbed.networks("fig7"))
     makers["stability"] = lambda: table(("", "undisturbed", *5 * ("",)), disturbed.curves(DEFAULT))
     makers["stability sensors"] = lambda: table(("sensor", "points", "MPJPE mm"), disturbed.sensors(DEFAULT))
     makers["stability ends"] = lambda: table(("", "mean, mm", "deviation"), disturbed.ends(DEFAULT))

@@ -1,4 +1,5 @@
-"""Rows of tables of errors with perturbed points, from the stability.json files in docs/scores/stability.
+"""Rows of tables of errors with perturbed points, from the stability.json files in docs/scores/stability, and from the
+cells of the paper's figures in docs/scores/paper/cells.
 
 lidarpose evaluate small bench --stability --out study        # study/stability.json -> small.json
 """
@@ -7,7 +8,8 @@ import json
 from functools import lru_cache
 from pathlib import Path
 
-FOLDER = Path(__file__).parents[1] / "docs" / "scores" / "stability"
+SCORES = Path(__file__).parents[1] / "docs" / "scores"
+FOLDER, PAPER = SCORES / "stability", SCORES / "paper"
 
 
 @lru_cache
@@ -49,6 +51,25 @@ def sensors(name: str) -> list[tuple[str, ...]]:
 def ends(name: str) -> list[tuple[str, ...]]:
     """One row per end joint: mean and standard deviation over the worst people."""
     return [(end["group"], f"{end['mean']:.1f}", f"{end['deviation']:.1f}") for end in read(name)["ends"]]
+
+
+def networks(figure: str) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Header and rows of one of the paper's figures: a column per network whose curves are stored with its cell, a row
+    per amount of perturbation and per end joint."""
+    columns: dict[str, list[str]] = {}
+    names: list[str] = []
+    for cell in json.loads((PAPER / f"{figure}.json").read_text())["cells"]:
+        path = PAPER / "cells" / f"{Path(cell['scores']).parent.name}.json"
+        study = json.loads(path.read_text()).get("stability") if path.is_file() else None
+        if study is not None:
+            points = {curve["name"]: curve["points"] for curve in study["curves"]}
+            jitter, clusters = points["jitter"], points["clusters"][1:]
+            names = ["undisturbed", *(f"jitter, clip {point['label']} cm" for point in jitter[1:])]
+            names += [f"two clusters of {point['label']} points" for point in clusters]
+            names += [f"{end['group']}, worst {end['worst']} people" for end in study["ends"]]
+            values = [point["mpjpe"] for point in (*jitter, *clusters)] + [end["mean"] for end in study["ends"]]
+            columns[cell["row"]] = [f"{value:.1f}" for value in values]
+    return ("MPJPE, mm", *columns), list(zip(names, *columns.values(), strict=True))
 
 
 def strays(name: str) -> tuple[str, ...]:
