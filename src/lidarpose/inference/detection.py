@@ -163,7 +163,7 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
     far_warning = None if origin is None or frame_warning else _far_from_most(full_scan, scan, search)
     if far_warning is not None:
         warnings.append(far_warning)
-    if origin is None:
+    if origin is None and not frame_warning:
         # without stray points, which the detector leaves out, too
         reach = np.quantile(level[:: 1 + len(level) // 20_000, :2], (0.001, 0.999), axis=0)
         if np.ptp(reach, axis=0).max() > MOST_EXTENT:
