@@ -228,8 +228,9 @@ def test_tilted_scan_uses_places_of_earlier_frames(scene, monkeypatch):
         reach=np.ones(2),
         rejected=np.zeros((0, 3)),
     )
-    found = detection.verify_people(places, search, known)
-    assert given[0].boxes == [] and len(given[0].pelvises) == 0 and len(found.pelvises) == len(found.boxes) > 0
+    verified_scan = detection.verify_people(places, search, known)
+    assert given[0].boxes == [] and len(given[0].pelvises) == 0
+    assert len(verified_scan.pelvises) == len(verified_scan.boxes) > 0
     np.testing.assert_allclose(given[0].tracks, known.tracks @ rotation_from_up(up).T)
 
 

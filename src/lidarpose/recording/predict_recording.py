@@ -127,11 +127,11 @@ def predict_recording(
         every: read only every n-th frame.
         **posing: options for posing. `boxes` takes a folder, a file or a mapping with the boxes of each frame, see
             `FrameBoxes`. `track=True` tracks people over time; known people are then not verified in each frame.
-            `live=True` tracks people and smooths their poses using past frames
-            only. `up=None` means what `boxes` state, else z. `calib`, `crop`, `find`, `min_score`, `max_range`,
-            `max_people`, `background`, `sensor_origin`, `skeleton` and `model` are as in `predict`, except that the
-            first frame with points decides whether all frames are crops of one person, and that a frame's own `origin`
-            takes the place of `sensor_origin=None`.
+            `live=True` tracks people and smooths their poses using past frames only. `up=None` means what `boxes`
+            state, else z. `calib`, `crop`, `find`, `min_score`, `max_range`, `max_people`, `background`,
+            `sensor_origin`, `skeleton` and `model` are as in `predict`, except that the first frame with points decides
+            whether all frames are crops of one person, and that a frame's own `origin` takes the place of
+            `sensor_origin=None`.
 
     Yields:
         `FramePoses` of each frame, including damaged frames. The warnings of the first include those about the source,
