@@ -180,6 +180,8 @@ def test_read_boxes_converts_kitti_labels_to_lidar_frame(tmp_path, tracking):
     np.testing.assert_allclose([fields(box) for box in boxes], rows, atol=0.04)
     np.testing.assert_allclose([box.size for box in boxes], rows[:, 3:6], atol=1e-6)
     np.testing.assert_allclose([box.center for box in boxes], rows[:, :3], atol=1e-5)
+    # only result files have scores
+    assert [(box.score, box.mounted) for box in boxes] == [(None, False), (0.9, True), (None, False)]
     assert [fields(box) for box in read_boxes(label, calib=calib)] == [fields(box) for box in boxes]
 
     for text, words in (

@@ -24,7 +24,7 @@ from lidarpose.train import loop, run_dir
 from lidarpose.train.augment import Example
 from lidarpose.train.data_loader import Chunks
 from lidarpose.train.networks import finetuned_network, pretraining_network
-from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, log_gaussian, pretraining, prn
+from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, log_gaussian, pretraining
 from lidarpose.train.objectives.dapt_objective import DaptObjective, finetuning_config, pretraining_config, small
 from lidarpose.train.objectives.dapt_transfer import transferred
 from lidarpose.train.objectives.objective import one_process, total
@@ -164,7 +164,7 @@ def test_losses_equal_equations_9_and_10(seed):
     # without heatmaps, fine-tuning uses Eq. 7, too
     bare = replace(outputs, logits_x=None, voted=outputs.coordinates * 2)
     assert finetuning(bare, targets, MENDED)["regression"].item() == pytest.approx(regression, rel=1e-5)
-    terms = prn(bare, targets, MENDED)
+    terms = pretraining(bare, targets, MENDED)
     assert terms["regression"].item() == pytest.approx(regression, rel=1e-5)
     assert terms["vote"].item() == pytest.approx(slow_regression(numbers(bare.voted), targets), rel=1e-5)
     assert terms["segmentation"].item() == pytest.approx(slow_segmentation(outputs.parts, targets.part), rel=1e-5)
@@ -202,7 +202,7 @@ def test_losses_of_the_released_code(seed):
     assert finetuning(bare, targets, replace(MENDED, squared_distance=True))["regression"].item() == pytest.approx(
         squared(outputs.coordinates), rel=1e-5
     )
-    terms = prn(bare, targets, replace(MENDED, squared_distance=True, ignore_background=True))
+    terms = pretraining(bare, targets, replace(MENDED, squared_distance=True, ignore_background=True))
     assert terms["vote"].item() == pytest.approx(squared(bare.voted), rel=1e-5)
     assert terms["segmentation"].item() == pytest.approx(slow_segmentation(outputs.parts, on_body), rel=1e-5)
 

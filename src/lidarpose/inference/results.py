@@ -304,8 +304,7 @@ class Poses(Sequence[PersonPose]):
             if person.pose is None:
                 continue
             values = [getattr(person.pose, name) for name in PER_JOINT]
-            mounted = None if person.box is None else person.box.mounted
-            known_values = (person.person, person.second_person, person.score, mounted)
+            known_values = (person.person, person.second_person, person.score, person.mounted)
             person_values = [np.nan if value is None else value for value in known_values]
             # escape characters that cannot be encoded when the table is written
             id = encodable(person.id) if isinstance(person.id, str) else person.id

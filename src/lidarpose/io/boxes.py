@@ -230,8 +230,8 @@ def _is_kitti(text: str) -> bool:
     return len(words) in (15, 16) and _parse_numbers(words[1:], len(words) - 1) is not None
 
 
-def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | None) -> list[list[float]]:
-    """Rows [x, y, z, l, w, h, yaw] in the LiDAR frame, one for each person in a label file."""
+def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | None) -> list[dict]:
+    """An entry in the LiDAR frame for each person in a label file, with the score that a result file has."""
     people = []
     for number, line in enumerate(text.splitlines(), 1):
         words = line.split()
@@ -242,7 +242,8 @@ def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | N
             raise FormatError(
                 f"expected a KITTI label of 15 values on line {number}, got {shorten(line)!r}: correct it"
             )
-        people.append(values)
+        score = (_parse_numbers(words[15:16], 1) or [None])[0]
+        people.append((values, {"score": score, "mounted": words[0] == "Cyclist"}))
     if not people:
         return []
     if calib is None:
@@ -253,13 +254,14 @@ def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | N
                 "put it there or give its path (calib)"
             )
     R_rect_velo, t_rect_velo = _read_calibration(calib)
-    rows = []
-    for height, width, length, x, y, z, rotation_y in people:
+    entries = []
+    for (height, width, length, x, y, z, rotation_y), known in people:
         # the camera's y axis points down, and a label's location is the center of the box's bottom face
         center = R_rect_velo.T @ (np.array([x, y - height / 2, z]) - t_rect_velo)
         forward = R_rect_velo.T @ np.array([math.cos(rotation_y), 0, -math.sin(rotation_y)])
-        rows.append([*center.tolist(), length, width, height, math.atan2(forward[1], forward[0])])
-    return rows
+        yaw = math.atan2(forward[1], forward[0])
+        entries.append({"center": center.tolist(), "size": [length, width, height], "yaw": yaw, **known})
+    return entries
 
 
 def _read_calibration(path: str | os.PathLike) -> tuple[np.ndarray, np.ndarray]:

@@ -44,15 +44,20 @@ def pretraining(
 ) -> dict[str, Tensor]:
     """Paper: Eq. 9, L_pre = lambda_reg L_reg + lambda_seg L_seg, for the coordinate head and the part head.
 
-    Terms "regression" and "segmentation", and "mpjpe" of the coordinates for the log; share: see `objective`.
+    Terms "regression" and "segmentation", and "mpjpe" of the coordinates for the log; share: see `objective`. The neck
+    prn has these losses in both stages, with the term "vote" of its voted joints and weights of 1, which are ours; none
+    are published.
     """
-    coordinates, parts, part = outputs.coordinates, outputs.parts, targets.part
+    coordinates, voted, parts, part = outputs.coordinates, outputs.voted, outputs.parts, targets.part
     assert coordinates is not None and parts is not None and part is not None
     if config.ignore_background:
         part = part.masked_fill(part == 0, -1)
     people, labels, voxels = _divisors(targets, share, (part >= 0).sum())
-    return {
-        "regression": REGRESSION * distance_loss(coordinates, targets, people, squared=config.squared_distance),
+    regression = distance_loss(coordinates, targets, people, squared=config.squared_distance)
+    terms = {"regression": REGRESSION * regression if voted is None else regression}
+    if voted is not None:
+        terms["vote"] = distance_loss(voted, targets, people, squared=config.squared_distance)
+    return terms | {
         "segmentation": SEGMENTATION * segmentation_loss(parts.float(), part, voxels),
         "mpjpe": _mpjpe(coordinates.float(), targets, labels),
     }
@@ -77,26 +82,6 @@ def finetuning(
         assert outputs.inter is not None
         terms["auxiliary"] = AUXILIARY * distance_loss(outputs.inter, targets, people, squared=squared)
     return terms | {"mpjpe": _mpjpe(joints.float(), targets, labels)}
-
-
-def prn(
-    outputs: DaptOutputs, targets: DaptTargets, config: DaptConfig, *, share: Share = one_process
-) -> dict[str, Tensor]:
-    """Losses of the neck prn in either stage: distances of refined and of voted joints, and the cross entropy of each
-    voxel's nearest joint, with background as a class unless `ignore_background`. The weights of 1 are ours; none are
-    published."""
-    coordinates, voted, parts, part = outputs.coordinates, outputs.voted, outputs.parts, targets.part
-    assert coordinates is not None and voted is not None and parts is not None and part is not None
-    if config.ignore_background:
-        part = part.masked_fill(part == 0, -1)
-    people, labels, voxels = _divisors(targets, share, (part >= 0).sum())
-    squared = config.squared_distance
-    return {
-        "regression": distance_loss(coordinates, targets, people, squared=squared),
-        "vote": distance_loss(voted, targets, people, squared=squared),
-        "segmentation": segmentation_loss(parts.float(), part, voxels),
-        "mpjpe": _mpjpe(coordinates.float(), targets, labels),
-    }
 
 
 def distance_loss(joints: Tensor, targets: DaptTargets, people: Tensor, *, squared: bool = False) -> Tensor:

@@ -16,7 +16,7 @@ from lidarpose.models.dapt.dapt_config import PARTS, RELEASED_FAULTS, DaptConfig
 from lidarpose.models.dapt.dapt_net import to_tensors
 from lidarpose.models.dapt.voxel_tables import LAYOUTS, Tables, build_tables
 from lidarpose.train.augment import UNKNOWN_PART, Example
-from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, pretraining, prn
+from lidarpose.train.objectives.dapt_losses import DaptTargets, finetuning, pretraining
 from lidarpose.train.objectives.objective import BuiltNetwork, Share, in_body26, majority_part, one_process
 from lidarpose.train.recipes import DEEP_PAPER, SMALL_PAPER, TINY_PAPER
 
@@ -101,10 +101,10 @@ class DaptObjective(BuiltNetwork):
     def terms(
         self, network: Callable, arrays: DaptArrays, *, device: torch.device | str = "cpu", share: Share = one_process
     ) -> dict[str, Tensor]:
-        """`dapt_losses.pretraining`, `finetuning` or `prn`. A labeled joint's weight is 1, whether visible or not, as
+        """`dapt_losses.pretraining` or `finetuning`. A labeled joint's weight is 1, whether visible or not, as
         in the released code."""
         outputs, targets = network(to_tensors(arrays.tables, device)), arrays.targets(device)
-        losses = prn if self.config.neck == "prn" else pretraining if self.stage == "pretrain" else finetuning
+        losses = pretraining if self.config.neck == "prn" or self.stage == "pretrain" else finetuning
         terms = losses(outputs, targets, self.config, share=share)
         # adds zero times every head's output: gradient averaging across processes waits for all heads, used or not
         first_term = next(iter(terms))

@@ -114,25 +114,23 @@ def missed_people(
     batch: not used.
     """
     device = next(network.parameters()).device
-    false_logits: list[np.ndarray] = []
-    best_logits: list[np.ndarray] = []
+    scans = []
     for example in examples:
         outputs = objective.scores(network, objective.collate([example]), device=device)
         logit, person, candidates = outputs[:, 0], example.labels.person, example.candidates
         centers, _ = predicted_boxes(candidates.centers, candidates.yaw, outputs)
         rows = suppress_near(centers, logit, SAME)
-        false_logits.append(logit[rows][person[rows] == NOBODY])
-        people = np.unique(person[person >= 0])
-        best_logits.append(np.array([logit[rows][person[rows] == number].max(initial=-np.inf) for number in people]))
-    return share_missed(false_logits, best_logits), None
+        scans.append((logit[rows], person[rows], np.unique(person[person >= 0])))
+    return share_missed(scans), None
 
 
-def share_missed(false_logits: Sequence[np.ndarray], best_logits: Sequence[np.ndarray]) -> float:
+def share_missed(scans: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> float:
     """Percentage of people that are missed at `FALSE_PER_SCAN` false positives per scan.
 
-    false_logits: (n,) per scan, logits of the false positives; best_logits: (n,) per scan, each person's highest logit.
+    scans: (n,) logits, (n,) people as in `Labels.person`, and the numbers of all people, of each.
     """
+    false_logits = [logit[person == NOBODY] for logit, person, _ in scans]
+    best_logits = [logit[person == k].max(initial=-np.inf) for logit, person, people in scans for k in people]
     false_ranking = np.sort(np.concatenate([*false_logits, [-np.inf]]))[::-1]
-    threshold = false_ranking[min(round(FALSE_PER_SCAN * len(false_logits)), len(false_ranking) - 1)]
-    person_logits = np.concatenate([*best_logits, np.zeros(0)])
-    return float((person_logits <= threshold).mean() * 100) if len(person_logits) else 0.0
+    threshold = false_ranking[min(round(FALSE_PER_SCAN * len(scans)), len(false_ranking) - 1)]
+    return float((np.array(best_logits) <= threshold).mean() * 100) if best_logits else 0.0

@@ -82,10 +82,6 @@ def missed_by_verifier(
     """Percentage of the people among the detections that the verifier's score alone misses at
     `detector_objective.FALSE_PER_SCAN` false positives per scan. batch: not used."""
     device = next(network.parameters()).device
-    false_logits: list[np.ndarray] = []
-    best_logits: list[np.ndarray] = []
-    for example in examples:
-        logit, person = objective.scores(network, example, device=device)[:, 0], example.person
-        false_logits.append(logit[person == NOBODY])
-        best_logits.append(np.array([logit[person == number].max() for number in np.unique(person[person >= 0])]))
-    return share_missed(false_logits, best_logits), None
+    logits = [objective.scores(network, example, device=device)[:, 0] for example in examples]
+    people = [example.person for example in examples]
+    return share_missed([(s, p, np.unique(p[p >= 0])) for s, p in zip(logits, people, strict=True)]), None
