@@ -242,8 +242,8 @@ def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | N
             raise FormatError(
                 f"expected a KITTI label of 15 values on line {number}, got {shorten(line)!r}: correct it"
             )
-        score = (_parse_numbers(words[15:16], 1) or [None])[0]
-        people.append((values, {"score": score, "mounted": words[0] == "Cyclist"}))
+        score = _parse_numbers(words[15:16], 1)
+        people.append((values, {"score": score[0] if score else None, "mounted": words[0] == "Cyclist"}))
     if not people:
         return []
     if calib is None:
