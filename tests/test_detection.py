@@ -347,6 +347,33 @@ def test_detect_suggests_no_up_axis_without_people(scene, fake):
     assert lidarpose.detect(near).warnings == () and len(fake.calls) >= 6
 
 
+def test_detect_suggests_no_axis_whose_ground_leans_onto_another(scene, monkeypatch):
+    """A search along the wrong axis finds the same people if it takes the sensor for tilted."""
+    empty = scene[0][alone(scene[0])]
+    near = empty[np.abs(empty[:, :2]).max(1) < 6]
+    person = Box(center=np.zeros(3), size=np.ones(3), score=0.9)
+    people = {"y": [person] * 3, "-x": [person] * 2}
+
+    def found(scan, search):
+        return replace(scan, boxes=people.get(scan.up, []), up="-1,0.01,0.02" if scan.up == "y" else scan.up)
+
+    monkeypatch.setattr(single_scan, "find_people", found)
+    (warning,) = lidarpose.detect(near).warnings
+    assert warning == "no people found with up z, but 2 people with up -x: try --up -x"
+
+
+def test_ground_that_leans_onto_another_axis_names_it(scene, monkeypatch):
+    scan = detection.Scan(points=scene[0], origin=np.zeros(3))
+    for direction, advice in (
+        ([0.1, 0.0, 1.0], "the sensor is assumed to be tilted: confirm it with --up 0.1,0,0.995"),
+        ([1.0, 0.0, -0.1], "another axis points up: try --up x"),
+    ):
+        up = np.array(direction) / np.linalg.norm(direction)
+        monkeypatch.setattr(detection, "estimate_up", lambda *_, up=up: up)
+        (warning, *_) = detection.detect_places(scan, detection.Search()).scan.warnings
+        assert advice in warning
+
+
 def test_detect_suggests_opposite_up_axis(scene):
     """Also where the ceiling is taken for the ground, and where a few false people are found."""
     points = scene[0] * [1, -1, -1]
@@ -587,12 +614,12 @@ def test_detect_excludes_background(scene, tmp_path, fake):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"min_score": 2}, "min_score: expected a probability"),
+        ({"min_score": 2}, "min_score .--min-score.: expected a probability"),
         ({"min_score": "high"}, "min_score"),
-        ({"max_range": 0}, "range: expected meters"),
-        ({"max_range": np.nan}, "range: expected meters"),
-        ({"max_range": 1e200}, "range: expected meters, more than 0 and at most 1e\\+09, got 1e\\+200"),
-        ({"max_range": 10**400}, "range: expected meters"),
+        ({"max_range": 0}, "max_range .--range.: expected meters"),
+        ({"max_range": np.nan}, "max_range .--range.: expected meters"),
+        ({"max_range": 1e200}, "max_range .--range.: expected meters, more than 0 and at most 1e\\+09, got 1e\\+200"),
+        ({"max_range": 10**400}, "max_range .--range.: expected meters"),
         ({"max_people": 0}, "max_people must be a whole number"),
         ({"sensor_origin": "here"}, "sensor origin"),
         ({"up": "w"}, "up: expected"),

@@ -362,7 +362,7 @@ def test_methods_find_single_person_on_plane(method):
 
 @pytest.mark.parametrize("method", run_module.METHODS)
 def test_methods_reject_infinite_range(method):
-    with pytest.raises(InputError, match="max_range: expected meters"):
+    with pytest.raises(InputError, match="max_range .--range.: expected meters"):
         run_module.run_detector(method, max_range=np.inf, limit=1)
 
 

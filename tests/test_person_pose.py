@@ -90,11 +90,19 @@ def test_scan_from_above_keeps_given_boxes():
         assert (drawn.yaw, drawn.id) == (pytest.approx(2), 7)
 
 
-def test_names_in_scan_keep_the_ends_of_ids():
-    pose = Pose(joints=np.zeros((24, 3)), skeleton=SMPL24)
-    people = [PersonPose(pose=pose, skeleton=SMPL24, points=np.zeros((9, 3)), id=f"pedestrian_00{k}") for k in range(3)]
-    _, scan = panels_of(Poses(people=tuple(people), skeleton=SMPL24, scan=np.zeros((9, 3))))
-    assert len(set(scan.names)) == 3 and max(map(len, scan.names)) <= bird_eye.LONGEST_NAME
+def test_people_with_long_ids_are_numbered_in_scan():
+    pose, box = Pose(joints=np.zeros((24, 3)), skeleton=SMPL24), Box(center=np.zeros(3), size=[1, 1, 2])
+    people = [PersonPose(pose=pose, skeleton=SMPL24, points=np.zeros((9, 3)), id=f"walker_{k}", box=box) for k in "ab"]
+    poses = Poses(people=tuple(people), skeleton=SMPL24, scan=np.zeros((9, 3)))
+    cards, scan = panels_of(poses)
+    assert [box.id for box in scan.boxes] == [1, 2] and scan.names == ["1", "2"]
+    assert [card.label for card in cards] == ["1: walker_a", "2: walker_b"]
+    # short ids are drawn, and a single one, however long; cards alone have the ids
+    named = replace(poses, people=tuple(replace(person, id=person.id[-3:]) for person in people))
+    for given in (named, replace(poses, people=tuple(people[:1])), replace(poses, scan=None)):
+        cards, scan = panels_of(given)
+        assert [card.label for card in cards] == [person.id for person in given.people]
+        assert scan is None or scan.names == [box.id for box in scan.boxes] == [card.label for card in cards]
 
 
 @pytest.mark.long
@@ -120,12 +128,14 @@ def test_picture_of_scan_has_view_from_above(monkeypatch, tmp_path):
         np.testing.assert_allclose(panel.sensor, origin[:2])
         assert np.abs(panel.boxes[0].center - center).max() < 1e-9
     named = replace(person, box=replace(person.box, id=7))
-    few = replace(person, pose=None, points=np.zeros((0, 3)), box=replace(person.box, id="0123456789abcdef"))
+    few = replace(person, pose=None, points=np.zeros((0, 3)), box=replace(person.box, id=None), id=8)
     written, annotate = [], Axes.annotate
     monkeypatch.setattr(Axes, "annotate", lambda ax, text, *a, **b: written.append(text) or annotate(ax, text, *a, **b))
     replace(poses, people=(named, few), up="z").picture()
     assert panels.pop().label == "2 people, 1 with a pose"
-    assert "7" in written and max(map(len, written)) == bird_eye.LONGEST_NAME
+    assert {"7", "8"} <= set(written)
+    replace(poses, people=(replace(named, id="0123456789abcdef"),), up="z").picture()
+    assert max(map(len, written)) == bird_eye.LONGEST_NAME and panels.pop()
     # without a known sensor position no distance is shown
     unplaced = replace(poses, people=(person,), origin=None)
     assert np.isnan(panels_of(unplaced)[0][0].distance)

@@ -1,6 +1,7 @@
 """Recordings of moving sensors, with irregular times or another up axis; columns of the result tables."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -16,6 +17,7 @@ from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.predictor import Predictor
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.inference.scan import Scan
+from lidarpose.io.sources.frame import Frame
 from lidarpose.recording import output, result_files
 from lidarpose.recording.coordinates import FixedFrame
 from lidarpose.recording.known_people import KnownPeople
@@ -85,6 +87,24 @@ def test_world_option_prints_lines_in_world_frame(monkeypatch, tmp_path, capsys)
     assert_where_people_are([json.loads(line) for line in capsys.readouterr().out.splitlines()])
     assert main(words) == 0
     assert all("coordinates" not in json.loads(line) for line in capsys.readouterr().out.splitlines())
+
+
+def test_frame_of_few_points_does_not_make_a_recording_one_of_crops(model):
+    """The first turn of a sensor may be cut short; the state of a resumed run keeps that nothing is decided."""
+    rng = np.random.default_rng(0)
+    ground = rng.uniform((-20, -20, -1.8), (20, 20, -1.7), (2000, 3))
+    frames = [Frame(index=k, id=str(k), points=points) for k, points in enumerate((rng.random((30, 3)), ground))]
+    predictor = FramePredictor(model=model)
+    few, whole = predictor.predict_all(iter(frames))
+    assert len(few.poses) == 1 and not len(whole.poses)
+    # a crop with enough points decides for larger frames
+    frames[0] = replace(frames[0], points=rng.random((300, 3)))
+    assert [len(frame.poses) for frame in FramePredictor(model=model).predict_all(iter(frames))] == [1, 1]
+    resumed, begun = FramePredictor(model=model), FramePredictor(model=model)
+    (_,) = begun.predict_all(iter([replace(frames[0], points=rng.random((30, 3)))]))
+    resumed.restore(begun.state())
+    (whole,) = resumed.predict_all(iter(frames[1:]))
+    assert not len(whole.poses)
 
 
 def test_fixed_frame_reuses_last_pose_if_missing():

@@ -729,6 +729,13 @@ def test_summary_merges_warnings_that_differ_in_numbers():
     assert len(summary.warning_lines(8)) == 2
 
 
+def test_summary_counts_tracks_with_poses():
+    people = [{"track": id, "joints": joints, "warnings": []} for id, joints in ((0, [[0, 0, 0]]), (1, None))]
+    summary = output.Summary()
+    summary.add({"people": people, "error": None, "warnings": []})
+    assert summary.poses == 1 and summary.tracks == {0}
+
+
 @pytest.mark.long
 def test_picture_of_single_frame_shows_people(drive, tmp_path, monkeypatch):
     drawn, above = [], []
@@ -1174,7 +1181,7 @@ def test_frame_rejects_pose_that_is_not_rigid(T):
     "wrong",
     [
         {"origin": (0, 0)}, {"origin": "unknown"}, {"origin": [0, 0, np.nan]}, {"index": 0.5}, {"index": -1},
-        {"time": "a"}, {"time": np.nan}, {"time": np.datetime64("2026-01-01T00:00:00")},
+        {"time": "a"}, {"time": np.nan}, {"time": 1.7e18}, {"time": np.datetime64("2026-01-01T00:00:00")},
     ],
 )  # fmt: skip
 def test_frame_rejects_invalid_position_index_and_time(wrong):

@@ -89,7 +89,7 @@ def oversize_warning(points: np.ndarray, pose: Pose) -> str | None:
     if width > _WIDEST_CROP:
         return (
             f"the points extend over {width:,.0f} m, and one pose was estimated near their middle: expected a crop "
-            "of one person: give the people's boxes, or crop closer"
+            "of one person: search for people (--find, in Python find=True), give their boxes, or crop closer"
         )
     low, high = np.percentile(points[:, 2], _TRIMMED)
     bound = _UNSURE_OF_SIZE if high - low < _GIANT else _UNSURE_OF_GIANT

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.errors import InputError, check_int, is_number
-from lidarpose.geometry import UP_AXES, rotation_about, up_text
+from lidarpose.geometry import UP_AXES, nearest_axis, rotation_about, up_text, upright_axis
 from lidarpose.inference.background import is_static, read_background
 from lidarpose.inference.checks import flat_along_another_axis, scan_unit_warning, unlikely_origin
 from lidarpose.inference.inputs import distinct, hashes
@@ -61,9 +61,10 @@ class Search:
     def __post_init__(self):
         if not is_number(self.max_range) or not 0 < self.max_range <= FARTHEST:
             actual = reprlib.repr(self.max_range)
-            raise InputError(f"max_range: expected meters, more than 0 and at most {FARTHEST:g}, got {actual}")
+            expected = f"expected meters, more than 0 and at most {FARTHEST:g}"
+            raise InputError(f"max_range (--range): {expected}, got {actual}")
         if self.min_score is not None and not (is_number(self.min_score) and 0 <= self.min_score <= 1):
-            raise InputError(f"min_score: expected a probability from 0 to 1, got {self.min_score!r}")
+            raise InputError(f"min_score (--min-score): expected a probability from 0 to 1, got {self.min_score!r}")
         if self.max_people is not None:
             check_int("max_people", self.max_people, least=1)
 
@@ -140,12 +141,14 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
     up = None if search.exact_up else estimate_up(_near(level, origin, search), origin)
     if up is not None:
         degrees = np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1, 1)))
-        direction = np.round(up @ scan.R_level_input, 3)
-        warnings.append(
-            f"the ground leans by {degrees:.0f} degrees, so the sensor is assumed to be tilted: confirm it with "
-            f"--up {','.join(f'{value:g}' for value in direction)}"
-            + (", or, if the ground slopes, give --up z" if scan.up == "z" else "")
-        )
+        # zero is added, since -0 would be shown
+        direction = np.round(up @ scan.R_level_input, 3) + 0.0
+        if (axis := nearest_axis(direction)) != upright_axis(scan.up):
+            remedy = f"another axis points up: try --up {axis}"
+        else:
+            remedy = f"the sensor is assumed to be tilted: confirm it with --up {','.join(f'{v:g}' for v in direction)}"
+            remedy += ", or, if the ground slopes, give --up z" if scan.up == "z" else ""
+        warnings.append(f"the ground leans by {degrees:.0f} degrees, so {remedy}")
         scan = replace(scan, up=up_text(up @ scan.R_level_input))
         level = _leveled(scan)
         origin = scan.level_origin

@@ -34,7 +34,7 @@ CROP_SIZE = 4.0
 # a smaller one with more points is a whole scan if the unit seems wrong
 _MANY_POINTS = 5000
 # the options of `predict` that choose detection
-_SEARCH_OPTIONS = "min_score, max_range, max_people and background"
+_SEARCH_OPTIONS = "min_score, max_range (--range), max_people and background"
 # maximum difference of equal up directions, as unit vectors: `detect` rounds them to three decimals
 _SAME_UP = 2e-3
 # maximum difference of up directions along the same axis: 45 degrees, the limit for tilted scans

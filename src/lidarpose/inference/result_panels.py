@@ -1,5 +1,6 @@
 """What the pictures of a result show: a panel for each person, level, and the scan seen from above."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -8,30 +9,41 @@ import numpy as np
 from lidarpose.errors import counted
 from lidarpose.geometry import UP_AXES, axes_from_above, rotation_from_up, rotation_of_boxes
 from lidarpose.sample import Box, person_note
-from lidarpose.viz.bird_eye import LONGEST_NAME, ScanPanel
-from lidarpose.viz.draw import shortened
+from lidarpose.viz.bird_eye import ScanPanel
 from lidarpose.viz.person_view import Panel, joined_poses
 
 if TYPE_CHECKING:
     from lidarpose.inference.results import PersonPose, Poses
 
+# characters of the longest id for which names beside each other can be read
+_SHORT_ID = 6
+
 
 def panels_of(poses: "Poses") -> tuple[list[Panel], ScanPanel | None]:
     """The panels to draw: one per person, and the scan around them if there is one."""
     upright_people = [_upright(person, poses.up) for person in poses.people]
+    ids = _ids_in_scan(poses)
     panels = [
         Panel(
             points=p.points,
             pose=p.pose,
-            label=person_label(person.id, person.score, person.mounted),
+            label=person_label(person.id if id == person.id else f"{id}: {person.id}", person.score, person.mounted),
             box=p.box,
             distance=_distance(person, poses.origin),
             note=person_note(person.pose, is_scored=person.score is not None),
             num_points=person.num_points,
         )
-        for p, person in zip(upright_people, poses.people, strict=True)
+        for p, person, id in zip(upright_people, poses.people, ids, strict=True)
     ]
-    return panels, None if poses.scan is None else _from_above(poses, upright_people)
+    return panels, None if poses.scan is None else _from_above(poses, upright_people, ids)
+
+
+def _ids_in_scan(poses: "Poses") -> list[str | int | None]:
+    """The ids that are drawn in a scan: those of the people, or numbers from 1 if ids are too long to be read beside
+    each other."""
+    ids = [person.id for person in poses.people]
+    is_numbered = poses.scan is not None and len(ids) > 1 and max(len(str(id)) for id in ids) > _SHORT_ID
+    return list(range(1, len(ids) + 1)) if is_numbered else ids
 
 
 def _distance(person: "PersonPose", origin: np.ndarray | None) -> float:
@@ -41,8 +53,8 @@ def _distance(person: "PersonPose", origin: np.ndarray | None) -> float:
     return float(np.linalg.norm(np.median(person.points, 0) - origin))
 
 
-def _from_above(poses: "Poses", people: "list[PersonPose]") -> ScanPanel:
-    """The scan with `people`, which are in the level frame (z up)."""
+def _from_above(poses: "Poses", people: "list[PersonPose]", ids: Sequence[str | int | None]) -> ScanPanel:
+    """The scan with `people`, which are in the level frame (z up), and the ids that are drawn beside them."""
     assert poses.scan is not None
     R_level_input = rotation_from_up(poses.up)
     posed = [person for person in people if person.has_pose]
@@ -52,13 +64,13 @@ def _from_above(poses: "Poses", people: "list[PersonPose]") -> ScanPanel:
     return ScanPanel(
         points=poses.scan @ R_level_input.T,
         boxes=[
-            # a box without an id has the number of its card
-            _level_box(box if box.id is not None else replace(box, id=person.id), poses.up)
-            for person in poses.people
+            # also boxes without an id have that of their card
+            _level_box(replace(box, id=id), poses.up)
+            for person, id in zip(poses.people, ids, strict=True)
             if (box := person.box) is not None
         ],
         poses=joined_poses([(person.joints, person.confidence) for person in posed], poses.skeleton),
-        names=[shortened(str(person.id), LONGEST_NAME) for person in posed],
+        names=["" if id is None else str(id) for person, id in zip(people, ids, strict=True) if person.has_pose],
         label=label,
         sensor=None if poses.origin is None else tuple((R_level_input @ poses.origin)[:2].tolist()),
         axes=axes_from_above(poses.up),

@@ -132,7 +132,9 @@ def _other_up_axis(places: DetectedScan, search: Search) -> str | None:
         # outdoors: the axis is right, but the scan may be upside down
         other_axes = [_opposite(input_scan)]
     everyone = replace(search, max_people=None)
-    boxes = {up: find_people(replace(input_scan, up=up), everyone).boxes or [] for up in other_axes}
+    results = {up: find_people(replace(input_scan, up=up), everyone) for up in other_axes}
+    # a wrong axis whose ground leans onto another one finds the same people
+    boxes = {up: result.boxes or [] if upright_axis(result.up) == up else [] for up, result in results.items()}
     best_axis = max(other_axes, key=lambda up: _sum_of_scores(boxes[up]))
     if _sum_of_scores(boxes[best_axis]) < _SURE:
         return None

@@ -251,7 +251,7 @@ def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | N
         if not calib.is_file():
             raise FormatError(
                 f"is a KITTI label: expected its calibration at {calib}, got none: "
-                "put it there or give its path (calib)"
+                "put it there or give its path as --calib (calib=)"
             )
     R_rect_velo, t_rect_velo = _read_calibration(calib)
     entries = []

@@ -190,9 +190,10 @@ class Summary:
 
     def add(self, line: dict[str, Any]) -> None:
         self.frames += 1
-        self.poses += sum(person["joints"] is not None for person in line["people"])
         self.in_world += line.get("coordinates") == "world"
-        self.tracks.update(person["track"] for person in line["people"] if person["track"] is not None)
+        posed = [person for person in line["people"] if person["joints"] is not None]
+        self.poses += len(posed)
+        self.tracks.update(person["track"] for person in posed if person["track"] is not None)
         if line["error"] is not None:
             self.damaged += 1
             name = f" ({line['id']})" if line["id"] else ""

@@ -31,6 +31,8 @@ from lidarpose.skeleton import Skeleton
 SCHEMA = "lidarpose.recording/1"
 # s; maximum wait at the end of the program for the frame that is being read
 _MAX_WAIT = 5.0
+# points of a frame that decides whether the frames are crops of one person
+_ENOUGH = 100
 _Item = TypeVar("_Item")
 
 
@@ -262,9 +264,11 @@ class FramePredictor:
         rotation_from_up(up)
         self.up, self.name, self.skeleton = up_text(up), name, skeleton
         self._origin = sensor_origin if sensor_origin is None else (as_origin(sensor_origin),)
-        # whether the frames are crops; None until the first frame with points decides
+        # whether the frames are crops; None until the first frame with points
         is_crop = crop or (find is False and boxes is None)
         self._is_crop = True if is_crop else False if is_searched or boxes is not None else None
+        # a frame of few points does not decide for those after it
+        self._is_decided = self._is_crop is not None
         # whether any frame was searched
         self._was_searched = False
         self._search = search_options(*search_arguments, columns, topic, meta, up=up if self._has_up else None)
@@ -357,8 +361,8 @@ class FramePredictor:
                 check_up(boxes, self.up, most=SAME_AXIS)
                 scan = replace(scan, up=boxes.up if boxes.has_up else self.up)
             scan = replace(scan, boxes=boxes or [])
-        elif self._is_crop is None and len(points):
-            self._is_crop = not is_whole(scan)
+        elif not self._is_decided and len(points):
+            self._is_crop, self._is_decided = not is_whole(scan), len(points) >= _ENOUGH
         if self._origin is not None:
             (origin,) = self._origin
         else:
@@ -370,12 +374,14 @@ class FramePredictor:
         """The state after the frames so far, as JSON values."""
         people = None if self.people is None else self.people.state()
         boxes_by = None if self.boxes is None else self.boxes.matched_by
-        search_state = {"is_crop": self._is_crop, "was_searched": self._was_searched}
+        is_crop = self._is_crop if self._is_decided else None
+        search_state = {"is_crop": is_crop, "was_searched": self._was_searched}
         return search_state | {"boxes_by": boxes_by, "people": people}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Resumes from the result of `state()`."""
         self._is_crop, self._was_searched = state["is_crop"], state["was_searched"]
+        self._is_decided = self._is_crop is not None
         if self.boxes is not None:
             self.boxes.matched_by = state["boxes_by"]
         if self.people is not None:

@@ -110,8 +110,9 @@ def draw_scans(panels: Sequence[ScanPanel], *, title: str = "", panel_width: flo
     )
     tracks = "; dotted: path over the frames" if any(panel.tracks for panel in panels) else ""
     limbs = "; left limbs blue, right ones orange" if any(is_known(panel.poses) for panel in panels) else ""
+    dots = "; dots: people of all frames" if any(panel.places is not None for panel in panels) else ""
     arrows = "arrow: facing, of given boxes their heading" if any(any(_is_headed(panel)) for panel in panels) else ""
-    note = f"{arrows}{tracks}{limbs}".removeprefix("; ")
+    note = f"{arrows}{tracks}{dots}{limbs}".removeprefix("; ")
     figure.text(0.15 / width, 1 - 0.42 / height, note, fontsize=8, color=FAINT, va="top")
     for number, panel in enumerate(panels):
         row, column = divmod(number, columns)
@@ -132,6 +133,8 @@ def _draw_panel(ax, panel: ScanPanel, size: np.ndarray) -> None:
     for name, set_label in zip(panel.axes, (ax.set_xlabel, ax.set_ylabel), strict=True):
         set_label(f"{name}, m", fontsize=7, color=FAINT, labelpad=1)
     ax.set_title(panel.label, fontsize=10, parse_math=False)
+    # coordinates of maps as they are, not as a sum with an offset
+    ax.ticklabel_format(style="plain", useOffset=False)
     ax.tick_params(labelsize=7, color=FAINT, labelcolor=FAINT)
     ax.spines[:].set_color(_HIGH)
     inside_points = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(1)]

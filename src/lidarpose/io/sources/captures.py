@@ -78,6 +78,6 @@ def _refuse(path: Path, packets: Sequence[Datagram]) -> NoReturn:
         if sum(payload.startswith(preamble) for payload in payloads) > len(payloads) / 4:
             problem = f"has packets of a {vendor} sensor; expected those of an Ouster, Velodyne or Livox sensor"
             raise file_error(path, f"{problem}: convert it to a ROS bag with {vendor}'s driver, or to .pcd files")
-    problem = f"an Ouster recording needs its metadata {path.stem}.json beside it, or the path of another file (meta)"
+    problem = f"an Ouster recording needs its metadata {path.stem}.json beside it, or another file as --meta (meta=)"
     sizes = f"(a Velodyne's packets have {PACKET_BYTES} bytes, these have up to {max(map(len, payloads))})"
     raise file_error(path, f"{problem} {sizes}")

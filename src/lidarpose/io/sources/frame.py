@@ -17,6 +17,8 @@ from lidarpose.io.files import FormatError, file_error, one_line, shorten
 DEFAULT_RATE = 10.0
 # s; seconds since 1970 have a float64 resolution of 0.2 microseconds
 _ROUNDING = 1e-6
+# s, three thousand years: larger times are milliseconds or nanoseconds since 1970
+_LATEST = 1e11
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -70,6 +72,9 @@ class Frame(Sweep):
         object.__setattr__(self, "index", check_int("Frame.index", self.index, least=0))
         if self.time is not None:
             check_finite("Frame.time", self.time)
+            if abs(self.time) > _LATEST:
+                problem = f"expected seconds, got {self.time:g}"
+                raise InputError(f"Frame.time: {problem}: divide nanoseconds by 1e9, milliseconds by 1000")
             object.__setattr__(self, "time", float(self.time))
         if self.origin is not None:
             origin = vector_of(self.origin)

@@ -132,7 +132,7 @@ class BagRecording:
             topic = max(clouds, key=clouds.__getitem__)
             if len(clouds) > 1:
                 self._notes.append(
-                    f"read the topic {topic}, which has the most clouds, of {names}: give topic to read another"
+                    f"read the topic {topic}, which has the most clouds, of {names}: --topic (topic=) reads another"
                 )
         return topic
 
