@@ -32,7 +32,7 @@ from lidarpose.eval.dataset import evenly_drawn, load_bench, open_eval_dataset
 from lidarpose.eval.metric_rows import facing_flipped, metric_rows, triples
 from lidarpose.eval.metrics import aggregate
 from lidarpose.eval.predictions import num_nearby
-from lidarpose.eval.protocols import check_protocol, eval_setup, jittered
+from lidarpose.eval.protocols import check_protocol, crop_of, eval_setup, jittered
 from lidarpose.eval.run import evaluate_dataset
 from lidarpose.geometry import rotation_about
 from lidarpose.inference.results import PersonPose, Poses
@@ -243,7 +243,7 @@ def test_dapt_protocol_crops_and_centers_as_released(sets):
         np.testing.assert_array_equal(center, person.sample.box.center)
     box = replace(person.sample.box, size=person.sample.box.size * 0.6)
     setup = eval_setup(model, open_eval_dataset(sets / "waymo"), protocol="dapt")
-    points, _ = setup.crop(replace(person, sample=replace(person.sample, box=box)))
+    points, _ = crop_of(replace(person, sample=replace(person.sample, box=box)), setup.setting)
     assert 0 < len(points) < len(person.points) and box.contains(points).all()
 
     for _, center, person in shown["leaking"]:

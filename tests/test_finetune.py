@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import dataset_files as files
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 import torch
 import waymo_files
@@ -144,6 +146,19 @@ def test_synthetic_shards_have_visibility_and_accept_noise(synthetic):
         assert len(b.points) > len(a.points) and (b.part[len(a.part) :] == 0).all()
         np.testing.assert_allclose(np.ptp(b.joints, 0)[2], np.ptp(a.joints, 0)[2], atol=1e-5)
     assert sorted(len(plain.example(k).points) for k in range(6)) == sorted(len(item.points) for item in items)
+
+
+def test_dataset_without_people_of_the_split_is_named(datasets, tmp_path):
+    empty = shutil.copytree(datasets["humanm3"], tmp_path / "empty")
+    for shard in empty.rglob("labelled*.parquet"):
+        table = pq.read_table(shard)
+        split = pa.array(["test"] * len(table), table.schema.field("split").type)
+        pq.write_table(table.set_column(table.schema.get_field_index("split"), "split", split), shard)
+    folders = [datasets["humanm3"], empty]
+    dataset = InMemoryDataset.load(folders, split="train")
+    assert dataset.empty == (str(empty),) and len(dataset) == len(InMemoryDataset.load(folders[:1], split="train"))
+    warning, *_ = make_setup(Finetune(data=tuple(map(str, folders)), mix=0.0)).warnings
+    assert warning == f"{empty} has no labeled people in the split of the training"
 
 
 def test_in_memory_dataset_skips_and_names_damaged_shard(datasets, tmp_path):

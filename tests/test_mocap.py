@@ -384,6 +384,18 @@ def test_load_motion_lidarhuman26m_round_trip(tmp_path, up):
     assert motion.names == ("labels/3d/pose/24", "labels/3d/pose/24#2") and tuple(motion.length) == (4, 7)
 
 
+def test_damaged_lidarhuman26m_pose_file_ends_a_clip(tmp_path):
+    rotations, way = files.a_clip(12)
+    folder = files.write_pose_json(tmp_path / "labels/3d/pose/24", rotations, way, up="z", first=5)
+    damaged = folder / "000009.json"
+    damaged.write_text(damaged.read_text()[:50])
+    with pytest.warns(UserWarning, match=r"left out 1 of 12 pose files: .*000009\.json: is not JSON"):
+        motion = load_motion(tmp_path, up="z")
+    assert tuple(motion.length) == (4, 7) and len(load_betas(tmp_path)) <= 1
+    with pytest.raises(InputError, match=r"000009\.json: is not JSON"):
+        load_motion(damaged)
+
+
 def test_load_motion_levels_lidarhuman26m(tmp_path):
     """The frame of a sensor that looks down is turned level, as by `prepare`; up="z" keeps it."""
     rotations, way = files.a_clip(120)
@@ -412,8 +424,13 @@ def test_load_motion_levels_lidarhuman26m(tmp_path):
 def test_load_motion_reports_bad_pose_json(tmp_path, content, message):
     folder = files.write_pose_json(tmp_path / "7", *files.a_clip(3))
     (folder / "000002.json").write_text(content)
-    for path in (folder, folder / "000002.json"):
-        refused(path, message, named="000002.json")
+    refused(folder / "000002.json", message, named="000002.json")
+    # a folder is read without it
+    with pytest.warns(UserWarning, match=rf"left out 1 of 3 pose files: \S*000002\.json: [^\n]*{message}[^\n]*$"):
+        assert len(load_motion(folder, up="z").rotations) == 2
+    for path in folder.iterdir():
+        path.write_text(content)
+    refused(folder, message, named=".json")
     (folder / "000002.json").write_text(json.dumps({"pose": [0] * 72, "trans": [None] * 3}))
     refused(folder / "000002.json", "expected pose|not finite")
 

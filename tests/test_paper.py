@@ -944,3 +944,14 @@ def test_paper_table1_from_raw_lidarhuman26m(tmp_path, smpl, monkeypatch):
     assert cell["people_seen"] == 8 * 16 and cell["people_scored"] == 16 and cell["undertrained"]
     assert len(cell["joints"]) == 24 and cell["mpjpe"] > 0 and cell["mean_pose"] > 0
     assert "| LiDARCap | " in (out / "table1.md").read_text()
+
+
+def test_table_in_folder_that_cannot_be_written_is_refused(tmp_path, monkeypatch, capsys):
+    def refuse(*_, **__):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    assert main(["paper", "table4", "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert "out: cannot be written (Read-only file system): give another folder by --out" in error
+    assert error.count("\n") == 1

@@ -453,7 +453,9 @@ def test_corpus_entry_in_other_format_is_skipped(tmp_path, smpl):
     assert "y.bin is not in" in skipped[0].where
 
 
-def test_noisemotion_placement_is_the_one_nearer_to_the_points(tmp_path, smpl):
+@pytest.mark.parametrize("meaning", ["trans", "the pelvis"])
+def test_noisemotion_placement_is_the_one_nearer_to_a_files_points(tmp_path, smpl, meaning):
+    """Even where the other one is nearer to the points of a person."""
     # as of SMPL itself, the pelvis of the body at rest is not at the origin
     model = dict(np.load(smpl, allow_pickle=False))
     model["v_template"] = model["v_template"] + [0.3, 0.0, 0.0]
@@ -462,14 +464,19 @@ def test_noisemotion_placement_is_the_one_nearer_to_the_points(tmp_path, smpl):
     truth = files.write_freemotion(tmp_path, shifted, name="FreeMotion_train.pkl", noise=True)
     path = tmp_path / "FreeMotion_train.pkl"
     entries = pickle.loads(path.read_bytes())
-    for entry in entries:
+    for number, entry in enumerate(entries):
         pelvis = SmplJoints(shifted, "")(entry["shape"][1:2], entry["gt"][1:2], np.zeros((1, 3)))[0, 0]
-        entry["T_1"], entry["T_3"] = entry["T_1"] - pelvis, entry["T_3"] - pelvis
+        for view in (1, 2, 3):
+            if meaning == "trans" and f"T_{view}" in entry:
+                entry[f"T_{view}"] = entry[f"T_{view}"] - pelvis
+            if number == 0 and view == 1:
+                # a few points, nearer to the other placement
+                entry["pc_1"] = entry["pc_1"][:5] + 0.6 * (pelvis if meaning == "the pelvis" else -pelvis)
     path.write_bytes(pickle.dumps(entries))
     items, skipped = everything("noisemotion", tmp_path, shifted)
     assert not skipped and len(items) == len(truth)
     for item in items:
-        assert item.source == f"noisemotion/T is {'the pelvis' if item.track == '2' else 'trans'}"
+        assert item.source == f"noisemotion/T is {meaning}"
         np.testing.assert_allclose(item.joints, truth[item.sequence, item.frame, item.track], atol=1e-5)
 
 

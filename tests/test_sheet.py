@@ -117,6 +117,8 @@ def test_view_draws_prepared_dataset(tmp_path, monkeypatch):
     assert main(["view", "walks"]) == 0 and main(["view", "walks", "--html"]) == 0
     page = (tmp_path / "walks.html").read_text()
     assert "distance m" in page and "does" not in re.findall("<th>(.*?)</th>", page)
+    # a person is named by sequence, frame and track
+    assert len(set(re.findall(r"<strong>(\S+ \d+ \S+)</strong>", page))) == page.count("<strong>") > 1
     for path in (tmp_path / "walks").glob("*.parquet"):
         path.unlink()
     with pytest.raises(InputError, match="or run lidarpose prepare again"):

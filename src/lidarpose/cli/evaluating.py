@@ -260,7 +260,11 @@ def _interval_text(row) -> str:
 def _study(study) -> Iterator[str]:
     yield f"{study.setting.method} perturbed: MPJPE in mm of {study.who} · {study.setting.summary}"
     for curve in study.curves:
-        points = (f"{p.label}: {'-' if p.mpjpe is None else f'{p.mpjpe:.1f}'}" for p in curve.points)
+        points = (
+            f"{p.label}: {'-' if p.mpjpe is None else f'{p.mpjpe:.1f}'}"
+            + f" ({p.no_pose} without pose)" * (p.no_pose > 0)
+            for p in curve.points
+        )
         yield f"  {curve.title:<38} {'  '.join(points)}"
     for end in study.ends:
         yield f"  {end.group} of the worst {end.worst:,} people: {end.mean:.1f} mm, deviation {end.deviation:.1f}"

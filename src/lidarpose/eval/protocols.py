@@ -154,6 +154,22 @@ class Model(Protocol):
     def outputs(self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None): ...
 
 
+def crop_of(person: EvalSample, setting: Setting) -> tuple[np.ndarray, Box | None]:
+    """The points that a network gets under the protocol, and the box that they are cropped with.
+
+    Protocol dapt uses the released code's box, clean a detector's box, which depends only on the seed and the person's
+    position in the dataset. If nothing is cropped, the box is the dataset's own, if any.
+    """
+    sample = person.sample
+    if setting.protocol == "dapt":
+        is_inside, _ = released_view(person.points, sample.joints, sample.centers, sample.box)
+        return person.points[is_inside], released_box(sample.joints, sample.centers, sample.box)
+    if setting.kind in _OWN_CROP or setting.kind not in _CLEAN_CROPS or sample.box is None:
+        return person.points, sample.box
+    box = jittered(sample.box, np.random.default_rng([setting.seed, person.shard, person.row]))
+    return person.points[box.contains(person.points)], box
+
+
 @dataclass(frozen=True, kw_only=True)
 class EvalSetup:
     """A network and a dataset, checked: see `eval_setup`. joints: those that are scored."""
@@ -162,21 +178,6 @@ class EvalSetup:
     dataset: EvalDataset
     setting: Setting
     joints: Skeleton
-
-    def crop(self, person: EvalSample) -> tuple[np.ndarray, Box | None]:
-        """The points that the network gets under the protocol, and the box that they are cropped with.
-
-        Protocol dapt uses the released code's box, clean a detector's box, which depends only on the seed and the
-        person's position in the dataset. If nothing is cropped, the box is the dataset's own, if any.
-        """
-        sample, setting = person.sample, self.setting
-        if setting.protocol == "dapt":
-            is_inside, _ = released_view(person.points, sample.joints, sample.centers, sample.box)
-            return person.points[is_inside], released_box(sample.joints, sample.centers, sample.box)
-        if setting.kind in _OWN_CROP or setting.kind not in _CLEAN_CROPS or sample.box is None:
-            return person.points, sample.box
-        box = jittered(sample.box, np.random.default_rng([setting.seed, person.shard, person.row]))
-        return person.points[box.contains(person.points)], box
 
     def crop_sample(self, person: EvalSample) -> tuple[EvalSample | None, str]:
         """The person as cropped by the protocol; or None, and the reason for which the person is skipped."""
@@ -187,7 +188,7 @@ class EvalSetup:
                 return None, f"people without the center {center!r}"
             if kind == "humanm3" and (person.sample.joint_labels == UNLABELED).all():
                 return None, "people without a labelled joint, which their box needs"
-        points, box = self.crop(person)
+        points, box = crop_of(person, self.setting)
         if len(points) < min_points:
             return None, f"people of under {min_points} points, as the released code skips them"
         return replace(person, points=points, crop_box=box), ""

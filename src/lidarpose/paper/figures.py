@@ -10,6 +10,8 @@ import numpy as np
 from lidarpose.eval.charts import compare_ends, compare_stability
 from lidarpose.eval.dataset import open_eval_dataset
 from lidarpose.eval.predictions import read_poses
+from lidarpose.eval.protocols import crop_of
+from lidarpose.eval.scores import FILE, read_scores
 from lidarpose.io.atomic import write_atomic
 from lidarpose.paper.cells import Cell
 from lidarpose.paper.report import can_be_drawn, stability_study
@@ -80,7 +82,10 @@ def _side_by_side(cells: dict[str, Cell], out: Path) -> bytes:
     hardest_keys = [common_keys[k] for k in np.argsort(-overall, kind="stable") if not np.isnan(overall[k])][:HARDEST]
     target = next(iter(cells.values())).target
     folder = target.test.product(out) if isinstance(target.test, Step) else target.test
-    clouds = {(p.shard, p.row): p.points for p in open_eval_dataset(folder) if (p.shard, p.row) in set(hardest_keys)}
+    # all methods have the same crops
+    setting = read_scores(next(iter(paths.values())).with_name(FILE)).results[0].setting
+    hardest = [person for person in open_eval_dataset(folder) if (person.shard, person.row) in hardest_keys]
+    clouds = {(person.shard, person.row): crop_of(person, setting)[0] for person in hardest}
     panels = []
     for key in hardest_keys:
         for k, (row, p) in enumerate(predictions.items()):

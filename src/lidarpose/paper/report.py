@@ -245,7 +245,7 @@ def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
         "people_scored": row.people,
         "joints": list(result.setting.joints),
         "protocol": result.setting.summary,
-        "notes": [*result.notes, *(f"training {warning}" for warning in header.card.get("warnings", ()))],
+        "notes": [*result.notes, *(f"training: {warning}" for warning in header.card.get("warnings", ()))],
         "people_seen": sum(run.get("people_seen", 0) for run in runs),
         "hours": round(sum(run.get("hours", 0.0) for run in runs), 3),
         "people_per_second": round(entry["people"] / entry["seconds"], 1) if entry and entry["seconds"] else None,

@@ -303,7 +303,10 @@ def length_of(step: Step, out: Path) -> tuple[str, ...]:
 def begin_out(out: Path) -> None:
     """Creates the folder at once, since another process may start another table in it. Raises as `check_out`."""
     check_out(out)
-    (out / RUNS).mkdir(parents=True, exist_ok=True)
+    try:
+        (out / RUNS).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror}): give another folder by --out") from None
 
 
 def check_out(out: Path) -> None:

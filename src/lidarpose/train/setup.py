@@ -264,7 +264,7 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     source = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=turn_augmentation, **noise)
     # PRN and LPFormer derive a point's part from the nearest joint
     has_parts = config.neck != "prn" if isinstance(config, DaptConfig) else not isinstance(config, BaselineConfig)
-    return replace(setup, source=source, warnings=_damage(dataset) + (_no_parts(dataset) if has_parts else ()))
+    return replace(setup, source=source, warnings=_left_out(dataset) + (_no_parts(dataset) if has_parts else ()))
 
 
 def _check_no_test(folder: str) -> None:
@@ -278,12 +278,14 @@ def _check_no_test(folder: str) -> None:
         )
 
 
-def _damage(dataset: InMemoryDataset) -> tuple[str, ...]:
-    """A warning about damaged shards that are left out, in one line."""
-    if not dataset.damaged:
-        return ()
-    problem, count = dataset.damaged[0], len(dataset.damaged) - 1
-    return (f"left out {len(dataset.damaged)} damaged shards: {problem}" + (f", and {count} more" if count else ""),)
+def _left_out(dataset: InMemoryDataset) -> tuple[str, ...]:
+    """Warnings, a line each, about damaged shards that are left out and datasets that give no people."""
+    lines = [f"{folder} has no labeled people in the split of the training" for folder in dataset.empty]
+    if dataset.damaged:
+        problem, count = dataset.damaged[0], len(dataset.damaged) - 1
+        others = f", and {count} more" if count else ""
+        lines.append(f"left out {len(dataset.damaged)} damaged shards: {problem}{others}")
+    return tuple(lines)
 
 
 def _no_parts(dataset: InMemoryDataset) -> tuple[str, ...]:
@@ -334,7 +336,7 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
         validation=validation,
         joints=joints,
         card=card | {"damaged": list(dataset.damaged)},
-        warnings=_damage(dataset) + ((no_validation,) if held_out_dataset is None else ()),
+        warnings=_left_out(dataset) + ((no_validation,) if held_out_dataset is None else ()),
     )
     if not isinstance(config, LidarcapConfig):
         if recipe.shift_windows:

@@ -37,7 +37,7 @@ class InMemoryDataset:
     They are stored as in the shards, in Arrow memory, which worker processes share. parts: for each shard its dataset,
     its rows, and whether any joint of the dataset is labeled as hidden; place (N, 2): each sample's part and row;
     sequence (N,): index into `sequences`; skeleton: name of the datasets' skeleton; dataset: name of the first dataset,
-    "" if synthetic; damaged: shards that cannot be read.
+    "" if synthetic; damaged: shards that cannot be read; empty: folders of datasets without any of these samples.
     """
 
     parts: list[tuple[DatasetReader, Any, bool]]
@@ -47,6 +47,7 @@ class InMemoryDataset:
     skeleton: str
     dataset: str
     damaged: tuple[str, ...]
+    empty: tuple[str, ...] = ()
 
     @classmethod
     def load(cls, folders: Sequence[str | Path], *, split: str | None = None, interval: int = 1) -> "InMemoryDataset":
@@ -60,6 +61,7 @@ class InMemoryDataset:
         parts: list[tuple[DatasetReader, Any, bool]] = []
         names: list[str] = []
         damaged: list[str] = []
+        empty: list[str] = []
         for dataset in datasets:
             if split is not None and dataset.card.people != "labelled":
                 problem = f"contains synthetic people, which have no split {split!r}: give --split all"
@@ -67,7 +69,9 @@ class InMemoryDataset:
             shards = list(_shards(dataset, split, interval, damaged))
             has_hidden = any(hidden for _, _, hidden in shards)
             parts += [(dataset, rows, has_hidden) for rows, _, _ in shards]
-            names += chain.from_iterable(shard_names for _, shard_names, _ in shards)
+            dataset_names = list(chain.from_iterable(shard_names for _, shard_names, _ in shards))
+            names += dataset_names
+            empty += [] if dataset_names else [str(dataset.folder)]
         skeletons = sorted({dataset.card.skeleton for dataset in datasets})
         if len(skeletons) > 1:
             raise InputError(f"datasets of one training need the same skeleton, got {', '.join(skeletons)}")
@@ -85,6 +89,7 @@ class InMemoryDataset:
             skeleton=skeletons[0],
             dataset=str(datasets[0].card.settings.get("dataset", "")),
             damaged=tuple(damaged),
+            empty=tuple(empty),
         )
 
     def __len__(self) -> int:

@@ -25,8 +25,10 @@ with the same `seq_path` or `motion_id`, in order, form a clip.
 
 import os
 import reprlib
+import warnings
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,6 +39,7 @@ from lidarpose.body.mocap.leveling import leveling
 from lidarpose.body.mocap.motion import Motion, is_of, join, standing_axis, usable_clips
 from lidarpose.body.mocap.retarget import motion_from_joints
 from lidarpose.body.rig import forward_kinematics, mean_adult_joints
+from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_from_up
 from lidarpose.io.files import FRAME_NUMBER, file_error, folders_below, read_json
 from lidarpose.io.npz import read_npz
@@ -262,8 +265,10 @@ def load_betas(path: str | os.PathLike, subjects: Sequence[str] = ()) -> np.ndar
         if file.suffix.lower() == ".json" and FRAME_NUMBER.fullmatch(file.stem):
             sequence = clip if file == path else path.stem if file.parent == path else clip.rpartition("/")[0]
             if is_wanted(sequence):
-                content = read_json(file, expected=_POSE_FILE)
-                rows.append(_first_betas(content.get("beta") if isinstance(content, dict) else None))
+                # `load_motion` warns of damaged files
+                with suppress(InputError):
+                    content = read_json(file, expected=_POSE_FILE)
+                    rows.append(_first_betas(content.get("beta") if isinstance(content, dict) else None))
         elif file.suffix.lower() == ".npz" and is_wanted(clip):
             rows.append(_first_betas(read_npz(file, ("betas",), expected="an npz file of motion")[0].get("betas")))
         elif file.suffix.lower() == ".pkl" and isinstance(labels := load_pickle(file), dict):
@@ -294,15 +299,27 @@ def pose_files(folder: Path) -> list[Path]:
 
 
 def load_lidarhuman26m(path: str | os.PathLike, *, up: str | None = None, fps: float | None = None) -> Motion:
-    """The motion of a folder of numbered pose files, or of a single file. A missing number ends a clip.
+    """The motion of a folder of numbered pose files, or of a single file. A missing number or, with a warning, a
+    damaged file ends a clip.
 
     The sensor's frame is tilted as it was mounted: unless `up` is given, the sequence is turned level by one rotation,
     as `lidarpose prepare` does. up="z" keeps the frame.
     """
     path = Path(path)
     files = pose_files(path) if path.is_dir() else [path]
-    poses, trans = zip(*(_read_pose_file(file) for file in files), strict=True)
-    number = np.array([int(file.stem) for file in files]) if path.is_dir() else None
+    read: dict[Path, tuple[np.ndarray, np.ndarray]] = {}
+    damaged: list[InputError] = []
+    for file in files:
+        try:
+            read[file] = _read_pose_file(file)
+        except InputError as error:
+            damaged.append(error)
+    if not read:
+        raise damaged[0]
+    if damaged:
+        warnings.warn(f"left out {len(damaged)} of {len(files)} pose files: {damaged[0]}", stacklevel=2)
+    poses, trans = zip(*read.values(), strict=True)
+    number = np.array([int(file.stem) for file in read]) if path.is_dir() else None
     fps = fps or LIDARHUMAN26M_FPS
     motion = motion_from_smpl(path, poses, trans, name=path.stem, fps=fps, up=up, kind="LiDARHuman26M", number=number)
     return _leveled(motion) if up is None else motion

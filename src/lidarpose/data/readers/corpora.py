@@ -11,8 +11,10 @@ Sources: 4DVLab/LIP dataset/LIP_dataset.py, 4DVLab/LiveHPS dataset/Livehps_datas
 Pickles are read without running them.
 """
 
+import collections
 from abc import abstractmethod
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -168,12 +170,28 @@ class NoiseMotion(FreeMotion):
     name = "noisemotion"
     # the files do not say which of the three poses belongs to the points; the middle one is off by at most 33 ms
     _poses, _which = 3, 1
+    # what T is in the file that is read; until it is known, the distances of the points, m, by what it may be
+    _meaning: str | None = None
+    _distances: dict[str, list[float]]
+
+    def read(self, root: Path, part: str) -> Iterator[LabeledSample | Skipped]:
+        """The script writes SURREAL's trans, LiveHPS's loader expects the pelvis: whichever is nearer to the points of
+        a file's people in the median."""
+        reader = copy(self)
+        reader._distances = {}
+        # read once for the distances
+        collections.deque(super(NoiseMotion, reader).read(root, part), maxlen=0)
+        medians = {meaning: np.median(distances) for meaning, distances in reader._distances.items()}
+        reader._meaning = min(medians, key=medians.__getitem__, default="")
+        yield from super(NoiseMotion, reader).read(root, part)
 
     def _place(self, points: np.ndarray, joints: np.ndarray, position: np.ndarray) -> tuple[np.ndarray, str]:
-        """The script writes SURREAL's trans, LiveHPS's loader expects the pelvis: whichever is nearer to the points."""
-        candidates = {"/T is the pelvis": joints - joints[0] + position, "/T is trans": joints + position}
-        words = _nearest(points, candidates)
-        return candidates[words], words
+        candidates = {"T is the pelvis": joints - joints[0] + position, "T is trans": joints + position}
+        if self._meaning is None and len(points):
+            for meaning, placed in candidates.items():
+                self._distances.setdefault(meaning, []).append(_apart(points, placed))
+        meaning = self._meaning or next(iter(candidates))
+        return candidates[meaning], f"/{meaning}"
 
     def parts(self, root: Path) -> list[str]:
         """The pickles. Raises InputError if there are only raw clouds, which have no poses."""
