@@ -362,16 +362,20 @@ def test_detect_suggests_no_axis_whose_ground_leans_onto_another(scene, monkeypa
     assert warning == "no people found with up z, but 2 people with up -x: try --up -x"
 
 
-def test_ground_that_leans_onto_another_axis_names_it(scene, monkeypatch):
-    scan = detection.Scan(points=scene[0], origin=np.zeros(3))
-    for direction, advice in (
-        ([0.1, 0.0, 1.0], "the sensor is assumed to be tilted: confirm it with --up 0.1,0,0.995"),
-        ([1.0, 0.0, -0.1], "another axis points up: try --up x"),
-    ):
-        up = np.array(direction) / np.linalg.norm(direction)
-        monkeypatch.setattr(detection, "estimate_up", lambda *_, up=up: up)
-        (warning, *_) = detection.detect_places(scan, detection.Search()).scan.warnings
-        assert advice in warning
+@pytest.mark.parametrize(
+    ("given", "direction", "advice"),
+    [
+        ("z", [0.1, 0.0, 1.0], "the sensor is assumed to be tilted: confirm it with --up 0.1,0,0.995"),
+        ("z", [1.0, 0.0, -0.1], "another axis points up: try --up x"),
+        ("y", [0.0, 0.6, 0.8], "another axis points up: try it without --up"),
+    ],
+)
+def test_ground_that_leans_onto_another_axis_names_it(scene, monkeypatch, given, direction, advice):
+    scan = detection.Scan(points=scene[0], origin=np.zeros(3), up=given)
+    up = scan.R_level_input @ direction / np.linalg.norm(direction)
+    monkeypatch.setattr(detection, "estimate_up", lambda *_: up)
+    warnings = detection.detect_places(scan, detection.Search()).scan.warnings
+    assert any("the ground leans by" in warning and advice in warning for warning in warnings)
 
 
 def test_detect_suggests_opposite_up_axis(scene):

@@ -158,7 +158,7 @@ def test_dataset_without_people_of_the_split_is_named(datasets, tmp_path):
     dataset = InMemoryDataset.load(folders, split="train")
     assert dataset.empty == (str(empty),) and len(dataset) == len(InMemoryDataset.load(folders[:1], split="train"))
     warning, *_ = make_setup(Finetune(data=tuple(map(str, folders)), mix=0.0)).warnings
-    assert warning == f"{empty} has no labeled people in the split of the training"
+    assert warning == f"{empty} has no labeled people for the training, see its splits"
 
 
 def test_in_memory_dataset_skips_and_names_damaged_shard(datasets, tmp_path):

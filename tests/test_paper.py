@@ -203,6 +203,12 @@ def test_fig5_draws_hardest_people_of_all_methods(finished, monkeypatch):
     for one, other in zip(drawn[::2], drawn[1::2], strict=True):
         np.testing.assert_array_equal(facing_of(one), facing_of(other))
         np.testing.assert_array_equal(facing_of(one), facing(one.truth))
+    # the points are those that the networks had
+    with monkeypatch.context() as patch:
+        patch.setattr(figures, "crop_of", lambda person, setting: (person.points[: 7 + setting.seed], None))
+        drawn.clear()
+        figures.draw("fig5", selected, out)
+    assert {len(panel.points) for panel in drawn} == {7}
     # a missing pose is no error of 0 mm, and does not make a person easier
     read = figures.read_poses
 

@@ -97,6 +97,8 @@ def test_people_with_long_ids_are_numbered_in_scan():
     cards, scan = panels_of(poses)
     assert [box.id for box in scan.boxes] == [1, 2] and scan.names == ["1", "2"]
     assert [card.label for card in cards] == ["1: walker_a", "2: walker_b"]
+    cards, _ = panels_of(replace(poses, people=(replace(people[0], id=None), replace(people[1], id="2"), people[0])))
+    assert [card.label for card in cards] == ["1", "2", "3: walker_a"]
     # short ids are drawn, and a single one, however long; cards alone have the ids
     named = replace(poses, people=tuple(replace(person, id=person.id[-3:]) for person in people))
     for given in (named, replace(poses, people=tuple(people[:1])), replace(poses, scan=None)):

@@ -1,7 +1,6 @@
 """Recordings of moving sensors, with irregular times or another up axis; columns of the result tables."""
 
 import json
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -90,21 +89,29 @@ def test_world_option_prints_lines_in_world_frame(monkeypatch, tmp_path, capsys)
 
 
 def test_frame_of_few_points_does_not_make_a_recording_one_of_crops(model):
-    """The first turn of a sensor may be cut short; the state of a resumed run keeps that nothing is decided."""
+    """The first turn of a sensor may be cut short."""
     rng = np.random.default_rng(0)
+    few, enough, none = rng.random((30, 3)), rng.random((300, 3)), np.zeros((0, 3))
     ground = rng.uniform((-20, -20, -1.8), (20, 20, -1.7), (2000, 3))
-    frames = [Frame(index=k, id=str(k), points=points) for k, points in enumerate((rng.random((30, 3)), ground))]
-    predictor = FramePredictor(model=model)
-    few, whole = predictor.predict_all(iter(frames))
-    assert len(few.poses) == 1 and not len(whole.poses)
-    # a crop with enough points decides for larger frames
-    frames[0] = replace(frames[0], points=rng.random((300, 3)))
-    assert [len(frame.poses) for frame in FramePredictor(model=model).predict_all(iter(frames))] == [1, 1]
-    resumed, begun = FramePredictor(model=model), FramePredictor(model=model)
-    (_,) = begun.predict_all(iter([replace(frames[0], points=rng.random((30, 3)))]))
-    resumed.restore(begun.state())
-    (whole,) = resumed.predict_all(iter(frames[1:]))
-    assert not len(whole.poses)
+    stray = np.concatenate([few, [[0.5, 9.0, 0.5]]])
+
+    def frames_of(clouds):
+        return [Frame(index=k, id=str(k), points=points) for k, points in enumerate(clouds)]
+
+    def people(clouds, predictor=None):
+        predictor = predictor or FramePredictor(model=model)
+        return [len(frame.poses) for frame in predictor.predict_all(iter(frames_of(clouds)))]
+
+    assert people([few, ground]) == [1, 0]
+    # a crop with enough points decides, and crops may be small, empty or have a stray point
+    assert people([enough, ground]) == [1, 1]
+    assert people([few, stray, few, none]) == [1, 1, 1, 1]
+    # resumed runs go on in the same way
+    for later in (ground, stray, none):
+        begun, resumed = FramePredictor(model=model), FramePredictor(model=model)
+        (one,) = people([few], begun)
+        resumed.restore(json.loads(json.dumps(begun.state())))
+        assert [one, *people([later], resumed)] == people([few, later])
 
 
 def test_fixed_frame_reuses_last_pose_if_missing():

@@ -520,6 +520,11 @@ def test_kitti_sequence_has_times_and_poses_in_first_frame(tmp_path, semantic):
     (sequence / "calib.txt").write_text("Tr: 1 2 3\n")
     source = open_source(sequence)
     assert source.count == 5 and "poses are not known" in source.warnings[0]
+    # nanoseconds since 1970
+    np.savetxt(sequence / "times.txt", 1.7e18 + 1e8 * np.arange(5))
+    source = open_source(sequence, rate=5)
+    assert [frame.time for frame in source] == [0.0, 0.2, 0.4, 0.6, 0.8]
+    assert "has times that are not seconds: read as 5 frames per second" in source.warnings
 
 
 def quaternion(R):

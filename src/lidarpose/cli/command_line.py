@@ -34,7 +34,7 @@ def run(arguments: list[str] | None = None) -> int:
     if unknown:
         # the error points to the command's own help, which lists its options
         parser.prog = " ".join(filter(None, (parser.prog, options.command)))
-        hint = _hint(options.command, unknown, words) or _likely_option(parser, options.command, unknown[0])
+        hint = _hint(options.command, unknown, words) or _likely_option(parser, options.command, unknown)
         parser.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
     if options.command is None:
         parser.print_help()
@@ -84,10 +84,11 @@ def _hint(command: str | None, unknown: list[str], words: list[str]) -> str:
     return ": --picture and --html take no file name, they are named as --out, NAME.png beside NAME.json or NAME.jsonl"
 
 
-def _likely_option(parser: argparse.ArgumentParser, command: str | None, word: str) -> str:
-    """The command's option that the word may be meant for, as a hint; "" if there is none."""
+def _likely_option(parser: argparse.ArgumentParser, command: str | None, unknown: list[str]) -> str:
+    """The command's option that the first unknown one may be meant for, as a hint; "" if there is none."""
     commands = next(action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
-    names = commands.choices[command]._option_string_actions if command and word.startswith("--") else ()
+    word = next((word for word in unknown if word.startswith("--")), "")
+    names = commands.choices[command]._option_string_actions if command and word else ()
     likely = difflib.get_close_matches(word.partition("=")[0].replace("_", "-"), names, 1, 0.7)
     return f", did you mean {likely[0]}?" if likely else ""
 

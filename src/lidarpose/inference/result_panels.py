@@ -27,7 +27,7 @@ def panels_of(poses: "Poses") -> tuple[list[Panel], ScanPanel | None]:
         Panel(
             points=p.points,
             pose=p.pose,
-            label=person_label(person.id if id == person.id else f"{id}: {person.id}", person.score, person.mounted),
+            label=person_label(_card_id(person.id, id), person.score, person.mounted),
             box=p.box,
             distance=_distance(person, poses.origin),
             note=person_note(person.pose, is_scored=person.score is not None),
@@ -44,6 +44,11 @@ def _ids_in_scan(poses: "Poses") -> list[str | int | None]:
     ids = [person.id for person in poses.people]
     is_numbered = poses.scan is not None and len(ids) > 1 and max(len(str(id)) for id in ids) > _SHORT_ID
     return list(range(1, len(ids) + 1)) if is_numbered else ids
+
+
+def _card_id(id: str | int | None, id_in_scan: str | int | None) -> str | int | None:
+    """The id on a card, after the one in the scan if that is another one."""
+    return id_in_scan if id is None or str(id) == str(id_in_scan) else f"{id_in_scan}: {id}"
 
 
 def _distance(person: "PersonPose", origin: np.ndarray | None) -> float:

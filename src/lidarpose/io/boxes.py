@@ -242,8 +242,8 @@ def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | N
             raise FormatError(
                 f"expected a KITTI label of 15 values on line {number}, got {shorten(line)!r}: correct it"
             )
-        score = _parse_numbers(words[15:16], 1)
-        people.append((values, {"score": score[0] if score else None, "mounted": words[0] == "Cyclist"}))
+        scores = _parse_numbers(words[15:16], 1)
+        people.append((values, scores[0] if scores else None, words[0] == "Cyclist"))
     if not people:
         return []
     if calib is None:
@@ -255,12 +255,13 @@ def _read_kitti(path: str | os.PathLike, text: str, calib: str | os.PathLike | N
             )
     R_rect_velo, t_rect_velo = _read_calibration(calib)
     entries = []
-    for (height, width, length, x, y, z, rotation_y), known in people:
+    for (height, width, length, x, y, z, rotation_y), score, is_mounted in people:
         # the camera's y axis points down, and a label's location is the center of the box's bottom face
         center = R_rect_velo.T @ (np.array([x, y - height / 2, z]) - t_rect_velo)
         forward = R_rect_velo.T @ np.array([math.cos(rotation_y), 0, -math.sin(rotation_y)])
         yaw = math.atan2(forward[1], forward[0])
-        entries.append({"center": center.tolist(), "size": [length, width, height], "yaw": yaw, **known})
+        box = {"center": center.tolist(), "size": [length, width, height], "yaw": yaw}
+        entries.append(box | {"score": score, "mounted": is_mounted})
     return entries
 
 

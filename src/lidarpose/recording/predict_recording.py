@@ -31,8 +31,9 @@ from lidarpose.skeleton import Skeleton
 SCHEMA = "lidarpose.recording/1"
 # s; maximum wait at the end of the program for the frame that is being read
 _MAX_WAIT = 5.0
-# points of a frame that decides whether the frames are crops of one person
-_ENOUGH = 100
+# points of a frame that decides whether the frames are crops of one person, and of a whole scan that decides after
+# smaller crops: a crop may have a stray point
+_ENOUGH, _WHOLE = 100, 1000
 _Item = TypeVar("_Item")
 
 
@@ -131,9 +132,9 @@ def predict_recording(
             `FrameBoxes`. `track=True` tracks people over time; known people are then not verified in each frame.
             `live=True` tracks people and smooths their poses using past frames only. `up=None` means what `boxes`
             state, else z. `calib`, `crop`, `find`, `min_score`, `max_range`, `max_people`, `background`,
-            `sensor_origin`, `skeleton` and `model` are as in `predict`, except that the first frame with points decides
-            whether all frames are crops of one person, and that a frame's own `origin` takes the place of
-            `sensor_origin=None`.
+            `sensor_origin`, `skeleton` and `model` are as in `predict`, except that the first frame of at least 100
+            points decides whether all frames are crops of one person (smaller crops before a whole scan are posed as
+            crops), and that a frame's own `origin` takes the place of `sensor_origin=None`.
 
     Yields:
         `FramePoses` of each frame, including damaged frames. The warnings of the first include those about the source,
@@ -264,10 +265,9 @@ class FramePredictor:
         rotation_from_up(up)
         self.up, self.name, self.skeleton = up_text(up), name, skeleton
         self._origin = sensor_origin if sensor_origin is None else (as_origin(sensor_origin),)
-        # whether the frames are crops; None until the first frame with points
+        # whether the frames are crops, None until the first frame with points; and whether that is final
         is_crop = crop or (find is False and boxes is None)
         self._is_crop = True if is_crop else False if is_searched or boxes is not None else None
-        # a frame of few points does not decide for those after it
         self._is_decided = self._is_crop is not None
         # whether any frame was searched
         self._was_searched = False
@@ -362,7 +362,9 @@ class FramePredictor:
                 scan = replace(scan, up=boxes.up if boxes.has_up else self.up)
             scan = replace(scan, boxes=boxes or [])
         elif not self._is_decided and len(points):
-            self._is_crop, self._is_decided = not is_whole(scan), len(points) >= _ENOUGH
+            looks_whole = is_whole(scan)
+            if not (self._is_crop and looks_whole and len(points) < _WHOLE):
+                self._is_crop, self._is_decided = not looks_whole, len(points) >= _ENOUGH
         if self._origin is not None:
             (origin,) = self._origin
         else:
@@ -374,14 +376,14 @@ class FramePredictor:
         """The state after the frames so far, as JSON values."""
         people = None if self.people is None else self.people.state()
         boxes_by = None if self.boxes is None else self.boxes.matched_by
-        is_crop = self._is_crop if self._is_decided else None
-        search_state = {"is_crop": is_crop, "was_searched": self._was_searched}
+        search_state = {"is_crop": self._is_crop, "is_decided": self._is_decided, "was_searched": self._was_searched}
         return search_state | {"boxes_by": boxes_by, "people": people}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Resumes from the result of `state()`."""
         self._is_crop, self._was_searched = state["is_crop"], state["was_searched"]
-        self._is_decided = self._is_crop is not None
+        # states of earlier versions are final
+        self._is_decided = state.get("is_decided", self._is_crop is not None)
         if self.boxes is not None:
             self.boxes.matched_by = state["boxes_by"]
         if self.people is not None:

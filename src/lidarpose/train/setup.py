@@ -280,7 +280,7 @@ def _check_no_test(folder: str) -> None:
 
 def _left_out(dataset: InMemoryDataset) -> tuple[str, ...]:
     """Warnings, a line each, about damaged shards that are left out and datasets that give no people."""
-    lines = [f"{folder} has no labeled people in the split of the training" for folder in dataset.empty]
+    lines = [f"{folder} has no labeled people for the training, see its splits" for folder in dataset.empty]
     if dataset.damaged:
         problem, count = dataset.damaged[0], len(dataset.damaged) - 1
         others = f", and {count} more" if count else ""

@@ -66,12 +66,13 @@ class InMemoryDataset:
             if split is not None and dataset.card.people != "labelled":
                 problem = f"contains synthetic people, which have no split {split!r}: give --split all"
                 raise file_error(dataset.folder, problem)
+            num_damaged = len(damaged)
             shards = list(_shards(dataset, split, interval, damaged))
             has_hidden = any(hidden for _, _, hidden in shards)
             parts += [(dataset, rows, has_hidden) for rows, _, _ in shards]
             dataset_names = list(chain.from_iterable(shard_names for _, shard_names, _ in shards))
             names += dataset_names
-            empty += [] if dataset_names else [str(dataset.folder)]
+            empty += [] if dataset_names or len(damaged) > num_damaged else [str(dataset.folder)]
         skeletons = sorted({dataset.card.skeleton for dataset in datasets})
         if len(skeletons) > 1:
             raise InputError(f"datasets of one training need the same skeleton, got {', '.join(skeletons)}")

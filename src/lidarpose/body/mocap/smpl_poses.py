@@ -265,8 +265,8 @@ def load_betas(path: str | os.PathLike, subjects: Sequence[str] = ()) -> np.ndar
         if file.suffix.lower() == ".json" and FRAME_NUMBER.fullmatch(file.stem):
             sequence = clip if file == path else path.stem if file.parent == path else clip.rpartition("/")[0]
             if is_wanted(sequence):
-                # `load_motion` warns of damaged files
-                with suppress(InputError):
+                # `load_motion` warns of damaged files in folders
+                with suppress(*([] if file == path else [InputError])):
                     content = read_json(file, expected=_POSE_FILE)
                     rows.append(_first_betas(content.get("beta") if isinstance(content, dict) else None))
         elif file.suffix.lower() == ".npz" and is_wanted(clip):

@@ -170,7 +170,8 @@ class NoiseMotion(FreeMotion):
     name = "noisemotion"
     # the files do not say which of the three poses belongs to the points; the middle one is off by at most 33 ms
     _poses, _which = 3, 1
-    # what T is in the file that is read; until it is known, the distances of the points, m, by what it may be
+    # what T is in the file that is read, "" if it has no points; while it is None, the distances of the points, m, by
+    # what T may be are collected
     _meaning: str | None = None
     _distances: dict[str, list[float]]
 

@@ -17,7 +17,7 @@ from lidarpose.io.files import FormatError, file_error, one_line, shorten
 DEFAULT_RATE = 10.0
 # s; seconds since 1970 have a float64 resolution of 0.2 microseconds
 _ROUNDING = 1e-6
-# s, three thousand years: larger times are milliseconds or nanoseconds since 1970
+# s, three thousand years: larger times are milliseconds, microseconds or nanoseconds since 1970
 _LATEST = 1e11
 
 
@@ -57,7 +57,7 @@ class Frame(Sweep):
 
     Raises:
         InputError: `T_world_sensor` is not a rigid transform (4, 4), `origin` not a position, or `index` or `time` not
-            a finite number.
+            a finite number, or `time` not in seconds.
     """
 
     index: int
@@ -74,7 +74,7 @@ class Frame(Sweep):
             check_finite("Frame.time", self.time)
             if abs(self.time) > _LATEST:
                 problem = f"expected seconds, got {self.time:g}"
-                raise InputError(f"Frame.time: {problem}: divide nanoseconds by 1e9, milliseconds by 1000")
+                raise InputError(f"Frame.time: {problem}: divide milliseconds by 1e3, nanoseconds by 1e9")
             object.__setattr__(self, "time", float(self.time))
         if self.origin is not None:
             origin = vector_of(self.origin)
@@ -274,7 +274,10 @@ class FrameSource:
             raise file_error(recording.name, "has no frames; expected at least one: was it recorded completely?")
         self._first_time = first_frame.time
         self._notes: list[str] = []
-        if first_frame.time is None and recording.count != 1 and rate is None:
+        if first_frame.time is not None and abs(first_frame.time) > _LATEST:
+            self._first_time = None
+            self._notes.append(f"has times that are not seconds: read as {self.rate:g} frames per second")
+        elif first_frame.time is None and recording.count != 1 and rate is None:
             rate_hint = "change it with rate, on the command line --rate"
             self._notes.append(f"has no times: read as {DEFAULT_RATE:g} frames per second ({rate_hint})")
         self._num_back = 0
