@@ -689,6 +689,7 @@ def test_quiet_prints_errors_only(crop, tmp_path, capsys):
         ("predct a.pcd", "invalid choice: 'predct', did you mean predict?; see lidarpose --help"),
         ("qqqq", "invalid choice: 'qqqq' (choose from"),
         ("detect a.pcd --picture", "unrecognized arguments: --picture; see lidarpose detect --help"),
+        ("predict --background a b.npy", "FILE: give them before --background, which takes all values after it; see"),
         ("detect a.pcd --min_score=1", "--min_score=1, did you mean --min-score?; see lidarpose detect --help"),
         (
             "predict a.pcd --picture a.png",

@@ -825,7 +825,8 @@ def test_recording_page_contains_all_frames(drive, tmp_path):
     still = np.reshape(scan["points"], (-1, 3))
     pelvis = np.array([pose["joints"][0] for pose in scan["frames"][-1]["poses"]])
     assert len(still) and np.linalg.norm(still[:, None] - pelvis, axis=-1).min() > 300
-    assert "<th scope=col>track</th>" in text.replace(' class="number"', "")
+    heads = text.replace(' class="number"', "")
+    assert all(f"<th scope=col>{name}</th>" in heads for name in ("track", "from, s", "to, s", "way, m"))
 
 
 def test_recording_page_of_crops_moves_points_with_the_person():

@@ -119,12 +119,21 @@ class _Parser(argparse.ArgumentParser):
     def __init__(self, **settings: Any):
         # otherwise --keep of another command would be accepted as an abbreviation of --keep-anchors
         super().__init__(**{"allow_abbrev": False} | settings)
+        self.words: list[str] = []
+
+    def parse_known_args(self, args=None, namespace=None):
+        # a parser of a command gets its own words
+        self.words = list(args or ())
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str):
         """One line, as for every other wrong input."""
         if choice := re.search(r"(invalid choice: '(.*)') \(choose from (.*)\)", message):
             for likely in difflib.get_close_matches(choice[2], re.findall(r"[\w-]+", choice[3]), 1):
                 message = f"{message[: choice.end(1)]}, did you mean {likely}?"
+        lists = (option for action in self._actions if action.nargs == "+" for option in action.option_strings)
+        if "are required" in message and (given := next((option for option in lists if option in self.words), None)):
+            message += f": give them before {given}, which takes all values after it"
         self.exit(2, f"lidarpose: error: {message}; see {self.prog} --help\n")
 
 

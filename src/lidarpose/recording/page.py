@@ -90,8 +90,10 @@ class RecordingPage:
             label=f"{counted(len(panels), 'frame')} of {self._count:,}",
         )
         start = self._start()
+        unit = ", s" if any(about["time"] is not None for about, _, _ in self._lines) else ", frame"
         rows = [
-            {"track": id, "frames": x.frames, "from": x.first - start, "to": x.last - start, "way, m": x.way}
+            {"track": id, "frames": x.frames}
+            | {f"from{unit}": x.first - start, f"to{unit}": x.last - start, "way, m": x.way}
             for id, x in sorted(self._tracks.items())
         ]
         return render_report([], title=title, summary=rows, scans=[panel]).encode("utf-8", "replace")
