@@ -9,7 +9,8 @@ import numpy as np
 from lidarpose.errors import counted
 from lidarpose.geometry import UP_AXES, axes_from_above, rotation_from_up, rotation_of_boxes
 from lidarpose.sample import Box, person_note
-from lidarpose.viz.bird_eye import ScanPanel
+from lidarpose.viz.bird_eye import LONGEST_NAME, ScanPanel
+from lidarpose.viz.draw import shortened
 from lidarpose.viz.person_view import Panel, joined_poses
 
 if TYPE_CHECKING:
@@ -75,7 +76,11 @@ def _from_above(poses: "Poses", people: "list[PersonPose]", ids: Sequence[str | 
             if (box := person.box) is not None
         ],
         poses=joined_poses([(person.joints, person.confidence) for person in posed], poses.skeleton),
-        names=["" if id is None else str(id) for person, id in zip(people, ids, strict=True) if person.has_pose],
+        names=[
+            "" if id is None else shortened(str(id), LONGEST_NAME)
+            for person, id in zip(people, ids, strict=True)
+            if person.has_pose
+        ],
         label=label,
         sensor=None if poses.origin is None else tuple((R_level_input @ poses.origin)[:2].tolist()),
         axes=axes_from_above(poses.up),
