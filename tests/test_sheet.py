@@ -206,6 +206,21 @@ def test_names_are_inside_view(monkeypatch):
 
 
 @pytest.mark.long
+def test_axes_of_maps_have_whole_coordinates():
+    """Without an offset beside the axis, and inside the narrow margin at the left."""
+    from matplotlib.figure import Figure
+
+    for far, rotation in ((0.0, 0), (5e6, 90)):
+        figure = Figure()
+        FigureCanvasAgg(figure)
+        axes = figure.add_axes((0.1, 0.1, 0.8, 0.8))
+        bird_eye._draw_panel(axes, ScanPanel(points=POINTS + [far, far, 0], sensor=None), np.array([7.0, 7.0]))
+        figure.canvas.draw()
+        texts = axes.get_yticklabels()
+        assert {text.get_rotation() for text in texts} == {rotation}
+        assert axes.yaxis.get_offset_text().get_text() == "" and all(len(t.get_text()) == 7 for t in texts) == bool(far)
+
+
 def test_draw_scans_accepts_no_and_too_many_panels():
     empty = ScanPanel(points=np.zeros((0, 3)), sensor=None)
     broken = ScanPanel(points=np.full((9, 3), np.nan), label="$x")

@@ -35,6 +35,7 @@ _LABEL_RADII, _LABEL_SIZE, _NAME_FONT = (15.0, 26.0, 38.0), 13.0, 9
 # pt: room that the word "sensor" needs
 _SENSOR_ROOM = 45.0
 _MARGIN, _LEAST_SPAN = 3.0, 16.0  # m: margin around the people, and minimum side of a view
+_LONG_NUMBERS = 10_000.0  # m: from here on, numbers at the left are upright, since the margin is narrow
 _BELOW, _ABOVE = 0.25, 2.5  # range of heights that the colors cover, m above the ground
 _GROUND, _HIGH = "#d5d9de", "#eceff2"
 
@@ -136,6 +137,9 @@ def _draw_panel(ax, panel: ScanPanel, size: np.ndarray) -> None:
     # coordinates of maps as they are, not as a sum with an offset
     ax.ticklabel_format(style="plain", useOffset=False)
     ax.tick_params(labelsize=7, color=FAINT, labelcolor=FAINT)
+    if np.abs((low[1], high[1])).max() >= _LONG_NUMBERS:
+        for text in ax.get_yticklabels():
+            text.set(rotation=90, va="center")
     ax.spines[:].set_color(_HIGH)
     inside_points = points[((points[:, :2] >= low) & (points[:, :2] <= high)).all(1)]
     _draw_points(ax, inside_points[evenly_spaced(len(inside_points), _MAX_POINTS)], estimate_ground(points))
