@@ -354,10 +354,10 @@ def test_detect_suggests_no_axis_whose_ground_leans_onto_another(scene, monkeypa
     person = Box(center=np.zeros(3), size=np.ones(3), score=0.9)
     people = {"y": [person] * 3, "-x": [person] * 2}
 
-    def found(scan, search):
+    def find(scan, search):
         return replace(scan, boxes=people.get(scan.up, []), up="-1,0.01,0.02" if scan.up == "y" else scan.up)
 
-    monkeypatch.setattr(single_scan, "find_people", found)
+    monkeypatch.setattr(single_scan, "find_people", find)
     (warning,) = lidarpose.detect(near).warnings
     assert warning == "no people found with up z, but 2 people with up -x: try --up -x"
 

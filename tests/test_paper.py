@@ -959,5 +959,6 @@ def test_table_in_folder_that_cannot_be_written_is_refused(tmp_path, monkeypatch
     monkeypatch.setattr(Path, "mkdir", refuse)
     assert main(["paper", "table4", "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
-    assert "out: cannot be written (Read-only file system): give another folder by --out" in error
+    problem = f"cannot write into the folder {tmp_path / 'out'} (Read-only file system)"
+    assert f"{problem}; the disk is read-only: write to another folder" in error
     assert error.count("\n") == 1

@@ -145,7 +145,8 @@ def detect_places(scan: Scan, search: Search) -> DetectedScan:
         direction = np.round(up @ scan.R_level_input, 3) + 0.0
         if (axis := nearest_axis(direction)) != upright_axis(scan.up):
             # --up z would be exact
-            remedy = f"another axis points up: try {f'--up {axis}' if axis != 'z' else 'it without --up'}"
+            option = "it without --up" if axis == "z" else f"--up {axis}"
+            remedy = f"another axis points up: try {option}"
         else:
             remedy = f"the sensor is assumed to be tilted: confirm it with --up {','.join(f'{v:g}' for v in direction)}"
             remedy += ", or, if the ground slopes, give --up z" if scan.up == "z" else ""

@@ -132,7 +132,7 @@ def _other_up_axis(places: DetectedScan, search: Search) -> str | None:
         # outdoors: the axis is right, but the scan may be upside down
         other_axes = [_opposite(input_scan)]
     everyone = replace(search, max_people=None)
-    boxes = {up: _found_along(up, input_scan, everyone) for up in other_axes}
+    boxes = {up: _people_along(up, input_scan, everyone) for up in other_axes}
     best_axis = max(other_axes, key=lambda up: _sum_of_scores(boxes[up]))
     if _sum_of_scores(boxes[best_axis]) < _SURE:
         return None
@@ -145,16 +145,16 @@ def _opposite_up(places: DetectedScan, search: Search, boxes: Sequence[Box]) -> 
     up, everyone = _opposite(places.given), replace(search, max_people=None)
     if search.max_people is not None:
         boxes = find_people(places.given, everyone).boxes or []
-    other_boxes = _found_along(up, places.given, everyone)
+    other_boxes = _people_along(up, places.given, everyone)
     if _sum_of_scores(other_boxes) < max(_SURE, 2 * _sum_of_scores(boxes)):
         return None
     people = counted(len(other_boxes), "person", "people")
     return f"{len(boxes)} found with up {places.given.up}, but {people} with up {up}: try --up {up}"
 
 
-def _found_along(up: str, scan: Scan, search: Search) -> Sequence[Box]:
-    """The people found with another up axis; none if the ground leans onto a third axis, along which the same people
-    are found."""
+def _people_along(up: str, scan: Scan, search: Search) -> Sequence[Box]:
+    """The boxes of people in the scan with another up axis; none if its ground leans onto a third axis, with which the
+    boxes are the same."""
     result = find_people(replace(scan, up=up), search)
     return (result.boxes or []) if upright_axis(result.up) == up else []
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from lidarpose.errors import InputError, LidarPoseError
-from lidarpose.io.atomic import exclusive_lock, write_atomic
+from lidarpose.io.atomic import exclusive_lock, write_atomic, write_error
 from lidarpose.io.files import read_json
 from lidarpose.train.recipes import Finetune, Pretrain
 from lidarpose.train.run_dir import CONFIG, LENGTHS, MODEL, read_config, read_log
@@ -306,7 +306,7 @@ def begin_out(out: Path) -> None:
     try:
         (out / RUNS).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror}): give another folder by --out") from None
+        raise write_error(out / RUNS, out, error) from None
 
 
 def check_out(out: Path) -> None:

@@ -1,7 +1,6 @@
 """Validation during training: the mean error over samples, and a picture of some of them."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 from torch import nn
@@ -68,7 +67,14 @@ def draw_examples(examples: list[Example], joints: np.ndarray, skeleton: Skeleto
     panels = []
     for example, predicted in zip(examples, joints, strict=True):
         error = np.nanmean(np.linalg.norm(predicted - example.joints, axis=-1)) * 1e3
-        # the position of the sensor in the person's frame is unknown
-        panel = Panel(points=example.points, label=f"{error:.0f} mm", distance=np.nan)
-        panels.append(replace(panel, pose=pose(predicted), truth=pose(example.joints)))
+        panels.append(
+            Panel(
+                points=example.points,
+                pose=pose(predicted),
+                truth=pose(example.joints),
+                label=f"{error:.0f} mm",
+                # the position of the sensor in the person's frame is unknown
+                distance=np.nan,
+            )
+        )
     return draw_people(panels, title=title)

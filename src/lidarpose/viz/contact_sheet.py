@@ -118,18 +118,19 @@ def _street_panel(rows: list[dict], dataset: DatasetReader) -> ScanPanel:
 
 
 def _panel(index: int, sample: LabeledSample, dataset: DatasetReader) -> Panel:
-    """A panel labeled as "#12 os1-128"; for clips and streets also with the frame, for streets also with the track; of
-    prepared datasets with sequence, frame and track."""
+    """A panel labeled as "#12 os1-128"; for clips and streets also with the frame, for streets also with the track; for
+    prepared datasets as "sequence frame track"."""
     if dataset.card.people == "labelled":
-        label = f"{sample.sequence} {sample.frame} {sample.track}"
-        return Panel(points=sample.points, truth=sample.pose, part=sample.part, label=label, distance=sample.distance)
-    words = [f"#{index}"]
-    if dataset.card.settings.get("what") in ("clips", "streets"):
-        words.append(f"frame {sample.frame}")
-    if "frames" in dataset.card.tables:
-        words.append(f"track {sample.track}")
-    words.append((sample.info and sample.info.sensor) or sample.source.rpartition("/")[2])
-    label = " ".join((*words, *sample.conditions))
+        words = [sample.sequence, str(sample.frame), sample.track]
+    else:
+        words = [f"#{index}"]
+        if dataset.card.settings.get("what") in ("clips", "streets"):
+            words.append(f"frame {sample.frame}")
+        if "frames" in dataset.card.tables:
+            words.append(f"track {sample.track}")
+        words.append((sample.info and sample.info.sensor) or sample.source.rpartition("/")[2])
+        words += sample.conditions
+    label = " ".join(words)
     return Panel(points=sample.points, truth=sample.pose, part=sample.part, label=label, distance=sample.distance)
 
 

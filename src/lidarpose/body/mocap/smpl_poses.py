@@ -28,7 +28,7 @@ import reprlib
 import warnings
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -266,7 +266,7 @@ def load_betas(path: str | os.PathLike, subjects: Sequence[str] = ()) -> np.ndar
             sequence = clip if file == path else path.stem if file.parent == path else clip.rpartition("/")[0]
             if is_wanted(sequence):
                 # `load_motion` warns of damaged files in folders
-                with suppress(*([] if file == path else [InputError])):
+                with nullcontext() if file == path else suppress(InputError):
                     content = read_json(file, expected=_POSE_FILE)
                     rows.append(_first_betas(content.get("beta") if isinstance(content, dict) else None))
         elif file.suffix.lower() == ".npz" and is_wanted(clip):
