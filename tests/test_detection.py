@@ -734,19 +734,18 @@ def test_verified_skips_candidates_below_min_score(monkeypatch):
     points, origin = scene.points, scene.origin
     detections = Detector(threads=1).detect(points, origin, limit=60)
     header = {"verification": {"bias": -1.0, "logit": 1.0, "verifier": 0.5, "log_points": 0.1}}
-    run, verified = verification._run, []
-    monkeypatch.setattr(verification, "_run", lambda *of: verified.append(of[-2:]) or run(*of))
+    pose, posed_rows = verification._posed, []
+    monkeypatch.setattr(verification, "_posed", lambda *of: posed_rows.append(of[-1]) or pose(*of))
     features = verification.verification_features(detections, points, origin)
     scores, logits = verification.final_score(features, header), verification.final_logit(features, header)
     assert features.shape == (len(detections), 3)
     highest = verification._highest_score(detections, header)
     assert (highest >= scores).all() and 2 <= (scores >= 0.6).sum() < (highest >= 0.6).sum() < len(detections)
-    verified.clear()
     people = verification.verified(detections, points, origin, header, 0.6)
-    (_, verifier), (posed, poser), *again = verified
-    assert verifier is not poser and set(posed) == set(np.flatnonzero(scores >= 0.6))
-    # a second pass poses only people close to one with a higher score
-    assert all(backend is poser and 0 < len(rows) < len(posed) for rows, backend in again) and len(again) <= 1
+    posed, *again = posed_rows
+    assert set(posed) == set(np.flatnonzero(scores >= 0.6))
+    # only people close to one with a higher score are posed again
+    assert all(0 < len(rows) < len(posed) for rows in again) and len(again) <= 1
     # by logits, because several scores are 1
     own = [np.nanargmin(np.abs(logits - logit)) for logit in people.logits]
     np.testing.assert_allclose(people.logits, logits[own])
@@ -772,9 +771,9 @@ def test_verified_skips_candidates_below_min_score(monkeypatch):
     assert sorted(again.verified) == [False] + [True] * (len(people.boxes) - 2) and len(nobody)
     assert {tuple(place) for place in again.rejected} <= {tuple(place) for place in nobody}
     # for max_people=1, the two highest-scoring detections are posed
-    verified.clear()
+    posed_rows.clear()
     (alone,) = verification.verified(detections, points, origin, header, 0.6, 1).boxes
-    assert sorted(verified[1][0]) == sorted(np.lexsort((-logits, -np.nan_to_num(scores)))[:2])
+    assert sorted(posed_rows[0]) == sorted(np.lexsort((-logits, -np.nan_to_num(scores)))[:2])
     np.testing.assert_array_equal(alone.center, people.boxes[0].center)
 
 

@@ -183,6 +183,21 @@ def test_uncertain_pose_is_averaged_with_one_about_the_box_center(confidence, pa
     assert next(count) == passes
 
 
+def test_first_pass_is_about_the_given_center():
+    """The second pass is about the pelvis that the first one finds."""
+    cloud = np.random.default_rng(0).normal((5, 0, 0), (0.2, 0.2, 0.5), (300, 3))
+    passes = []
+
+    def pose_at(x):
+        passes.append(x)
+        return 5.4 + 0.02 * len(passes), 0.9, 0.0
+
+    estimator = PoseEstimator(PoseAt(pose_at, cloud.mean(0)[0]))
+    (pose,) = estimator.poses([cloud], np.zeros(3), first_centers=np.array([[6.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(passes, [6.0, 5.42], atol=0.006)
+    np.testing.assert_allclose(pose.joints[:, 0], (5.42 + 5.44) / 2, atol=1e-4)
+
+
 class PoseAt:
     """Fake backend. pose_at: x m of the crop's center -> x m of the joints, their confidence, and that of a second
     person; mean_x m: of the cloud."""

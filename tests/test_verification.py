@@ -1,15 +1,22 @@
 """Verification of detections: their points and features, and boxes from poses."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from lidarpose.inference import verification
+from lidarpose.inference.backend import bundled_backend
+from lidarpose.inference.estimator import PoseEstimator
+from lidarpose.inference.tta import MIRRORED, average
 from lidarpose.inference.verification import Crops, box_about, inside_column
+from lidarpose.models import DEFAULT
 from lidarpose.models.detector.detector import Detections
 from lidarpose.sample import Box, Pose
-from lidarpose.skeleton import HUMAN15
+from lidarpose.skeleton import BODY26, HUMAN15
+from lidarpose.synth.generator import Generator
+from lidarpose.synth.scene import scene_config
 
 # facing +x, left is +y, m
 STANDING = {
@@ -93,6 +100,22 @@ def test_verification_features_and_score_bound(monkeypatch):
         for log_points in np.log1p([5, 100, 1e5]):
             possible = np.column_stack([np.arange(3.0), np.full(3, odds), np.full(3, log_points)])
             assert (verification.final_score(possible, header) <= highest).all()
+
+
+def test_posed_rows_have_the_mean_of_two_passes():
+    """The slow way, one person at a time; other rows and columns with under five points have no pose."""
+    rng, estimator = np.random.default_rng(0), PoseEstimator(bundled_backend(DEFAULT))
+    person = Generator(scene=replace(scene_config("wild"), sensors=("os1-128",)), measure=False).person(5, 3).sample
+    centers = person.box.center + rng.normal(0, 0.05, (4, 3))
+    clouds = [person.points.astype(float), person.points.astype(float)[::2], person.points[:4], person.points]
+    joints = verification._posed(clouds, centers, np.zeros(3), np.array([0, 1, 2])).joints
+    assert np.isnan(joints[2:]).all()
+    for i in (0, 1):
+        first = estimator._transformed(MIRRORED, [clouds[i]], centers[[i]], np.zeros(3), None)
+        shift = np.round(first.joints[:, BODY26.index("pelvis")], 2)
+        second = estimator.outputs([clouds[i]], centers[[i]] + shift, np.zeros(3))
+        second = replace(second, joints=second.joints + shift)
+        np.testing.assert_allclose(joints[i], average([second, first]).joints[0] + centers[i], atol=1e-4)
 
 
 def fitted(monkeypatch, scores, places, mounted=0.0, sure=0.5, known=None, fit=verification._fit_boxes):

@@ -95,6 +95,7 @@ class PoseEstimator:
         *,
         clips: Clips | None = None,
         centers: np.ndarray | None = None,
+        first_centers: np.ndarray | None = None,
         box_centers: np.ndarray | None = None,
         progress: bool = False,
     ) -> list[Pose | None]:
@@ -105,6 +106,7 @@ class PoseEstimator:
             origin: (3,) m, the sensor position, None if unknown.
             clips: for networks that read clips: which clouds are frames of the same person.
             centers: (N, 3) m, approximate pelvis positions; with them, the first pass is skipped.
+            first_centers: (N, 3) m, centers of the first pass; None means the middle of each cloud.
             box_centers: (N, 3) m; they tell which person is meant where a cloud shows two or the pose is uncertain.
             progress: whether to show a progress bar.
 
@@ -112,13 +114,14 @@ class PoseEstimator:
             One pose per cloud; None if too few points are near the center, or if the cloud is in no window of `clips`.
         """
         poses: list[Pose | None] = [None] * len(clouds)
-        centers = None if centers is None else np.round(centers, _CENTER_DECIMALS)
+        # by parameter of `_batch`
+        given_places = {"centers": centers, "first_centers": first_centers, "box_centers": box_centers}
+        places = {name: place for name, place in given_places.items() if place is not None}
         count = 0
         with Progress(len(clouds), unit="clouds", shown=progress) as bar:
             for rows, clip in self._batches(clouds, clips):
-                batch_centers = None if centers is None else centers[rows]
-                batch_box_centers = None if box_centers is None else box_centers[rows]
-                batch_poses = self._batch([clouds[row] for row in rows], origin, clip, batch_centers, batch_box_centers)
+                batch_places = {name: place[rows] for name, place in places.items()}
+                batch_poses = self._batch([clouds[row] for row in rows], origin, clip, **batch_places)
                 for row, pose in zip(rows, batch_poses, strict=True):
                     poses[row] = pose
                 count += len(rows)
@@ -142,12 +145,15 @@ class PoseEstimator:
         clouds: list[np.ndarray],
         origin: np.ndarray | None,
         clip: Clips | None,
-        centers: np.ndarray | None,
-        box_centers: np.ndarray | None,
+        centers: np.ndarray | None = None,
+        first_centers: np.ndarray | None = None,
+        box_centers: np.ndarray | None = None,
     ) -> list[Pose | None]:
         first_passes: list[Pose] = []
-        if centers is None:
-            centers = np.stack([center_of(points) for points in clouds])
+        if centers is not None:
+            centers = np.round(centers, _CENTER_DECIMALS)
+        else:
+            centers = np.stack([center_of(points) for points in clouds]) if first_centers is None else first_centers
             first_passes = [self._transformed(self._first, clouds, centers, origin, clip)]
             if box_centers is not None and self._averaged and first_passes[0].confidence is not None:
                 centers, first_passes = self._passes_about_boxes(clouds, centers, box_centers, origin, first_passes[0])

@@ -4,17 +4,18 @@ the default network, and boxes are fitted to their poses.
 Legend: D detections.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lidarpose.geometry import distance_to_segments, rotation_about, rows_near
-from lidarpose.inference.backend import Backend, Raw, bundled_backend, estimates
+from lidarpose.inference.backend import bundled_backend
+from lidarpose.inference.estimator import PoseEstimator
 from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.tta import IDENTITY, apply
 from lidarpose.models import DEFAULT, VERIFIER
-from lidarpose.models.decode import decoder, sigmoid
+from lidarpose.models.decode import sigmoid
 from lidarpose.models.detector.detector import Detections
 from lidarpose.sample import MIN_POINTS, Box, Pose, facing_yaw
 
@@ -123,9 +124,14 @@ class Crops:
         """Runs the verifier. Returns features (D, 3), see `FEATURES`, and the probability (D,) that the person rides or
         sits in a wheelchair; the verifier's values are NaN for too few points."""
         logits = np.full((len(self.detections), 2), np.nan)
-        centers, all_rows = self.detections.centers, np.arange(len(self.detections))
-        for rows, raw in _run(self.columns, centers, self.origin, all_rows, bundled_backend(VERIFIER)):
-            logits[rows] = raw.person
+        backend, centers = bundled_backend(VERIFIER), self.detections.centers
+        enough = [i for i, column in enumerate(self.columns) if len(column) >= MIN_POINTS]
+        # a batch costs as much as if all its clouds were as large as the largest
+        rows = sorted(enough, key=lambda i: len(self.columns[i]))
+        for start in range(0, len(rows), backend.batch):
+            batch = rows[start : start + backend.batch]
+            columns = [self.columns[i] for i in batch]
+            logits[batch] = backend.run(*apply(IDENTITY, columns, centers[batch], self.origin)).person
         odds = np.clip(logits[:, 0], -_MOST_ODDS, _MOST_ODDS) + _BEYOND_MOST * logits[:, 0]
         log_points = np.log1p([len(column) for column in self.columns])
         return np.column_stack([self.detections.logit, odds, log_points]), sigmoid(logits[:, 1])
@@ -133,24 +139,16 @@ class Crops:
 
 def _posed(clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None, rows: np.ndarray) -> Pose:
     """Poses of the given rows (C,) of clouds (n, 3) m around centers (D, 3) m by the default network: joints
-    (D, 26, 3) m, NaN for other rows and for too few points."""
-    backend = bundled_backend(DEFAULT)
-    skeleton = backend.header.skeleton
-    joints = np.full((len(centers), len(skeleton), 3), np.nan)
-    for batch, raw in _run(clouds, centers, origin, rows, backend):
-        joints[batch] = estimates(raw, decoder("window"), skeleton).joints + centers[batch][:, None]
-    return Pose(joints=joints, skeleton=skeleton)
-
-
-def _run(
-    clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None, rows: np.ndarray, backend: Backend
-) -> Iterator[tuple[list[int], Raw]]:
-    """Runs a network on the given rows that have enough points. Yields the rows and the raw outputs of each batch."""
-    enough = (i for i in rows.tolist() if len(clouds[i]) >= MIN_POINTS)
-    ordered = sorted(enough, key=lambda i: len(clouds[i]))
-    for start in range(0, len(ordered), backend.batch):
-        batch = ordered[start : start + backend.batch]
-        yield batch, backend.run(*apply(IDENTITY, [clouds[i] for i in batch], centers[batch], origin))
+    (D, 26, 3) m, NaN for other rows and for too few points. As in `predict`, the first pass finds the pelvis; here it
+    is about the detection instead of the middle of the points, which may be those of another person."""
+    estimator = PoseEstimator(bundled_backend(DEFAULT))
+    joints = np.full((len(centers), len(estimator.skeleton), 3), np.nan)
+    posed_rows = [row for row in rows.tolist() if len(clouds[row]) >= MIN_POINTS]
+    poses = estimator.poses([clouds[row] for row in posed_rows], origin, first_centers=centers[posed_rows])
+    for row, pose in zip(posed_rows, poses, strict=True):
+        if pose is not None:
+            joints[row] = pose.joints
+    return Pose(joints=joints, skeleton=estimator.skeleton)
 
 
 def _highest_score(detections: Detections, header: dict) -> np.ndarray:
