@@ -42,6 +42,34 @@ def heldout() -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     return ("MPJPE, mm", *_NETWORKS.values(), "`small` with box centers", "people"), rows
 
 
+def _clouds() -> dict[str, Any]:
+    """Scores of point_times.py on people by condition, without whole scans."""
+    return {name: scores for name, scores in _read("point_times").items() if name != "whole scans"}
+
+
+def whole_scans() -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """People found in clouds of several whole scans by the points that are used; see point_times.py."""
+    rows = []
+    for sensor, scores in _read("point_times")["whole scans"].items():
+        cells = [scores[name] for name in ("all points", "newest scan", "both")]
+        figures = [f"{cell['found']} ({cell['false']}), {cell['mpjpe']:.1f} mm" for cell in cells]
+        rows.append((sensor, *figures, f"{scores['people']}", f"{scores['in all']}"))
+    names = ("all points", "the newest scan alone", "times of points")
+    return ("found (false), MPJPE", *names, "people", "found in all three"), rows
+
+
+def point_times() -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """MPJPE of clouds of several scans by the points that are used; see point_times.py."""
+    rows = []
+    for condition, scores in _clouds().items():
+        cells = [scores.get(name) for name in ("all points", "newest scan", "both")]
+        figures = ["-" if c is None else f"{c['value']:.1f} [{c['low']:.1f}, {c['high']:.1f}]" for c in cells]
+        low, high = scores["both"]["change"] if "both" in scores else (None, None)
+        change = "-" if low is None else f"{cells[2]['value'] - cells[0]['value']:.1f} [{low:.1f}, {high:.1f}]"
+        rows.append((condition, *figures, change, f"{scores['people']:,}"))
+    return ("MPJPE, mm", "all points", "the newest scan alone", "both", "both minus all points", "people"), rows
+
+
 def goals() -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Goal, its bound, and the figure; bold where it is missed."""
     first, second = _figures("small"), _figures("small-2")
@@ -50,6 +78,7 @@ def goals() -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     recall = {(row["group"], row["of"]): row["value"] for row in scans if (row["figure"], row["at"]) == ("recall", "1")}
     extra_error = next(row["value"] for row in scans if (row["figure"], row["at"]) == ("mpjpe_difference", "default"))
     clean = second["mpjpe", "clean"]
+    timed = {name: scores.get("both", scores["all points"])["value"] for name, scores in _clouds().items()}
     before = _figures("small-before")["mpjpe_p95", "all"]
     ways = {way["what"]: way["figures"]["all"]["value"] for way in _read("test_time")["small"]["ways"]}
     one_more = ways["`--tta 1`, the first pass mirrored and averaged"] - ways["`--tta 4`"]
@@ -64,6 +93,7 @@ def goals() -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
         ),
         ("merged LiDARs, relative to one clean scan", "", 1.25, second["mpjpe", "merged"] / clean, False),
         ("accumulated frames, relative to one clean scan", "", 1.25, second["mpjpe", "accumulated"] / clean, False),
+        ("accumulated frames with times of points", "", 1.25, timed["accumulated"] / timed["clean"], False),
         ("clean people scanned by a Mid-360 instead", "mm", 95, sensors["livox-mid360"], False),
         ("by a VLP-16", "mm", 95, sensors["vlp-16"], False),
         *(

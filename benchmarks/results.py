@@ -581,6 +581,8 @@ def tables() -> dict[str, Callable[[], str]]:
     makers["stability sensors"] = lambda: table(("sensor", "points", "MPJPE mm"), disturbed.sensors(DEFAULT))
     makers["stability ends"] = lambda: table(("", "mean, mm", "deviation"), disturbed.ends(DEFAULT))
     makers |= {"goals": lambda: table(*aimed.goals()), "heldout": lambda: table(*aimed.heldout())}
+    makers |= {"point times": lambda: table(*aimed.point_times())}
+    makers |= {"point times scans": lambda: table(*aimed.whole_scans())}
     makers["strays"] = partial(
         strays,
         paper="the paper's design, faster rates, 98,304 people",

@@ -99,12 +99,14 @@ def zipped(name, content):
 _TEXT = "".join(f"{x} {y} {z} {i}\n" for x, y, z, i in POINTS.tolist())
 
 
-def las(points=POINTS, *, version="1.2", kind=0, packed=False, step=1e-3, shift=(0.0, 0.0, 0.0)) -> bytes:
+def las(points=POINTS, *, version="1.2", kind=0, packed=False, step=1e-3, shift=(0.0, 0.0, 0.0), times=None) -> bytes:
     """A LAS or LAZ file written by laspy."""
     header = laspy.LasHeader(point_format=kind, version=version)
     header.scales, header.offsets = np.full(3, step), np.array(shift)
     cloud = laspy.LasData(header)
     cloud.xyz = np.asarray(points, float)[:, :3]
+    if times is not None:
+        cloud.gps_time = times
     file = io.BytesIO()
     cloud.write(file, do_compress=packed, laz_backend=laspy.LazBackend.Lazrs if packed else None)
     return file.getvalue()

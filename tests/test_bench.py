@@ -108,7 +108,7 @@ class Knowing:
 @pytest.mark.long
 def test_objects_are_posed_about_their_boxes_as_people_are():
     class Boxed(Knowing):
-        def predict_in(self, clouds, origin, skeleton, *, box_centers, check_upside_down):
+        def predict_in(self, clouds, origin, skeleton, *, box_centers, newest_clouds=None, check_upside_down):
             asked.append((len(clouds), box_centers))
             return self.predict(clouds)
 

@@ -163,7 +163,7 @@ def test_clean_protocol_crops_by_jittered_box(sets):
 
 
 class Asked(Fake):
-    def predict_in(self, points, origin, skeleton=None, progress=False, *, box_centers, check_upside_down):
+    def predict_in(self, points, origin, skeleton=None, progress=False, *, box_centers, **options):
         self.centers += [] if box_centers is None else list(box_centers)
         return self.predict(points, sensor_origin=origin, skeleton=skeleton)
 
@@ -243,7 +243,8 @@ def test_dapt_protocol_crops_and_centers_as_released(sets):
         np.testing.assert_array_equal(center, person.sample.box.center)
     box = replace(person.sample.box, size=person.sample.box.size * 0.6)
     setup = eval_setup(model, open_eval_dataset(sets / "waymo"), protocol="dapt")
-    points, _ = crop_of(replace(person, sample=replace(person.sample, box=box)), setup.setting)
+    rows, _ = crop_of(replace(person, sample=replace(person.sample, box=box)), setup.setting)
+    points = person.points[rows]
     assert 0 < len(points) < len(person.points) and box.contains(points).all()
 
     for _, center, person in shown["leaking"]:

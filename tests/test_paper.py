@@ -205,7 +205,7 @@ def test_fig5_draws_hardest_people_of_all_methods(finished, monkeypatch):
         np.testing.assert_array_equal(facing_of(one), facing(one.truth))
     # the points are those that the networks had
     with monkeypatch.context() as patch:
-        patch.setattr(figures, "crop_of", lambda person, setting: (person.points[: 7 + setting.seed], None))
+        patch.setattr(figures, "crop_of", lambda person, setting: (np.arange(7 + setting.seed), None))
         drawn.clear()
         figures.draw("fig5", selected, out)
     assert {len(panel.points) for panel in drawn} == {7}

@@ -227,9 +227,10 @@ def test_decode_cloud_reads_all_field_layouts(name):
     points[[2, 5]] = np.nan
     ring = np.arange(len(points)) % 128
     message = cloud(points, **LAYOUTS[name], extra={key: ring for key in ("ring", "line", "intensity")})
-    got, got_ring = decode_cloud(ROS2.deserialize_cdr(ROS2.serialize_cdr(message, CLOUD), CLOUD))
+    got, got_ring, got_times = decode_cloud(ROS2.deserialize_cdr(ROS2.serialize_cdr(message, CLOUD), CLOUD))
     assert np.array_equal(got, points, equal_nan=True)
     assert np.array_equal(got_ring, ring) if "ring" in name else got_ring is None
+    assert got_times is None
 
 
 @pytest.mark.parametrize("row_step", [0, 10, 40 * 16])

@@ -261,6 +261,10 @@ def box_id(given: object) -> str | int | None:
     raise InputError(f"Box.id must be text or a whole number, got {given!r}")
 
 
+# additional fields of `Sample` for networks that read clips
+_CLIP_FIELDS = ("rotations", "translation", "background", "neighbors")
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sample:
     """One person as recorded by a LiDAR.
@@ -268,7 +272,9 @@ class Sample:
     points (n, 3) float32 m in the sensor frame, n = 0 is legal; center (3,) m, the origin of the person's own frame,
     which has the axes of the sensor frame; part (n,) uint8, 0 = background, 1 + j = the bone of SMPL-24's joint j;
     ring (n,) int, the beam, -1 for none; pose in the sensor frame; box of the person; source: where the sample comes
-    from; frame_id: name of its frame; second_person_points: number of points on other people, None if unknown.
+    from; frame_id: name of its frame; second_person_points: number of points on other people, None if unknown;
+    point_times (n,) float32 s: when each point of a cloud of several scans was measured, relative to the pose, None for
+    a single scan or if unknown.
 
     Additional values for networks that read clips: rotations (24, 3) rad, axis-angles of SMPL's joints, each relative
     to its parent, the pelvis' from SMPL's rest frame (y up, facing +z) to the sensor frame; translation (3,) m, SMPL's
@@ -286,6 +292,7 @@ class Sample:
     source: str = ""
     frame_id: str = ""
     second_person_points: int | None = None
+    point_times: np.ndarray | None = None
     rotations: np.ndarray | None = None
     translation: np.ndarray | None = None
     background: np.ndarray | None = None
@@ -299,12 +306,12 @@ class Sample:
         return tuple(words[3].split("+")) if words[0] == "synth" and len(words) > 3 else ()
 
     def __post_init__(self):
-        _as_arrays(self, "points", "center", "part", "ring", "rotations", "translation", "background", "neighbors")
+        _as_arrays(self, "points", "center", "part", "ring", "point_times", *_CLIP_FIELDS)
         if self.points.ndim != 2 or self.points.shape[1] != 3 or self.points.dtype != np.float32:
             raise InputError(f"Sample.points must be (n, 3) float32, got {self.points.shape} {self.points.dtype}")
         if self.center.shape != (3,):
             raise InputError(f"Sample.center must be (3,), got {self.center.shape}")
-        for name in ("part", "ring"):
+        for name in ("part", "ring", "point_times"):
             value = getattr(self, name)
             if value is not None and value.shape != (len(self.points),):
                 raise InputError(f"Sample.{name} must be ({len(self.points)},), one per point, got {value.shape}")

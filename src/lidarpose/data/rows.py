@@ -7,6 +7,7 @@ A row of people-*.parquet is one synthetic person in one frame:
                             x forward, y left, z up
     part, ring              one per point: 0 = background, 1 + j = the bone of SMPL-24's joint j; the beam, or
                             -1 for a point of none
+    point_times             s, relative to the pose, of the points of several scans; null for a single scan
     joints                  x, y, z of the joints named in dataset.json, m
     center                  origin of the person's own frame, computed from the points
     box_center, box_size, box_yaw    a detector's box: m, m, rad
@@ -74,8 +75,8 @@ TABLES = {
     "people": _columns(f"""
         index:int64 frame:int32 track:int32
         points:float32[n,3] part:uint8[n]? ring:int32[n]? joints:float32[J,3] center:float64[3] {_BOX}
-        source:string frame_id:string sensor:string? kind:string? distance:float32? visible:float32?
-        height_seen:float32? clutter:float32? upright:bool? {_CLIP}"""),
+        source:string frame_id:string point_times:float32[n]? sensor:string? kind:string? distance:float32?
+        visible:float32? height_seen:float32? clutter:float32? upright:bool? {_CLIP}"""),
     "frames": _columns("""
         index:int64 frame:int32 sensor:string points:float32[n,3] ring:int32[n] person:int16[n] part:uint8[n]
         track:int16[P] box:float64[P,7] joints:float32[P,26,3]"""),
@@ -154,7 +155,8 @@ def _check_row(row: dict[str, Any], table: str, joints: int) -> None:
         raise InputError("columns box_center, box_size, box_yaw: some are null, expected all or none")
     check_lengths(row, table, joints)
     clip_columns = [name for name in _CLIP_COLUMNS if row[name] is not None]
-    for name in ("points", "center", *clip_columns):
+    timed_columns = ["point_times"] if row.get("point_times") is not None else []
+    for name in ("points", "center", *clip_columns, *timed_columns):
         if not np.isfinite(row[name]).all():
             raise InputError(f"column {name} has values that are not finite numbers")
     # a joint may be NaN

@@ -70,9 +70,10 @@ class EvalSample:
     """A sample and its place in the dataset.
 
     points: (n, 3) m, the network's input; when read, all points that the dataset holds, at their stored precision;
-    crop_box: the box that `points` were cropped with, or the dataset's own box if nothing was cropped, None if there is
-    neither; shard, row: position in the dataset; condition, poses, family: as in lidarpose-bench, "" elsewhere; moving:
-    a frame of a clip that is scored for acceleration only.
+    point_times: (n,) s, as in `Sample`, of these points, None if unknown or not to be used; crop_box: the box that
+    `points` were cropped with, or the dataset's own box if nothing was cropped, None if there is neither; shard, row:
+    position in the dataset; condition, poses, family: as in lidarpose-bench, "" elsewhere; moving: a frame of a clip
+    that is scored for acceleration only.
     """
 
     sample: LabeledSample
@@ -84,6 +85,7 @@ class EvalSample:
     family: str = ""
     moving: bool = False
     crop_box: Box | None = None
+    point_times: np.ndarray | None = None
 
     @property
     def info(self) -> PersonInfo:
@@ -262,7 +264,9 @@ def _read_folder(
             except InputError as error:
                 count_skipped(skipped, "people whose rows are no sample", f"{path.name}, row {row}: {error}")
             else:
-                yield EvalSample(sample=sample, points=sample.points, shard=int(shard), row=int(row))
+                yield EvalSample(
+                    sample=sample, points=sample.points, point_times=sample.point_times, shard=int(shard), row=int(row)
+                )
 
 
 # ---- the sets that ship with the package

@@ -18,6 +18,7 @@ from lidarpose.eval.dataset import EvalDataset, EvalSample
 from lidarpose.eval.predictions import Predictions, num_nearby, stack
 from lidarpose.eval.scores import Setting
 from lidarpose.inference.inputs import Clips
+from lidarpose.inference.newest import newest_points
 from lidarpose.io.files import one_line, shorten
 from lidarpose.sample import PER_PERSON, UNLABELED, Box, LabeledSample, Pose, clip_windows, known_values
 from lidarpose.skeleton import Skeleton
@@ -155,7 +156,7 @@ class Model(Protocol):
 
 
 def crop_of(person: EvalSample, setting: Setting) -> tuple[np.ndarray, Box | None]:
-    """The points that a network gets under the protocol, and the box that they are cropped with.
+    """Which points (n,) bool a network gets under the protocol, and the box that they are cropped with.
 
     Protocol dapt uses the released code's box, clean a detector's box, which depends only on the seed and the person's
     position in the dataset. If nothing is cropped, the box is the dataset's own, if any.
@@ -163,11 +164,11 @@ def crop_of(person: EvalSample, setting: Setting) -> tuple[np.ndarray, Box | Non
     sample = person.sample
     if setting.protocol == "dapt":
         is_inside, _ = released_view(person.points, sample.joints, sample.centers, sample.box)
-        return person.points[is_inside], released_box(sample.joints, sample.centers, sample.box)
+        return is_inside, released_box(sample.joints, sample.centers, sample.box)
     if setting.kind in _OWN_CROP or setting.kind not in _CLEAN_CROPS or sample.box is None:
-        return person.points, sample.box
+        return np.ones(len(person.points), bool), sample.box
     box = jittered(sample.box, np.random.default_rng([setting.seed, person.shard, person.row]))
-    return person.points[box.contains(person.points)], box
+    return box.contains(person.points), box
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,10 +189,11 @@ class EvalSetup:
                 return None, f"people without the center {center!r}"
             if kind == "humanm3" and (person.sample.joint_labels == UNLABELED).all():
                 return None, "people without a labelled joint, which their box needs"
-        points, box = crop_of(person, self.setting)
-        if len(points) < min_points:
+        rows, box = crop_of(person, self.setting)
+        if np.count_nonzero(rows) < min_points:
             return None, f"people of under {min_points} points, as the released code skips them"
-        return replace(person, points=points, crop_box=box), ""
+        point_times = None if person.point_times is None else person.point_times[rows]
+        return replace(person, points=person.points[rows], point_times=point_times, crop_box=box), ""
 
     def predict(self, samples: Sequence[EvalSample]) -> Predictions:
         """Labels and predictions of people that were cropped by `crop_sample`."""
@@ -214,7 +216,8 @@ class EvalSetup:
         name, clips = model.skeleton.name, self._clips(samples)
         # in a call either all people have a box or none; these are the boxes that cropped, not boxes made from labels
         centers = [person.crop_box.center for person in samples if person.crop_box is not None]
-        people = self.answers(clouds, origin, np.stack(centers) if centers else None, clips)
+        newest_clouds = [newest_points(person.points, person.point_times) for person in samples]
+        people = self.answers(clouds, origin, np.stack(centers) if centers else None, clips, newest_clouds)
         if (
             not isinstance(people, Sequence)
             or len(people) != len(clouds)
@@ -234,13 +237,16 @@ class EvalSetup:
         origin: np.ndarray | None,
         box_centers: np.ndarray | None,
         clips: dict[str, Clips] | None = None,
+        newest_clouds: Sequence[np.ndarray | None] | None = None,
     ) -> Any:
-        """The model's answers for clouds (n, 3) m under the protocol clean. box_centers (N, 3) m, None without boxes:
-        for models that take them, but not for clips."""
+        """The model's answers for clouds (n, 3) m under the protocol clean. box_centers (N, 3) m, None without boxes,
+        and newest_clouds, see `Predictor.predict_in`: for models that take them, but not for clips."""
         model: Any = self.model
         name = model.skeleton.name
         if hasattr(model, "predict_in") and not clips:
-            return model.predict_in(clouds, origin, name, box_centers=box_centers, check_upside_down=False)
+            return model.predict_in(
+                clouds, origin, name, box_centers=box_centers, newest_clouds=newest_clouds, check_upside_down=False
+            )
         return model.predict(clouds, sensor_origin=origin, skeleton=name, **(clips or {}))
 
     def _check_pose(self, pose: Any, person: EvalSample) -> None:

@@ -231,7 +231,10 @@ def people_to_perturb(setup: EvalSetup) -> list[CroppedPerson]:
     # people that are not scored are not perturbed either
     pairs = [(setup.crop_sample(person)[0], person) for person in samples]
     people = [
-        CroppedPerson(shown=crop, whole=person) for crop, person in pairs if crop is not None and len(crop.points)
+        # perturbed points have no times
+        CroppedPerson(shown=replace(crop, point_times=None), whole=person)
+        for crop, person in pairs
+        if crop is not None and len(crop.points)
     ]
     if not people:
         raise InputError(

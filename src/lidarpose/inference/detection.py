@@ -16,9 +16,10 @@ import numpy as np
 from lidarpose.errors import InputError, check_int, is_number
 from lidarpose.geometry import UP_AXES, nearest_axis, rotation_about, up_text, upright_axis
 from lidarpose.inference.background import is_static, read_background
-from lidarpose.inference.checks import flat_along_another_axis, scan_unit_warning, unlikely_origin
-from lidarpose.inference.inputs import distinct, hashes
+from lidarpose.inference.checks import flat_along_another_axis, rows_inside, scan_unit_warning, unlikely_origin
+from lidarpose.inference.inputs import distinct_rows, hashes
 from lidarpose.inference.known_places import KnownPlaces
+from lidarpose.inference.newest import newest_scan
 from lidarpose.inference.scan import Scan
 from lidarpose.inference.verification import rounded, verified
 from lidarpose.models.detector.detector import MAX_RANGE, Detections, Detector
@@ -110,7 +111,8 @@ class DetectedScan:
 
     given: the scan as given, thinned; scan: the scan as it was searched; level (n, 3) m: its points in the level frame;
     detections: in the level frame, None for a scan without points; moving (n,) bool: points off the background, None
-    without a background; far_warning: that of `_far_from_most`, one of the scan's warnings.
+    without a background; far_warning: that of `_far_from_most`, one of the scan's warnings; older: the points that are
+    not of the newest scan, which was searched alone, None if there is one scan.
     """
 
     given: Scan
@@ -119,16 +121,24 @@ class DetectedScan:
     detections: Detections | None
     moving: np.ndarray | None = None
     far_warning: str | None = None
+    older: Scan | None = None
 
 
 def detect_places(scan: Scan, search: Search) -> DetectedScan:
-    """The first half of `find_people`, which does not depend on other frames of a recording."""
+    """The first half of `find_people`, which does not depend on other frames of a recording. Of several scans in one
+    cloud, the newest is searched: in all of them a moving person is many."""
+    newest_rows = newest_scan(scan.points, scan.point_times)
+    if newest_rows is not None:
+        counts = f"{np.count_nonzero(newest_rows):,} of {len(scan.points):,} points"
+        note = f"the points are of several scans by their times: people are searched for in the newest, {counts}"
+        newest = replace(scan.with_points_of(newest_rows), warnings=(*scan.warnings, note))
+        return replace(detect_places(newest, search), older=scan.with_points_of(~newest_rows))
     full_scan, count = scan, len(scan.points)
     if _MOST_AROUND < count <= _MOST_SORTED:
         # before the points are thinned: copies are kept or dropped together
-        scan = replace(scan, points=distinct(scan.points))
+        scan = scan.with_points_of(distinct_rows(scan.points))
     input_scan, notes = _thinned(scan, search)
-    input_scan = replace(input_scan, points=distinct(input_scan.points))
+    input_scan = input_scan.with_points_of(distinct_rows(input_scan.points))
     scan, warnings = input_scan, [*scan.warnings, *notes]
     if len(scan.points) < MIN_POINTS:
         scan = replace(scan, warnings=(*warnings, f"under {MIN_POINTS} points"))
@@ -254,6 +264,8 @@ def verify_people(places: DetectedScan, search: Search, known: KnownPlaces | Non
     )
     boxes = [_in_input(box, scan, input_scan) for box in people.boxes]
     result = replace(scan, boxes=boxes, detected_rows=people.rows)
+    if places.older is not None:
+        result = _with_older(result, places.older, people.boxes)
     if known is None:
         return result
     return replace(
@@ -262,6 +274,18 @@ def verify_people(places: DetectedScan, search: Search, known: KnownPlaces | Non
         verified=people.verified,
         rejected=people.rejected @ scan.R_level_input,
     )
+
+
+def _with_older(scan: Scan, older: Scan, level_boxes: list[Box]) -> Scan:
+    """The searched scan with the points of older scans appended, and those in the boxes of people added to theirs. The
+    boxes are in the level frame."""
+    older_rows = rows_inside(level_boxes, older.points @ scan.R_level_input.T)
+    count = len(scan.points)
+    rows = [np.append(rows, count + more) for rows, more in zip(scan.detected_rows or [], older_rows, strict=True)]
+    points, times = (
+        np.concatenate([getattr(part, name) for part in (scan, older)]) for name in ("points", "point_times")
+    )
+    return replace(scan, points=points, point_times=times, detected_rows=rows)
 
 
 def least_score(search: Search) -> float:
@@ -318,7 +342,7 @@ def _thinned(scan: Scan, search: Search) -> tuple[Scan, list[str]]:
             f"thinned from {num_searched:,} to {len(rows):,} points for detection: give one scan at a time, or a "
             "part of it"
         ]
-    return replace(scan, points=points[rows]), notes
+    return scan.with_points_of(rows), notes
 
 
 def _squared(points: np.ndarray, origin: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.inference.backend import Backend, estimates
-from lidarpose.inference.inputs import Clips
+from lidarpose.inference.inputs import Clips, is_few
 from lidarpose.inference.tta import IDENTITY, MIRRORED, TTATransform, apply, average, invert, tta_transforms
 from lidarpose.models.config import NetworkConfig
 from lidarpose.models.decode import decoder
@@ -30,6 +30,9 @@ _SAME_PERSON = 0.2
 # mean confidence above which a pose is not repeated about the box center, and the fraction of another pose's confidence
 # that is enough for a pose beside a second person
 _SURE, _LESS_SURE = 0.7, 0.5
+# the weight of the pose of a person's newest points, relative to that of all points, and the maximum horizontal
+# distance of these points from the pelvis, m
+_NEWEST_WEIGHT, _REACH = 3.0, 1.25
 
 
 class PoseEstimator:
@@ -173,6 +176,31 @@ class PoseEstimator:
             values = {name: value[k] for name, value in known_values(mean_pose, *PER_JOINT, *PER_PERSON).items()}
             poses.append(replace(mean_pose, joints=mean_pose.joints[k] + centers[k], **values))
         return poses
+
+    def averaged_with_newest(
+        self, poses: Sequence[Pose], newest_clouds: Sequence[np.ndarray], origin: np.ndarray | None
+    ) -> list[Pose]:
+        """Poses of N people from all points of several scans, averaged with those from each person's newest points,
+        where there is one: the older points show where a moving person was.
+
+        Args:
+            poses: of all points.
+            newest_clouds: N clouds (n, 3) m, see `newest_points`.
+            origin: (3,) m, the sensor position, None if unknown.
+        """
+        pelvises = [self._pelvis_of(pose) for pose in poses]
+        # a cloud may hold more than the person
+        pairs = zip(newest_clouds, pelvises, strict=True)
+        clouds = [cloud[np.hypot(*(cloud - pelvis)[:, :2].T) < _REACH] for cloud, pelvis in pairs]
+        rows = [row for row, cloud in enumerate(clouds) if not is_few(cloud)]
+        averaged = list(poses)
+        if rows:
+            box_centers = np.stack([pelvises[row] for row in rows])
+            newest_poses = self.poses([clouds[row] for row in rows], origin, box_centers=box_centers)
+            for row, newest_pose in zip(rows, newest_poses, strict=True):
+                if newest_pose is not None:
+                    averaged[row] = average([poses[row], newest_pose], (1.0, _NEWEST_WEIGHT))
+        return averaged
 
     def _passes_about_boxes(
         self,

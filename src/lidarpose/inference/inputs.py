@@ -204,7 +204,8 @@ def as_origin(value: object) -> np.ndarray | None:
 def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """Drops invalid points of (n, 3) m as `only_returns` does and thins the rest to `MAX_POINTS`. Returns the points
     and a message for each change."""
-    points, notes = _finite_returns(points)
+    rows, notes = usable_rows(points)
+    points = points if rows is None else points[rows]
     if len(points) > MAX_POINTS:
         notes.append(
             f"thinned from {len(points)} to {MAX_POINTS} points: crop closer to the person if the crop contains others"
@@ -214,13 +215,19 @@ def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
 
 
 def distinct(points: np.ndarray) -> np.ndarray:
-    """Points (n, 3) m without duplicates, if there are more than a few: second returns mostly repeat the first, and
-    networks count points."""
+    """Points (n, 3) m without duplicates, see `distinct_rows`."""
+    rows = distinct_rows(points)
+    return points if rows is None else points[rows]
+
+
+def distinct_rows(points: np.ndarray) -> np.ndarray | None:
+    """The rows of points (n, 3) m without duplicates, if there are more than a few, else None: second returns mostly
+    repeat the first, and networks count points."""
     keys = hashes(points)
     ordered = np.sort(keys)
     if np.count_nonzero(ordered[1:] == ordered[:-1]) <= _FEW_COPIES * len(points):
-        return points
-    return points[np.sort(np.unique(keys, return_index=True)[1])]
+        return None
+    return np.sort(np.unique(keys, return_index=True)[1])
 
 
 def hashes(points: np.ndarray) -> np.ndarray:
@@ -256,11 +263,14 @@ def rounding_warning(points: np.ndarray) -> str | None:
 def only_returns(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """Drops rows of points (n, 3) m that are not finite, too large or not returns. Returns the points and a message for
     each kind of dropped rows and for rounded coordinates."""
-    points, notes = _finite_returns(points)
+    rows, notes = usable_rows(points)
+    points = points if rows is None else points[rows]
     return points, [*notes, *filter(None, [rounding_warning(points)])]
 
 
-def _finite_returns(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
+def usable_rows(points: np.ndarray) -> tuple[np.ndarray | None, list[str]]:
+    """The rows (n,) bool of points (n, 3) m that are finite, not too large and returns, None if all are; and a message
+    for each kind of other rows."""
     notes = []
     is_usable = within_reach(points)
     if num_dropped := int((~is_usable).sum()):
@@ -270,7 +280,7 @@ def _finite_returns(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     if (num_zeros := int(is_zero.sum())) > 1:
         notes.append(f"dropped {num_zeros} of {len(points)} points at 0,0,0, which are not returns")
         is_usable &= ~is_zero
-    return (points[is_usable], notes) if notes else (points, [])
+    return (is_usable, notes) if notes else (None, [])
 
 
 def is_few(points: np.ndarray) -> bool:

@@ -56,6 +56,7 @@ def predict(
     skeleton: str | Skeleton | None = None,
     up: str | Sequence[float] | None = None,
     columns: int | None = None,
+    point_times: "ArrayLike | None" = None,
     model: "Predictor | str | os.PathLike | Callable[[], Predictor]" = DEFAULT,
     progress: bool = False,
 ) -> Poses:
@@ -87,6 +88,9 @@ def predict(
             stated by `boxes`, as `detect` and `predict` write it, otherwise z, or, if the ground leans, the direction
             in which it does. A given z or direction is exact.
         columns: number of values per row of a .bin file.
+        point_times: (n,) s from any zero, when each point of an array was measured. A file's own are read from its
+            column t, offset_time, time, timestamp or gps_time. If a person's points are of several scans, their pose is
+            that of the newest scan; without times, it is blurred by motion. The paper's networks do not use them.
         model: a `Predictor`; or the name or path of weights, loaded with the default settings of `load`; or a function
             without arguments that returns a `Predictor`, called when it is needed. Bundled networks are loaded once and
             cached; files are loaded in each call, since they may have changed.
@@ -112,7 +116,7 @@ def predict(
         # boxes of a tilted scan state its up direction, which may differ from the given axis
         check_up(input_boxes, up, most=SAME_AXIS)
     scan = Scan(points=np.zeros((0, 3)), boxes=input_boxes, origin=as_origin(sensor_origin), up=up_text(up))
-    scan = read_scan(scan, path, columns)
+    scan = read_scan(scan, path, columns, point_times)
     if find is None:
         find = is_searched or boxes is None and not crop and (not len(scan.points) or is_whole(scan))
     if sensor_origin is None and (find or boxes is not None):

@@ -1,11 +1,12 @@
 """`load` a network and predict the poses of one or many point clouds, of any number type; clouds may be empty."""
 
 import os
+import reprlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Protocol, TypedDict, Unpack, overload
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypedDict, Unpack, overload
 
 import numpy as np
 
@@ -33,11 +34,14 @@ from lidarpose.inference.inputs import (
     is_many,
     only_returns,
 )
+from lidarpose.inference.newest import newest_points
 from lidarpose.inference.results import PersonPose, Poses
-from lidarpose.inference.scan import Scan, pose_scan
+from lidarpose.inference.scan import Scan, pose_scan, read_scan
 from lidarpose.inference.tta import tta_transforms
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.files import file_error
+from lidarpose.io.point_cloud import Cloud
+from lidarpose.io.point_times import as_point_times
 from lidarpose.models import BUNDLED, DEFAULT, weights_name, weights_path
 from lidarpose.models.checkpoint import read_header
 from lidarpose.models.decode import decoder
@@ -150,6 +154,7 @@ class _Options(TypedDict, total=False):
     sensor_origin: "np.ndarray | Sequence[float] | str | None"
     skeleton: str | Skeleton | None
     progress: bool
+    point_times: "ArrayLike | Sequence[ArrayLike | None] | None"
 
 
 class Predictor(PoseEstimator):
@@ -218,7 +223,16 @@ class Predictor(PoseEstimator):
     ) -> Poses: ...
 
     def predict(
-        self, points, *, boxes=None, find=False, sensor_origin=None, skeleton=None, progress=False, clips=None
+        self,
+        points,
+        *,
+        boxes=None,
+        find=False,
+        sensor_origin=None,
+        skeleton=None,
+        progress=False,
+        clips=None,
+        point_times=None,
     ) -> PersonPose | Poses:
         """Predicts the pose of one person, of several people, or of all people in a scan.
 
@@ -238,6 +252,8 @@ class Predictor(PoseEstimator):
             progress (bool): whether to show a progress bar.
             clips (Clips): for networks that read clips: which clouds of a list are frames of the same person. By
                 default each cloud is repeated to fill a clip.
+            point_times (array, or list of arrays for a list of clouds): (n,) s from any zero, when each point was
+                measured, for clouds of several scans, as in `lidarpose.predict`. A list may contain None.
 
         Returns:
             A `PersonPose` for one cloud; `Poses` for a list of clouds, or with `boxes` or `find`. `Poses` has the order
@@ -254,11 +270,12 @@ class Predictor(PoseEstimator):
         if clips is not None and (find or boxes is not None):
             raise InputError("clips need a list of clouds, each of one person: omit clips with boxes or find")
         if boxes is not None or find:
-            cloud, notes = only_returns(as_points(points))
+            cloud = as_points(points)
             origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)
             input_boxes = None if boxes is None else read_boxes(boxes)
             up = "z" if input_boxes is None else input_boxes.up
-            scan = Scan(points=cloud, boxes=input_boxes, origin=origin, up=up, warnings=tuple(notes))
+            scan = Scan(points=cloud, boxes=input_boxes, origin=origin, up=up)
+            scan = read_scan(scan, cloud, None, _own_times(points) if point_times is None else point_times)
             if find:
                 from lidarpose.inference.detection import Search
                 from lidarpose.inference.single_scan import search_alone
@@ -269,7 +286,8 @@ class Predictor(PoseEstimator):
         is_one = not is_many(points)
         clouds = [as_points(points)] if is_one else [as_points(cloud, f"points[{i}]") for i, cloud in enumerate(points)]
         clips = None if clips is None else clips.checked(len(clouds))
-        poses = self._predict_clouds(clouds, origin, skeleton, progress, clips)
+        times = _times_of([points] if is_one else points, clouds, [point_times] if is_one else point_times)
+        poses = self._predict_clouds(clouds, origin, skeleton, progress, clips, times)
         return poses.people[0] if is_one else poses
 
     def predict_clip(
@@ -329,6 +347,7 @@ class Predictor(PoseEstimator):
         clips: Clips | None = None,
         pelvises: np.ndarray | None = None,
         box_centers: np.ndarray | None = None,
+        newest_clouds: Sequence[np.ndarray | None] | None = None,
         is_scored: bool = False,
         check_upside_down: bool = True,
     ) -> Poses:
@@ -341,6 +360,8 @@ class Predictor(PoseEstimator):
                 person. The first pass, which finds the pelvis, is then skipped.
             box_centers: (N, 3) m, centers of the boxes that cropped the clouds. They tell which person is meant where a
                 cloud shows two people or the pose is uncertain.
+            newest_clouds: for each cloud of several scans the newest of its points, see `newest_points`, else None.
+                The paper's networks do not use them.
             is_scored: whether the boxes have scores, which rest on more than the points inside the box. Warnings that
                 a cloud may not show a person are then suppressed.
             check_upside_down: whether to pose clouds with uncertain poses upside down as well, in order to warn of a
@@ -352,6 +373,10 @@ class Predictor(PoseEstimator):
         in_box = pelvises is not None or box_centers is not None
         is_placed = np.zeros(len(clouds), bool) if pelvises is None else np.isfinite(pelvises).all(1)
         best_poses = self._best(cleaned_clouds, is_usable, is_placed, origin, progress, clips, pelvises, box_centers)
+        if newest_clouds is not None and self._averaged:
+            newest = {i: cloud for i in best_poses if (cloud := newest_clouds[i]) is not None}
+            averaged = self.averaged_with_newest([best_poses[i][0] for i in newest], list(newest.values()), origin)
+            best_poses |= {i: (pose, best_poses[i][1]) for i, pose in zip(newest, averaged, strict=True)}
         poses: list[Pose | None] = [None] * len(clouds)
         unsure_rows: list[int] = []
         for i, (points, notes) in enumerate(cleaned_clouds):
@@ -404,12 +429,13 @@ class Predictor(PoseEstimator):
         )
         return Poses(people=people, skeleton=target_skeleton, model=self.model)
 
-    def _predict_clouds(self, clouds, origin, skeleton, progress, clips) -> Poses:
+    def _predict_clouds(self, clouds, origin, skeleton, progress, clips, times=None) -> Poses:
         """Poses of clouds given by the user, without duplicate points, and with a warning for each cloud with rounded
-        coordinates. Of people cropped from a scan, these belong to the scan."""
+        coordinates. Of people cropped from a scan, these belong to the scan. times: of each cloud's points, or None."""
         returns = [only_returns(cloud) for cloud in clouds]
         distinct_clouds = [points if is_few(points) else distinct(points) for points, _ in returns]
-        poses = self.predict_in(distinct_clouds, origin, skeleton, progress, clips=clips)
+        newest_clouds = None if times is None else list(map(newest_points, clouds, times))
+        poses = self.predict_in(distinct_clouds, origin, skeleton, progress, clips=clips, newest_clouds=newest_clouds)
         people = zip(poses, returns, strict=True)
         people_with_notes = (replace(person, warnings=(*notes, *person.warnings)) for person, (_, notes) in people)
         return replace(poses, people=tuple(people_with_notes))
@@ -455,6 +481,27 @@ class Predictor(PoseEstimator):
             i: select_pose(person_poses, None if box_centers is None else box_centers[i])
             for i, person_poses in poses_by_person.items()
         }
+
+
+def _own_times(points: Any) -> np.ndarray | None:
+    """The times of the points of a `Cloud`, which are relative to the newest; None for arrays."""
+    return points.point_times if isinstance(points, Cloud) else None
+
+
+def _times_of(inputs: Sequence, clouds: list[np.ndarray], point_times: Any) -> list[np.ndarray | None]:
+    """When the points of each cloud were measured: as given by the user, or of a `Cloud`. Raises InputError."""
+    if point_times is None:
+        return [_own_times(points) for points in inputs]
+    if not isinstance(point_times, list | tuple) or len(point_times) != len(clouds):
+        raise InputError(
+            f"point_times: expected a list with the times of each of {len(clouds)} clouds or None, got "
+            f"{reprlib.repr(point_times)}"
+        )
+    triples = zip(inputs, clouds, point_times, strict=True)
+    return [
+        _own_times(points) if own_times is None else as_point_times(own_times, len(cloud), f"point_times[{i}]")
+        for i, (points, cloud, own_times) in enumerate(triples)
+    ]
 
 
 def _range_warning(pose: Pose) -> str | None:

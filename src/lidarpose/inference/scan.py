@@ -12,13 +12,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lidarpose.errors import check_int
+from lidarpose.errors import InputError, check_int
 from lidarpose.geometry import rotation_from_up, rotation_of_boxes, upright_axis
 from lidarpose.inference.checks import check_scan, origin_warning, rows_inside, unit_warning
-from lidarpose.inference.inputs import as_points, distinct, only_returns
+from lidarpose.inference.inputs import as_points, distinct, rounding_warning, usable_rows
+from lidarpose.inference.newest import newest_points
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.io.files import file_error
 from lidarpose.io.point_cloud import Cloud, read_points
+from lidarpose.io.point_times import as_point_times
 from lidarpose.sample import FARTHEST, Box
 
 if TYPE_CHECKING:
@@ -38,7 +40,7 @@ class Scan:
     After detection, detected_rows holds for each box the rows (k,) of the person's points, which the enlarged box of a
     tilted scan does not determine. In recordings, pelvises (N, 3) m: approximate pelvis positions of the people in the
     boxes; verified (N,) bool: whether the box was verified in this scan; rejected (R, 3) m: positions of detections
-    that the verifier rejected.
+    that the verifier rejected; point_times (n,) s: when each point was measured, relative to any time, None if unknown.
     """
 
     points: np.ndarray
@@ -51,6 +53,7 @@ class Scan:
     pelvises: np.ndarray | None = None
     verified: np.ndarray | None = None
     rejected: np.ndarray | None = None
+    point_times: np.ndarray | None = None
 
     @cached_property
     def R_level_input(self) -> np.ndarray:
@@ -85,6 +88,21 @@ class Scan:
             return self.detected_rows
         return rows_inside(self.level_boxes(), self.box_points())
 
+    def with_points_of(self, rows: np.ndarray | None) -> Scan:
+        """The scan with only these rows of its points; None keeps all."""
+        if rows is None:
+            return self
+        point_times = None if self.point_times is None else self.point_times[rows]
+        return replace(self, points=self.points[rows], point_times=point_times)
+
+    def newest_clouds(self) -> list[np.ndarray | None] | None:
+        """The newest points of each person in the level frame, see `newest_points`; None if no times are known."""
+        if self.point_times is None:
+            return None
+        rows = [np.arange(len(self.points))] if self.boxes is None else self.rows
+        clouds = [newest_points(self.points[own_rows], self.point_times[own_rows]) for own_rows in rows]
+        return [None if cloud is None else _turned(cloud, self.R_level_input) for cloud in clouds]
+
     def clouds(self) -> list[np.ndarray]:
         """The points of each person in the level frame (z up); for a crop, all points."""
         # rotate only the points of people, not the whole scan
@@ -97,22 +115,37 @@ def _turned(points: np.ndarray, R: np.ndarray) -> np.ndarray:
     return points if np.array_equal(R, np.eye(3)) else points @ R.T
 
 
-def read_scan(scan: Scan, points: str | os.PathLike | ArrayLike, columns: int | None) -> Scan:
-    """The scan with the valid points of a file or an array (n, 3+) m, the file's name, and warnings from reading.
+def read_scan(
+    scan: Scan,
+    points: str | os.PathLike | ArrayLike,
+    columns: int | None,
+    point_times: ArrayLike | None = None,
+) -> Scan:
+    """The scan with the valid points of a file or an array (n, 3+) m, when they were measured, the file's name, and
+    warnings from reading. point_times: (n,) s, of an array.
 
     Raises InputError for a file without valid points.
     """
     source = os.fsdecode(points) if isinstance(points, str | os.PathLike) else None
     if source is None and columns is not None:
         check_int("columns", columns, least=3, hint=" (x y z first)")
-    cloud = Cloud(points=as_points(points)) if source is None else read_points(source, columns=columns)
-    returns, notes = only_returns(cloud.points)
-    if source is not None and not len(returns):
+    cloud = read_points(source, columns=columns) if source is not None else None
+    if cloud is None:
+        array = as_points(points)
+        own_times = points.point_times if isinstance(points, Cloud) else None
+        times = own_times if point_times is None else point_times
+        cloud = Cloud(points=array, point_times=as_point_times(times, len(array)))
+    elif point_times is not None:
+        raise InputError("point_times are for arrays, a file has its own: omit them, or give the points as an array")
+    rows, notes = usable_rows(cloud.points)
+    scan = replace(scan, points=cloud.points, point_times=cloud.point_times).with_points_of(rows)
+    notes += filter(None, [rounding_warning(scan.points)])
+    if source is not None and not len(scan.points):
         problem = (
             f"only coordinates beyond {FARTHEST:,.0f} m" if cloud.points.any() else "only 0,0,0, which are not returns"
         )
         raise file_error(source, f"expected points in meters, got {problem}: export it again")
-    return replace(scan, points=returns, warnings=(*cloud.warnings, *notes), source=source)
+    return replace(scan, warnings=(*cloud.warnings, *notes), source=source)
 
 
 def pose_scan(
@@ -136,10 +169,15 @@ def pose_scan(
         box_centers = np.stack([scan.R_level_input @ box.center for box in scan.boxes])
         is_scored = all(box.score is not None for box in scan.boxes)
         level_poses = predictor.predict_in(
-            clouds, origin, skeleton, progress, pelvises=pelvises, box_centers=box_centers, is_scored=is_scored
-        )
+            *(clouds, origin, skeleton, progress),
+            pelvises=pelvises, box_centers=box_centers, is_scored=is_scored, newest_clouds=scan.newest_clouds(),
+        )  # fmt: skip
     else:
-        level_poses = predictor.predict(clouds, sensor_origin=origin, skeleton=skeleton, progress=progress)
+        # a crop, or no boxes at all
+        times = [scan.point_times] if scan.boxes is None else []
+        level_poses = predictor.predict(
+            scan.clouds(), sensor_origin=origin, skeleton=skeleton, progress=progress, point_times=times
+        )
     predict_ms = (time.perf_counter() - crop_end) * 1e3
     level_poses = replace(level_poses, people=_named(level_poses, scan.boxes))
     warnings += check_scan(scan, level_poses)

@@ -46,6 +46,7 @@ def detect(
     min_score: float | None = None,
     max_people: int | None = None,
     background: str | os.PathLike | Sequence | ArrayLike | None = None,
+    point_times: ArrayLike | None = None,
 ) -> Boxes:
     """Detects the people in a whole scan and returns their boxes, highest score first, ready for `predict`.
 
@@ -62,6 +63,8 @@ def detect(
         background: static background of a stationary sensor, in which no people are searched for: a file or an array
             (k, 3) m of static points, see `learn_background`; or several scans or a folder of scans, from which the
             background is learned.
+        point_times: (n,) s, as in `predict`. If the points are of several scans, only the newest is searched: in all of
+            them a moving person is many.
 
     Returns:
         `Boxes` in the frame of the points. Each box has `score`, the probability that it contains a person, calibrated
@@ -77,7 +80,7 @@ def detect(
     search = search_options(min_score, max_range, max_people, background, columns, up=up)
     origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)
     scan = Scan(points=np.zeros((0, 3)), origin=origin, up=up_text(up_direction))
-    result = search_alone(read_scan(scan, points, columns), search)
+    result = search_alone(read_scan(scan, points, columns, point_times), search)
     return Boxes(
         result.boxes or [],
         source=result.source,

@@ -6,6 +6,7 @@ differ slightly because points fall into other voxels; their mean is more accura
 Legend: B people, J joints.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -77,21 +78,26 @@ def invert(poses: Pose, transform: TTATransform) -> Pose:
     return replace(poses, **{name: value[:, flip] for name, value in values.items()})
 
 
-def average(poses: list[Pose]) -> Pose:
-    """The mean of several predictions for B people, weighted per person by confidence if the network predicts it."""
+def average(poses: list[Pose], factors: Sequence[float] | None = None) -> Pose:
+    """The mean of several predictions for B people or for one, weighted per person by confidence if the network
+    predicts it. factors: by which the weights of each prediction are multiplied."""
     if len(poses) == 1:
         return poses[0]
     names = known_values(poses[0], "joints", *PER_JOINT, *PER_PERSON)
     stacks = {name: np.stack([getattr(pose, name) for pose in poses]).astype(float) for name in names}
-    weight = np.ones(stacks["joints"].shape[:2])
+    weight = np.ones(stacks["joints"].shape[:-2])
     if "confidence" in stacks:
         weight = stacks["confidence"].mean(-1) ** _POWER
         # equal weights if all confidences are zero
         weight = np.where(weight.sum(0) > 0, weight, 1.0)
-    values: dict[str, Any] = {
-        name: np.average(stack, 0, np.broadcast_to(weight.reshape(weight.shape + (1,) * (stack.ndim - 2)), stack.shape))
-        for name, stack in stacks.items()
-    }
+    if factors is not None:
+        weight = (weight.T * factors).T
+
+    def mean(stack: np.ndarray) -> np.ndarray:
+        weights = weight.reshape(weight.shape + (1,) * (stack.ndim - weight.ndim))
+        return np.average(stack, 0, np.broadcast_to(weights, stack.shape))
+
+    values: dict[str, Any] = {name: mean(stack) for name, stack in stacks.items()}
     if "in_range" in values:
         # majority vote
         values["in_range"] = values["in_range"] > 0.5

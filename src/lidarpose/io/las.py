@@ -10,7 +10,7 @@ import numpy as np
 
 from lidarpose.errors import needs_extra
 from lidarpose.io.files import FormatError, check_unpacked
-from lidarpose.io.text import check_bytes
+from lidarpose.io.text import PickColumns, check_bytes, pick_xyz
 
 # header bytes of version 1.2 and older, and of 1.4, whose longer header has a 64-bit number of points
 _HEADER, _HEADER_1_4 = 227, 375
@@ -21,11 +21,14 @@ _PACKED = 0x80
 _LASZIP = (b"laszip encoded", 22204)
 # size of the chunks in that record if they differ
 _VARIABLE = b"\xff\xff\xff\xff"
+# byte of the time in a point, and in a point of format 6 and later, which has a larger scan angle
+_TIME_OFFSET, _LATER_TIME_OFFSET, _LATER = 20, 22, 6
 _WITH_TIME, _WITH_COLOR = (1, 3, 4, 5, 6, 7, 8, 9, 10), (2, 3, 5, 7, 8, 10)
 
 
-def parse_las(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
-    """x y z (n, 3) float64 in the file's unit and the column names; raises FormatError."""
+def parse_las(data: bytes, pick: PickColumns = pick_xyz) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The picked columns (n, c), x y z and perhaps the time, float64 in the file's units, and the column names; raises
+    FormatError."""
     if len(data) < _HEADER or data[:4] != b"LASF":
         raise FormatError("a LAS header", f"an unknown or damaged one in {len(data)} bytes", "copy it again")
     version = tuple(data[24:26])
@@ -42,11 +45,15 @@ def parse_las(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
         check_unpacked(len(data), num_points * size)
         data, start = _unpack(data, start, size, num_points), 0
     check_bytes(data, start, num_points * size, num_points)
-    record = np.dtype({"names": ["xyz"], "formats": [("<i4", 3)], "offsets": [0], "itemsize": size})
-    steps = np.frombuffer(data, record, num_points, start)["xyz"]
     names = ["x", "y", "z", "intensity", "classification"]
     names += ["gps_time"] * (kind in _WITH_TIME) + ["red", "green", "blue"] * (kind in _WITH_COLOR)
-    return steps * scale + shift, tuple(names)
+    steps: np.ndarray = np.ndarray((num_points, 3), "<i4", data, start, (size, 4))
+    points = steps * scale + shift
+    offset = _TIME_OFFSET if kind < _LATER else _LATER_TIME_OFFSET
+    if len(pick(names)) == 3 or size < offset + 8:
+        return points, tuple(names)
+    times: np.ndarray = np.ndarray(num_points, "<f8", data, start + offset, size)
+    return np.column_stack([points, times]), tuple(names)
 
 
 class _Unseekable(io.RawIOBase):

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lidarpose.io.files import FormatError, check_unpacked, shorten
-from lidarpose.io.text import check_bytes, decode, parse_count, parse_rows, pick_xyz
+from lidarpose.io.text import PickColumns, check_bytes, decode, parse_count, parse_rows, pick_xyz
 
 _PCD_TYPES = ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
 _PLY_TYPES = {
@@ -22,13 +22,15 @@ _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": "
 
 
 def _columns(data: bytes, num_points: int, types: Sequence[str], starts: Sequence[int], steps: Sequence[int]):
-    """x y z (n, 3) from bytes: of each the type, the byte offset of the first value, and the stride to the next one."""
+    """c columns (n, c) float64 from bytes: of each the type, the byte offset of the first value, and the stride to the
+    next one."""
     layouts = zip(types, starts, steps, strict=True)
-    return np.stack([np.ndarray(num_points, kind, data, start, step) for kind, start, step in layouts], axis=-1)
+    columns = (np.ndarray(num_points, kind, data, start, step) for kind, start, step in layouts)
+    return np.stack([column.astype(np.float64) for column in columns], axis=-1)
 
 
-def parse_pcd(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
-    """x y z (n, 3) and the field names; raises FormatError."""
+def parse_pcd(data: bytes, pick: PickColumns = pick_xyz) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The picked columns (n, c) and the field names; raises FormatError."""
     header, encoding, start = _pcd_header(data)
     names = tuple(header.get("FIELDS") or header.get("COLUMNS") or ())
     # older versions of the format have no COUNT, the oldest no SIZE and TYPE
@@ -43,26 +45,26 @@ def parse_pcd(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
         raise FormatError("PCD TYPE F, I or U with SIZE 1, 2, 4 or 8", f"{shorten(text)!r}", "export it again")
     size_keys = ("POINTS",) if "POINTS" in header else ("WIDTH", "HEIGHT")
     num_points = math.prod(parse_count(" ".join(header.get(key, ())), key) for key in size_keys)
-    xyz_indices = pick_xyz(names)
-    if any(counts[i] != 1 for i in xyz_indices):
+    picked = pick(names)
+    if any(counts[i] != 1 for i in picked):
         raise FormatError("expected COUNT 1 for x, y and z in the PCD header: export the points without features")
     if encoding not in ("ascii", "binary", "binary_compressed"):
         raise FormatError("PCD DATA ascii, binary or binary_compressed", f"{encoding!r}", "export it again")
     if not num_points:
-        return np.empty((0, 3)), names
+        return np.empty((0, len(picked))), names
     if encoding == "ascii":
-        cells = [sum(counts[:i]) for i in xyz_indices]
+        cells = [sum(counts[:i]) for i in picked]
         return parse_rows(decode(data[start:]), num_points, cells, sum(counts)), names
     widths = [int(s) * c for s, c in zip(sizes, counts, strict=True)]
-    offsets, row_size = [sum(widths[:i]) for i in xyz_indices], sum(widths)
+    offsets, row_size = [sum(widths[:i]) for i in picked], sum(widths)
     if encoding == "binary":
         check_bytes(data, start, num_points * row_size, num_points)
-        starts, steps = [start + offset for offset in offsets], [row_size] * 3
+        starts, steps = [start + offset for offset in offsets], [row_size] * len(picked)
     else:
         # stored field by field: all x, then all y
         data = _decompress(data, start, num_points * row_size, num_points)
-        starts, steps = [num_points * offset for offset in offsets], [widths[i] for i in xyz_indices]
-    return _columns(data, num_points, [f"<{formats[i]}" for i in xyz_indices], starts, steps), names
+        starts, steps = [num_points * offset for offset in offsets], [widths[i] for i in picked]
+    return _columns(data, num_points, [f"<{formats[i]}" for i in picked], starts, steps), names
 
 
 def viewpoint_notes(data: bytes) -> tuple[str, ...]:
@@ -111,8 +113,8 @@ def _decompress(data: bytes, start: int, size: int, num_points: int) -> bytes:
     return body
 
 
-def parse_ply(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
-    """x y z (n, 3) of the vertices and their property names; raises FormatError."""
+def parse_ply(data: bytes, pick: PickColumns = pick_xyz) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The picked columns (n, c) of the vertices and their property names; raises FormatError."""
     encoding, elements, body_start = _ply_header(data)
     start, skip_lines = body_start, 0
     for name, num_points, properties in elements:
@@ -129,14 +131,14 @@ def parse_ply(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
     else:
         raise FormatError("a PLY element 'vertex'", "none", "export the points")
     names = tuple(name for name, _ in properties)
-    xyz_indices = pick_xyz(names)
+    picked = pick(names)
     if not num_points:
-        return np.empty((0, 3)), names
+        return np.empty((0, len(picked))), names
     if encoding == "ascii":
-        return parse_rows(decode(data[body_start:]), num_points, xyz_indices, len(names), skip=skip_lines), names
+        return parse_rows(decode(data[body_start:]), num_points, picked, len(names), skip=skip_lines), names
     check_bytes(data, start, num_points * sum(widths), num_points)
-    starts = [start + sum(widths[:i]) for i in xyz_indices]
-    return _columns(data, num_points, [types[i] for i in xyz_indices], starts, [sum(widths)] * 3), names
+    starts = [start + sum(widths[:i]) for i in picked]
+    return _columns(data, num_points, [types[i] for i in picked], starts, [sum(widths)] * len(picked)), names
 
 
 def _ply_header(data: bytes) -> tuple[str, list[tuple[str, int, list[tuple[str, str]]]], int]:

@@ -1,16 +1,18 @@
 """Point clouds from files: PCD, PLY, LAS, raw float32, NumPy and text.
 
 The suffix, in upper or lower case, determines the format. Coordinates are not changed (meters are assumed, nothing is
-rotated or scaled). They are float64, since float32 rounds map coordinates such as UTM to half a meter. Columns other
-than x, y and z are listed in `Cloud.fields` and otherwise ignored.
+rotated or scaled). They are float64, since float32 rounds map coordinates such as UTM to half a meter. A column with
+the times of the points is read, too; others are listed in `Cloud.fields` and otherwise ignored.
 
 The sizes in a header are checked against the file before numpy, pandas or LZF decode it. A parser takes a file's bytes
-and returns x y z (n, 3) and the column names; it raises `FormatError`, to which `read_points` adds the file name.
+and a function that picks columns by their names, and returns these columns (n, 3 or 4) and all names; it raises
+`FormatError`, to which `read_points` adds the file name.
 """
 
 import os
 import re
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +22,17 @@ from lidarpose.io.files import FormatError, file_error, read_bytes, shorten
 from lidarpose.io.las import parse_las
 from lidarpose.io.npz import load_array, member_header, open_npz, unpack
 from lidarpose.io.pcd_ply import parse_pcd, parse_ply, viewpoint_notes
-from lidarpose.io.text import FEW_ROWS, is_image, is_transposed, numbered, parse_text, pick_xyz
+from lidarpose.io.point_times import times_of_column
+from lidarpose.io.text import (
+    FEW_ROWS,
+    PickColumns,
+    is_image,
+    is_transposed,
+    numbered,
+    parse_text,
+    pick_xyz,
+    pick_xyz_and_time,
+)
 
 KITTI_FIELDS = ("x", "y", "z", "intensity")
 NUSCENES_FIELDS = ("x", "y", "z", "intensity", "ring")
@@ -76,13 +88,15 @@ class Cloud:
 
     points: (n, 3) float64, x y z in the file's own frame and unit, all finite, n > 0; num_dropped: number of rows
     dropped because a coordinate was NaN, infinite or missing; fields: names of all columns of the file; warnings:
-    lines for the user.
+    lines for the user; point_times: (n,) float32 s, when each point was measured relative to the newest, None if the
+    file does not tell.
     """
 
     points: np.ndarray
     num_dropped: int = 0
     fields: tuple[str, ...] = ("x", "y", "z")
     warnings: tuple[str, ...] = ()
+    point_times: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -129,11 +143,12 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
             notes: tuple[str, ...] = ()
             if suffix == ".bin":
                 columns = 5 if columns is None and name.endswith(".pcd.bin") else columns
-                points, fields, notes = _parse_bin(data, columns)
+                values, fields, notes = _parse_bin(data, columns)
             else:
-                points, fields = _PARSERS[suffix](data)
+                values, fields = _parsed(_PARSERS[suffix], data)
                 notes = viewpoint_notes(data) if suffix == ".pcd" else ()
-            points = np.ascontiguousarray(points, dtype=np.float64)
+            points = np.ascontiguousarray(values[:, :3], dtype=np.float64)
+            times = times_of_column(values[:, 3], fields) if values.shape[1] > 3 else None
             is_finite = np.isfinite(points).all(axis=1)
         num_dropped = len(points) - int(is_finite.sum())
         if not len(points):
@@ -151,8 +166,16 @@ def read_points(path: str | os.PathLike, *, columns: int | None = None) -> Cloud
         raise file_error(path, f"cannot be read as a {suffix} file ({reason}); export it again") from None
     if num_dropped:
         notes = (*notes, f"dropped {num_dropped} of {len(points)} points that were NaN, infinite or incomplete")
-        points = points[is_finite]
-    return Cloud(points=points, num_dropped=num_dropped, fields=tuple(fields), warnings=tuple(notes))
+        points, times = points[is_finite], None if times is None else times[is_finite]
+    return Cloud(points=points, num_dropped=num_dropped, fields=tuple(fields), warnings=tuple(notes), point_times=times)
+
+
+def _parsed(parse: Callable, data: bytes) -> tuple[np.ndarray, Sequence[str]]:
+    """The columns of a file: x, y, z, and the points' times unless they are no numbers."""
+    try:
+        return parse(data, pick_xyz_and_time)
+    except (FormatError, ValueError):
+        return parse(data, pick_xyz)
 
 
 def _refuse_foreign(data: bytes, suffix: str) -> None:
@@ -256,11 +279,11 @@ def _width(values: np.ndarray, columns: int) -> float:
 # ---- NumPy
 
 
-def _parse_npy(data: bytes):
-    return _points_of(load_array(data), "the array")
+def _parse_npy(data: bytes, pick: PickColumns):
+    return _points_of(load_array(data), "the array", pick)
 
 
-def _parse_npz(data: bytes):
+def _parse_npz(data: bytes, pick: PickColumns):
     """Reads the array `points`, else `xyz`, else the only array with the shape of points."""
     with open_npz(data) as (archive, members):
         keys = [key for key in ("points", "xyz") if key in members]
@@ -272,13 +295,13 @@ def _parse_npz(data: bytes):
             actual = shorten(", ".join(members)) or "no array"
             raise FormatError("'points', 'xyz' or a single (n, 3+) array", actual, "save it with points=")
         (content,) = unpack(archive, [members[keys[0]]], len(data))
-        return _points_of(load_array(content), f"the array {shorten(keys[0])!r}")
+        return _points_of(load_array(content), f"the array {shorten(keys[0])!r}", pick)
 
 
-def _points_of(array: np.ndarray, label: str):
+def _points_of(array: np.ndarray, label: str, pick: PickColumns):
     if array.dtype.names:
         names = array.dtype.names
-        parts = [array[names[i]] for i in pick_xyz(names)]
+        parts = [array[names[i]] for i in pick(names)]
         if any(part.ndim != 1 or part.dtype.kind not in "fiu" for part in parts):
             raise FormatError(f"(n,) records with numbers x, y, z in {label}", array.shape, "save (n, 3) floats")
         return np.stack([part.astype(np.float64) for part in parts], axis=-1), names

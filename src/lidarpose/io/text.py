@@ -4,12 +4,13 @@ import csv
 import io
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from lidarpose.io.files import FormatError, shorten
+from lidarpose.io.point_times import time_column
 from lidarpose.sample import JOINT_COLUMNS
 
 # a table of at most this many rows and more than this many columns has a point per column
@@ -32,6 +33,16 @@ def pick_xyz(names: Sequence[str]) -> list[int]:
         actual = shorten(" ".join(names)) or "none"
         raise FormatError("columns x, y and z", actual, "export or rename x, y, z")
     return [plain_names.index(axis) for axis in "xyz"]
+
+
+# selects columns by their names
+PickColumns = Callable[[Sequence[str]], list[int]]
+
+
+def pick_xyz_and_time(names: Sequence[str]) -> list[int]:
+    """The positions of x, y and z among column names, and that of the points' times if there is one."""
+    time = time_column(names)
+    return pick_xyz(names) + ([] if time is None else [time])
 
 
 def has_xyz(names: Sequence[str]) -> bool:
@@ -83,7 +94,7 @@ def check_bytes(data: bytes, start: int, size: int, num_points: int) -> None:
 
 
 def parse_rows(text: str, num_rows: int, columns: list[int], num_cells: int, *, skip: int = 0) -> np.ndarray:
-    """The three given columns, (n, 3), of `num_rows` lines with `num_cells` numbers each, after `skip` other lines.
+    """The c given columns, (n, c), of `num_rows` lines with `num_cells` numbers each, after `skip` other lines.
 
     Blank lines do not count. Raises FormatError if there are fewer lines, and for the first line that does not fit.
     """
@@ -101,8 +112,8 @@ def parse_rows(text: str, num_rows: int, columns: list[int], num_cells: int, *, 
         raise _wrong_line(rows, columns, error, where=" of the points") from None
 
 
-def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
-    """x y z (n, 3) and the column names; raises FormatError."""
+def parse_text(data: bytes, pick: PickColumns = pick_xyz) -> tuple[np.ndarray, tuple[str, ...]]:
+    """The picked columns (n, c) and the column names; raises FormatError."""
     text = re.sub(_COUNT, r"\1\n", _with_plain_nan(decode(data)))
     names, num_skipped, has_header, separator, decimal = _find_columns(text)
     # comments, but not in quotes; lines with only a comment would count as rows without values; the lookbehind keeps
@@ -120,10 +131,10 @@ def parse_text(data: bytes) -> tuple[np.ndarray, tuple[str, ...]]:
     if has_header:
         _check_width(body, names, separator, num_skipped)
     style: dict[str, Any] = {"separator": separator, "decimal": decimal, "num_skipped": num_skipped}
-    points = _read_csv(body, pick_xyz(names), **style)
+    points = _read_csv(body, pick(names), **style)
     if names == numbered(len(names)) and len(names) > 3 and _is_counter(points[:, 0]):
         names = ("row", *numbered(len(names) - 1))
-        points = _read_csv(body, pick_xyz(names), **style)
+        points = _read_csv(body, pick(names), **style)
     if not has_header and is_transposed((len(points), len(names))):
         actual = f"{len(points)} lines of {len(names)} values"
         raise FormatError("a line of x y z for each point", actual, "save its transpose")
@@ -240,7 +251,7 @@ def _wrong_line(
 
 
 def _read_csv(text: str, columns: list[int], *, separator: str | None, decimal: str, num_skipped: int) -> np.ndarray:
-    """The three given columns as (n, 3) float64; missing values are NaN. Separator None means any run of blanks."""
+    """The c given columns as (n, c) float64; missing values are NaN. Separator None means any run of blanks."""
     import pandas as pd
 
     style: dict[str, Any] = {"separator": separator, "decimal": decimal}
@@ -258,7 +269,7 @@ def _read_csv(text: str, columns: list[int], *, separator: str | None, decimal: 
             engine="c",
         )
     except pd.errors.EmptyDataError:
-        return np.empty((0, 3))
+        return np.empty((0, len(columns)))
     except ValueError as error:
         raise _wrong_line(text.splitlines(), columns, error, num_skipped=num_skipped, **style) from None
     if '"' in text and len(frame) < sum(1 for line in io.StringIO(text) if line.strip()):

@@ -85,7 +85,7 @@ def _side_by_side(cells: dict[str, Cell], out: Path) -> bytes:
     # all methods have the same crops
     setting = read_scores(next(iter(paths.values())).with_name(FILE)).results[0].setting
     hardest = [person for person in open_eval_dataset(folder) if (person.shard, person.row) in hardest_keys]
-    clouds = {(person.shard, person.row): crop_of(person, setting)[0] for person in hardest}
+    clouds = {(person.shard, person.row): person.points[crop_of(person, setting)[0]] for person in hardest}
     panels = []
     for key in hardest_keys:
         for k, (row, p) in enumerate(predictions.items()):

@@ -359,7 +359,7 @@ def _crop(
     """The sample of a scan's points in a box; None: the box is drawn here, after the scan."""
     config, acquisition = scene.config, scene.acquisition
     box = _box(scene, bodies, row, rng) if box is None else box
-    points, ring, part = scan.points, scan.ring, scan.part
+    points, ring, part, times = scan.points, scan.ring, scan.part, scan.time
     clutter_draw, part_draw = rng.random(2)
     if clutter_draw < config.noise.clutter * config.hard:
         if config.noise.dapt_compat:
@@ -370,19 +370,26 @@ def _crop(
         points = np.concatenate([points, clusters.astype(np.float32)])
         ring = np.concatenate([ring, np.full(len(clusters), -1, ring.dtype)])
         part = np.concatenate([part, np.zeros(len(clusters), np.uint8)])
+        if times is not None:
+            # evenly over the scans
+            rows = np.arange(len(clusters)) * len(times) // max(len(clusters), 1)
+            times = np.concatenate([times, times[rows] if len(times) else np.zeros(len(clusters), np.float32)])
     is_inside = box.contains(points)
     points, ring, part = points[is_inside], ring[is_inside], part[is_inside]
+    times = None if times is None else times[is_inside]
     other_count = int(np.count_nonzero(part == _OTHER))
     part = np.where(part == _OTHER, np.uint8(0), part)
     if part_draw < config.noise.missing_part * config.hard:
         keep_mask = noise.part_removal(part, rng=rng)
         points, ring, part = points[keep_mask], ring[keep_mask], part[keep_mask]
+        times = None if times is None else times[keep_mask]
     return Sample(
         points=points,
         # if the crop holds two people, the box's center tells which one is meant
         center=center_of(points) if len(points) and not acquisition.crowded else box.center,
         part=part,
         ring=ring,
+        point_times=times,
         pose=Pose(joints=scene.body_place.of_body(bodies.joints[row]), skeleton=BODY26, frame="sensor"),
         box=box,
         second_person_points=other_count,

@@ -137,11 +137,13 @@ class View:
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedScan:
-    """Points (n, 3) float32 m in the level frame, with noise; ring (n,); part (n,) uint8, 0: not the person."""
+    """Points (n, 3) float32 m in the level frame, with noise; ring (n,); part (n,) uint8, 0: not the person; time (n,)
+    float32 s, relative to the scene's own scan, if the cloud also has points of earlier frames."""
 
     points: np.ndarray
     ring: np.ndarray
     part: np.ndarray
+    time: np.ndarray | None = None
 
 
 def looks(device: Sensor | RayPattern, position: np.ndarray) -> tuple[float, ...]:
@@ -209,13 +211,18 @@ def _added_up(
 ) -> SimulatedScan:
     """Simulates scans as in `Scene.scans` and concatenates them in the frame of the first one."""
     scans: list[SimulatedScan] = []
+    frames: list[int] = []
     for view_scene, meshes, frame, position in view_scans:
+        frames.append(frame)
         view_box = None if box is None else replace(box, center=box.center - position)
         scan = simulate_scan(view_scene, meshes, rng, frame=frame, box=view_box)
         scans.append(replace(scan, points=scan.points + position.astype(np.float32)) if scans else scan)
     if len(scans) == 1:
         return scans[0]
     arrays = {name: np.concatenate([getattr(scan, name) for scan in scans]) for name in ("points", "ring", "part")}
+    if min(frames) < frames[0]:
+        seconds = np.array([FRAME_TIME * (frame - frames[0]) for frame in frames], np.float32)
+        arrays["time"] = np.repeat(seconds, [len(scan.points) for scan in scans])
     return SimulatedScan(**arrays)
 
 

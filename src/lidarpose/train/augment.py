@@ -288,8 +288,8 @@ def add_disturbances(sample: _Sample, *, strays: float, noise: float, rng: np.ra
         points = jitter(points, sigma=sigma, clip=2 * sigma, rng=rng).astype(np.float32)
     if points is sample.points:
         return sample
-    # clutter points have no ring
-    return replace(sample, points=points, part=part, ring=None, center=_own_center(sample, points))
+    # clutter points have no ring and no time
+    return replace(sample, points=points, part=part, ring=None, point_times=None, center=_own_center(sample, points))
 
 
 def _own_center(sample: Sample, points: np.ndarray) -> np.ndarray:

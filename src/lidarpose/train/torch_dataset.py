@@ -196,6 +196,7 @@ def _to_body26(sample: LabeledSample) -> LabeledSample:
         sample,
         part=part,
         ring=None,
+        point_times=None,
         pose=Pose(joints=joints, visible=visible, skeleton=BODY26, frame="sensor"),
         joint_labels=labels.astype(np.uint8),
         sequence=sample.sequence if sample.info is None else "",

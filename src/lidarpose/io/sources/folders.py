@@ -101,7 +101,7 @@ def open_files(name: str, paths: Sequence[Path], options: ReadingOptions) -> Ind
 
     def read(i: int) -> Sweep:
         cloud = read_points(paths[i], columns=columns)
-        return Sweep(points=cloud.points, warnings=cloud.warnings)
+        return Sweep(points=cloud.points, point_times=cloud.point_times, warnings=cloud.warnings)
 
     return IndexedRecording(
         name=name, ids=ids, times=times if options.name_times else None, read=read, warnings=warnings

@@ -32,6 +32,7 @@ class Sweep:
         origin: (3,) m, the sensor position in the points' frame; None if unknown or not stated.
         is_origin_unknown: whether None means unknown. Otherwise `predict_recording` assumes 0, 0, 0 as for point files.
         ring: (n,) the beam of each point, or None.
+        point_times: (n,) s from any zero, when each point was measured, or None.
         warnings: lines about this frame.
     """
 
@@ -39,6 +40,7 @@ class Sweep:
     T_world_sensor: np.ndarray | None = None
     origin: np.ndarray | None = None
     ring: np.ndarray | None = None
+    point_times: np.ndarray | None = None
     warnings: tuple[str, ...] = ()
     is_origin_unknown: bool = False
 
@@ -347,9 +349,9 @@ def _read(lazy_frame: LazyFrame, index: int, time: float | None) -> Frame | Dama
         # false for NaN, infinity and 0, 0, 0
         distance = np.abs(points) @ np.ones(3)
         is_return = (distance > 0) & (distance < np.inf)
-        ring = None if sweep.ring is None else sweep.ring[is_return]
-        returns = vars(sweep) | {"points": points[is_return], "ring": ring}
-        return Frame(**returns, index=index, id=lazy_frame.id, time=time)
+        per_point = {name: value for name in ("ring", "point_times") if (value := getattr(sweep, name)) is not None}
+        returns = {name: value[is_return] for name, value in ({"points": points} | per_point).items()}
+        return Frame(**vars(sweep) | returns, index=index, id=lazy_frame.id, time=time)
     except MissingExtra:
         raise
     except Exception as error:

@@ -9,6 +9,7 @@ import numpy as np
 
 from lidarpose.errors import needs_extra
 from lidarpose.io.files import FormatError, shorten
+from lidarpose.io.point_times import time_column, times_of_column
 from lidarpose.io.sources import livox, ouster, velodyne
 
 CLOUD_TYPES = ("sensor_msgs/msg/PointCloud2", "sensor_msgs/PointCloud2")
@@ -35,8 +36,14 @@ def decoders() -> dict[str, Callable[[bytes, str], Any]]:
     return {"cdr": ros2.deserialize_cdr, "ros1": ros1.deserialize_ros1}
 
 
-def decode_cloud(cloud: Any) -> tuple[np.ndarray, np.ndarray | None]:
-    """The points (n, 3) of a PointCloud2, float64, and the ring (n,) of each if it has one.
+def _is_within(field: Any, point_step: int) -> bool:
+    """Whether a PointField has a known type and lies within a point."""
+    size = np.dtype(_DATATYPES.get(field.datatype, "f8")).itemsize
+    return field.datatype in _DATATYPES and field.offset + size <= point_step
+
+
+def decode_cloud(cloud: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """The points (n, 3) of a PointCloud2, float64, and the ring (n,) and the time (n,) of each if it has one.
 
     Fields may lie anywhere in a point, in any number type and either byte order; rows may be padded.
 
@@ -51,11 +58,12 @@ def decode_cloud(cloud: Any) -> tuple[np.ndarray, np.ndarray | None]:
         raise FormatError("fields x, y, z in a PointCloud2", actual, "choose another topic")
     order = ">" if cloud.is_bigendian else "<"
     for name in field_names:
-        field = names[name]
-        size = np.dtype(_DATATYPES.get(field.datatype, "f8")).itemsize
-        if field.datatype not in _DATATYPES or field.offset + size > cloud.point_step:
+        if not _is_within(field := names[name], cloud.point_step):
             actual = f"datatype {field.datatype} at byte {field.offset} of {cloud.point_step}"
             raise FormatError(f"the field {name} within a point", actual, "record it again")
+    time_index = time_column(list(names))
+    time = None if time_index is None else list(names)[time_index]
+    field_names += [time] if time and _is_within(names[time], cloud.point_step) else []
     formats = [order + _DATATYPES[names[name].datatype] for name in field_names]
     offsets = [names[name].offset for name in field_names]
     point = np.dtype({"names": field_names, "formats": formats, "offsets": offsets, "itemsize": cloud.point_step})
@@ -70,7 +78,10 @@ def decode_cloud(cloud: Any) -> tuple[np.ndarray, np.ndarray | None]:
     shape, strides = (cloud.height, cloud.width), (row_step, cloud.point_step)
     rows = np.ndarray(shape, point, cloud.data, strides=strides) if cloud.width * cloud.height else np.empty(0, point)
     points = np.stack([rows[name].ravel().astype(np.float64) for name in "xyz"], axis=-1)
+    times = None
+    if time in field_names:
+        times = times_of_column(rows[time].ravel().astype(np.float64), list(names))
     if ring is None:
-        return points, None
+        return points, None, times
     with np.errstate(invalid="ignore"):
-        return points, rows[ring].ravel().astype(np.int64)
+        return points, rows[ring].ravel().astype(np.int64), times

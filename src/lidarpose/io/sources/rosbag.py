@@ -245,17 +245,19 @@ class _Cloud:
             reason = shorten(f"{type(self.content).__name__}: {self.content}")
             raise FormatError(f"cannot be decoded as a point cloud: the message is damaged ({reason})")
         ring: np.ndarray | None
+        times: np.ndarray | None = None
         if isinstance(self.content, livox.LivoxCloud):
             points, ring = self.content.points, self.content.ring
         elif hasattr(self.content, "packets"):
             points, ring = velodyne.decode_scan(self.content.packets)
         else:
-            points, ring = decode_cloud(self.content)
+            points, ring, times = decode_cloud(self.content)
         is_unknown = self.frame_id in _NO_SENSORS
         origin = None if is_unknown else np.zeros(3)
         return Sweep(
-            points=points, T_world_sensor=T_world_sensor, origin=origin, is_origin_unknown=is_unknown, ring=ring
-        )
+            points=points, T_world_sensor=T_world_sensor, origin=origin, is_origin_unknown=is_unknown, ring=ring,
+            point_times=times,
+        )  # fmt: skip
 
 
 class TransformTree:
