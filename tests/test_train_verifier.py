@@ -12,6 +12,7 @@ from training_runs import refused, train_until_killed
 from lidarpose.cli import main
 from lidarpose.geometry import rows_near
 from lidarpose.inference import verification
+from lidarpose.inference.backend import Raw
 from lidarpose.models import bundled_path, weights_file
 from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
 from lidarpose.models.config import NetworkConfig
@@ -77,7 +78,7 @@ def test_scan_crops_match_crops_of_detection(monkeypatch):
 
         def run(self, clouds, view):
             shown.extend(clouds)
-            return verification.Raw(
+            return Raw(
                 vote=np.zeros((len(clouds), 1, 3)),
                 heatmaps=None,
                 low=np.zeros(3),
