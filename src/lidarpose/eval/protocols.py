@@ -216,7 +216,7 @@ class EvalSetup:
         name, clips = model.skeleton.name, self._clips(samples)
         # in a call either all people have a box or none; these are the boxes that cropped, not boxes made from labels
         centers = [person.crop_box.center for person in samples if person.crop_box is not None]
-        newest_clouds = [newest_points(person.points, person.point_times) for person in samples]
+        newest_clouds = [newest_points(person.points, person.point_times, origin) for person in samples]
         people = self.answers(clouds, origin, np.stack(centers) if centers else None, clips, newest_clouds)
         if (
             not isinstance(people, Sequence)

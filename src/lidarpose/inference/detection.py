@@ -19,7 +19,6 @@ from lidarpose.inference.background import is_static, read_background
 from lidarpose.inference.checks import flat_along_another_axis, rows_inside, scan_unit_warning, unlikely_origin
 from lidarpose.inference.inputs import distinct_rows, hashes
 from lidarpose.inference.known_places import KnownPlaces
-from lidarpose.inference.newest import newest_scan
 from lidarpose.inference.scan import Scan
 from lidarpose.inference.verification import rounded, verified
 from lidarpose.models.detector.detector import MAX_RANGE, Detections, Detector
@@ -127,12 +126,12 @@ class DetectedScan:
 def detect_places(scan: Scan, search: Search) -> DetectedScan:
     """The first half of `find_people`, which does not depend on other frames of a recording. Of several scans in one
     cloud, the newest is searched: in all of them a moving person is many."""
-    newest_rows = newest_scan(scan.points, scan.point_times)
-    if newest_rows is not None:
-        counts = f"{np.count_nonzero(newest_rows):,} of {len(scan.points):,} points"
+    scan = scan.with_newest()
+    if (is_newest := scan.is_newest) is not None:
+        counts = f"{np.count_nonzero(is_newest):,} of {len(scan.points):,} points"
         note = f"the points are of several scans by their times: people are searched for in the newest, {counts}"
-        newest = replace(scan.with_points_of(newest_rows), warnings=(*scan.warnings, note))
-        return replace(detect_places(newest, search), older=scan.with_points_of(~newest_rows))
+        newest = replace(scan.with_points_of(is_newest), is_newest=None, warnings=(*scan.warnings, note))
+        return replace(detect_places(newest, search), older=scan.with_points_of(~is_newest))
     full_scan, count = scan, len(scan.points)
     if _MOST_AROUND < count <= _MOST_SORTED:
         # before the points are thinned: copies are kept or dropped together
@@ -281,11 +280,10 @@ def _with_older(scan: Scan, older: Scan, level_boxes: list[Box]) -> Scan:
     boxes are in the level frame."""
     older_rows = rows_inside(level_boxes, older.points @ scan.R_level_input.T)
     count = len(scan.points)
-    rows = [np.append(rows, count + more) for rows, more in zip(scan.detected_rows or [], older_rows, strict=True)]
-    points, times = (
-        np.concatenate([getattr(part, name) for part in (scan, older)]) for name in ("points", "point_times")
-    )
-    return replace(scan, points=points, point_times=times, detected_rows=rows)
+    assert scan.detected_rows is not None
+    rows = [np.append(rows, count + more) for rows, more in zip(scan.detected_rows, older_rows, strict=True)]
+    points = np.concatenate([scan.points, older.points])
+    return replace(scan, points=points, is_newest=np.arange(len(points)) < count, detected_rows=rows)
 
 
 def least_score(search: Search) -> float:

@@ -89,8 +89,9 @@ def predict(
             in which it does. A given z or direction is exact.
         columns: number of values per row of a .bin file.
         point_times: (n,) s from any zero, when each point of an array was measured. A file's own are read from its
-            column t, offset_time, time, timestamp or gps_time. If a person's points are of several scans, their pose is
-            that of the newest scan; without times, it is blurred by motion. The paper's networks do not use them.
+            columns, see "Times of points" in docs/use.md. If the points are of several scans, people are searched for
+            in the newest and their poses are those of that time; without times they are blurred by motion. This needs
+            the sensor position. The paper's networks do not use times.
         model: a `Predictor`; or the name or path of weights, loaded with the default settings of `load`; or a function
             without arguments that returns a `Predictor`, called when it is needed. Bundled networks are loaded once and
             cached; files are loaded in each call, since they may have changed.

@@ -36,11 +36,10 @@ from lidarpose.inference.inputs import (
 )
 from lidarpose.inference.newest import newest_points
 from lidarpose.inference.results import PersonPose, Poses
-from lidarpose.inference.scan import Scan, pose_scan, read_scan
+from lidarpose.inference.scan import Scan, own_times, pose_scan, read_scan
 from lidarpose.inference.tta import tta_transforms
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.files import file_error
-from lidarpose.io.point_cloud import Cloud
 from lidarpose.io.point_times import as_point_times
 from lidarpose.models import BUNDLED, DEFAULT, weights_name, weights_path
 from lidarpose.models.checkpoint import read_header
@@ -275,7 +274,7 @@ class Predictor(PoseEstimator):
             input_boxes = None if boxes is None else read_boxes(boxes)
             up = "z" if input_boxes is None else input_boxes.up
             scan = Scan(points=cloud, boxes=input_boxes, origin=origin, up=up)
-            scan = read_scan(scan, cloud, None, _own_times(points) if point_times is None else point_times)
+            scan = read_scan(scan, cloud, None, own_times(points) if point_times is None else point_times)
             if find:
                 from lidarpose.inference.detection import Search
                 from lidarpose.inference.single_scan import search_alone
@@ -434,7 +433,10 @@ class Predictor(PoseEstimator):
         coordinates. Of people cropped from a scan, these belong to the scan. times: of each cloud's points, or None."""
         returns = [only_returns(cloud) for cloud in clouds]
         distinct_clouds = [points if is_few(points) else distinct(points) for points, _ in returns]
-        newest_clouds = None if times is None else list(map(newest_points, clouds, times))
+        newest_clouds = None
+        if times is not None:
+            pairs = zip(clouds, times, strict=True)
+            newest_clouds = [newest_points(cloud, own, origin) for cloud, own in pairs]
         poses = self.predict_in(distinct_clouds, origin, skeleton, progress, clips=clips, newest_clouds=newest_clouds)
         people = zip(poses, returns, strict=True)
         people_with_notes = (replace(person, warnings=(*notes, *person.warnings)) for person, (_, notes) in people)
@@ -483,15 +485,10 @@ class Predictor(PoseEstimator):
         }
 
 
-def _own_times(points: Any) -> np.ndarray | None:
-    """The times of the points of a `Cloud`, which are relative to the newest; None for arrays."""
-    return points.point_times if isinstance(points, Cloud) else None
-
-
 def _times_of(inputs: Sequence, clouds: list[np.ndarray], point_times: Any) -> list[np.ndarray | None]:
     """When the points of each cloud were measured: as given by the user, or of a `Cloud`. Raises InputError."""
     if point_times is None:
-        return [_own_times(points) for points in inputs]
+        return [own_times(points) for points in inputs]
     if not isinstance(point_times, list | tuple) or len(point_times) != len(clouds):
         raise InputError(
             f"point_times: expected a list with the times of each of {len(clouds)} clouds or None, got "
@@ -499,8 +496,8 @@ def _times_of(inputs: Sequence, clouds: list[np.ndarray], point_times: Any) -> l
         )
     triples = zip(inputs, clouds, point_times, strict=True)
     return [
-        _own_times(points) if own_times is None else as_point_times(own_times, len(cloud), f"point_times[{i}]")
-        for i, (points, cloud, own_times) in enumerate(triples)
+        own_times(points) if times is None else as_point_times(times, len(cloud), f"point_times[{i}]")
+        for i, (points, cloud, times) in enumerate(triples)
     ]
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from lidarpose.errors import InputError, check_int
 from lidarpose.geometry import rotation_from_up, rotation_of_boxes, upright_axis
 from lidarpose.inference.checks import check_scan, origin_warning, rows_inside, unit_warning
 from lidarpose.inference.inputs import as_points, distinct, rounding_warning, usable_rows
-from lidarpose.inference.newest import newest_points
+from lidarpose.inference.newest import newest_of_person, newest_scan
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.io.files import file_error
 from lidarpose.io.point_cloud import Cloud, read_points
@@ -40,7 +40,8 @@ class Scan:
     After detection, detected_rows holds for each box the rows (k,) of the person's points, which the enlarged box of a
     tilted scan does not determine. In recordings, pelvises (N, 3) m: approximate pelvis positions of the people in the
     boxes; verified (N,) bool: whether the box was verified in this scan; rejected (R, 3) m: positions of detections
-    that the verifier rejected; point_times (n,) s: when each point was measured, relative to any time, None if unknown.
+    that the verifier rejected; point_times (n,) s: when each point was measured, relative to any time, None if unknown;
+    is_newest (n,) bool: in a cloud of several scans, which points are of the newest.
     """
 
     points: np.ndarray
@@ -54,6 +55,7 @@ class Scan:
     verified: np.ndarray | None = None
     rejected: np.ndarray | None = None
     point_times: np.ndarray | None = None
+    is_newest: np.ndarray | None = None
 
     @cached_property
     def R_level_input(self) -> np.ndarray:
@@ -92,15 +94,21 @@ class Scan:
         """The scan with only these rows of its points; None keeps all."""
         if rows is None:
             return self
-        point_times = None if self.point_times is None else self.point_times[rows]
-        return replace(self, points=self.points[rows], point_times=point_times)
+        arrays = {name: getattr(self, name) for name in ("points", "point_times", "is_newest")}
+        return replace(self, **{name: array[rows] for name, array in arrays.items() if array is not None})
+
+    def with_newest(self) -> Scan:
+        """The scan with `is_newest` computed from the times of its points, which are dropped."""
+        if self.point_times is None:
+            return self
+        is_newest = newest_scan(_turned(self.points, self.R_level_input), self.point_times, self.level_origin)
+        return replace(self, point_times=None, is_newest=is_newest)
 
     def newest_clouds(self) -> list[np.ndarray | None] | None:
-        """The newest points of each person in the level frame, see `newest_points`; None if no times are known."""
-        if self.point_times is None:
+        """The newest points of each person in the level frame, see `newest_of_person`; None for a single scan."""
+        if self.is_newest is None:
             return None
-        rows = [np.arange(len(self.points))] if self.boxes is None else self.rows
-        clouds = [newest_points(self.points[own_rows], self.point_times[own_rows]) for own_rows in rows]
+        clouds = [newest_of_person(self.points[rows], self.is_newest[rows]) for rows in self.rows]
         return [None if cloud is None else _turned(cloud, self.R_level_input) for cloud in clouds]
 
     def clouds(self) -> list[np.ndarray]:
@@ -113,6 +121,11 @@ class Scan:
 def _turned(points: np.ndarray, R: np.ndarray) -> np.ndarray:
     """points (n, 3) rotated by R; the input itself if R is the identity, which saves much time for whole scans."""
     return points if np.array_equal(R, np.eye(3)) else points @ R.T
+
+
+def own_times(points: Any) -> np.ndarray | None:
+    """The times of the points of a `Cloud`, which are relative to the newest; None for arrays."""
+    return points.point_times if isinstance(points, Cloud) else None
 
 
 def read_scan(
@@ -129,14 +142,15 @@ def read_scan(
     source = os.fsdecode(points) if isinstance(points, str | os.PathLike) else None
     if source is None and columns is not None:
         check_int("columns", columns, least=3, hint=" (x y z first)")
-    cloud = read_points(source, columns=columns) if source is not None else None
-    if cloud is None:
+    if source is None:
         array = as_points(points)
-        own_times = points.point_times if isinstance(points, Cloud) else None
-        times = own_times if point_times is None else point_times
+        times = own_times(points) if point_times is None else point_times
         cloud = Cloud(points=array, point_times=as_point_times(times, len(array)))
-    elif point_times is not None:
-        raise InputError("point_times are for arrays, a file has its own: omit them, or give the points as an array")
+    else:
+        if point_times is not None:
+            problem = "point_times are for arrays, a file has its own"
+            raise InputError(f"{problem}: omit them, or give the points as an array")
+        cloud = read_points(source, columns=columns)
     rows, notes = usable_rows(cloud.points)
     scan = replace(scan, points=cloud.points, point_times=cloud.point_times).with_points_of(rows)
     notes += filter(None, [rounding_warning(scan.points)])
@@ -160,6 +174,7 @@ def pose_scan(
     if warning := origin_warning(scan):
         warnings.append(warning)
         scan = replace(scan, origin=None)
+    scan = scan.with_newest() if scan.boxes else scan
     origin = scan.level_origin
     if scan.boxes:
         pelvises = None if scan.pelvises is None else scan.pelvises @ scan.R_level_input.T

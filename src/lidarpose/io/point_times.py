@@ -3,7 +3,7 @@
 Times are (n,) float32 s relative to the newest point, so 0 or negative; -inf for a point without a time.
 """
 
-import re
+import reprlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -33,10 +33,11 @@ def time_column(names: Sequence[str]) -> int | None:
 
 def _name_and_unit(name: str) -> tuple[str, str | None]:
     """ "TIMESTAMP (ns)" -> ("timestamp", "ns")."""
-    match = re.fullmatch(r"(.*?)(?: ?[\[(](\w+)[\])])?", name.strip().lower())
-    return (match[1], match[2]) if match else (name, None)
+    name, _, unit = name.strip().lower().rstrip("])").replace("[", "(").partition("(")
+    return name.strip(), unit or None
 
 
+@np.errstate(all="ignore")
 def times_of_column(values: np.ndarray, names: Sequence[str]) -> np.ndarray | None:
     """Times from the values (n,) of the column at `time_column(names)`; None if the unit is unknown or too coarse, or
     if all points have the same time."""
@@ -63,10 +64,10 @@ def _unit(values: np.ndarray, names: Sequence[str], column: int) -> float | None
     largest, is_whole = np.abs(values).max(), not (values % 1).any()
     if is_whole and name in _WHOLE_UNITS:
         return _WHOLE_UNITS[name]
-    if largest >= _MICROSECONDS:
-        return 1e-6 if largest < _NANOSECONDS else 1e-9
     if {other.lower() for other in names} >= _LIVOX and name == "timestamp":
         return 1e-9
+    if largest >= _MICROSECONDS:
+        return 1e-6 if largest < _NANOSECONDS else 1e-9
     # whole numbers may count scans, milliseconds, or anything else
     return None if is_whole or largest >= _NO_SECONDS else 1.0
 
@@ -85,7 +86,7 @@ def as_point_times(times: Any, count: int, what: str = "point_times") -> np.ndar
     except (TypeError, ValueError):
         seconds = np.full(0, np.nan)
     if seconds.shape != (count,):
-        actual = f"shape {np.shape(times)}" if hasattr(times, "shape") else type(times).__name__
+        actual = f"{times.dtype} of shape {times.shape}" if hasattr(times, "dtype") else reprlib.repr(times)
         raise InputError(f"{what}: expected {count} numbers of seconds, one per point, got {actual}")
     return _relative(seconds)
 
@@ -95,5 +96,6 @@ def _relative(seconds: np.ndarray) -> np.ndarray:
     is_finite = np.isfinite(seconds)
     newest = seconds[is_finite].max(initial=-np.inf)
     relative = np.full(len(seconds), -np.inf, np.float32)
-    relative[is_finite] = seconds[is_finite] - newest
+    with np.errstate(over="ignore"):
+        relative[is_finite] = seconds[is_finite] - newest
     return relative

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from lidarpose.io.files import FormatError
+from lidarpose.io.point_times import times_of_column
 
 _PACKAGES = ("livox_ros_driver2", "livox_ros_driver", "livox_interfaces")
 TYPES = tuple(f"{package}/{folder}CustomMsg" for package in _PACKAGES for folder in ("msg/", ""))
@@ -20,10 +21,12 @@ _POINT, _POINT_CDR = 19, 20
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LivoxCloud:
-    """points (n, 3) float64 m; ring (n,): each point's laser; header: as of a ROS message, with stamp and frame_id."""
+    """points (n, 3) float64 m; ring (n,): each point's laser; times (n,) s, see `times_of_column`; header: as of a ROS
+    message, with stamp and frame_id."""
 
     points: np.ndarray
     ring: np.ndarray
+    times: np.ndarray | None
     header: SimpleNamespace
 
 
@@ -65,4 +68,6 @@ def decode_cloud(data: bytes, encoding: str) -> LivoxCloud:
     # the last point may lack the padding
     rows = np.ndarray(count, point, body + b"\0", position)
     header = SimpleNamespace(stamp=stamp, frame_id=frame_id)
-    return LivoxCloud(points=rows["xyz"].astype(np.float64), ring=rows["line"].astype(np.int64), header=header)
+    times = times_of_column(rows["time"].astype(np.float64), ["offset_time"])
+    ring = rows["line"].astype(np.int64)
+    return LivoxCloud(points=rows["xyz"].astype(np.float64), ring=ring, times=times, header=header)

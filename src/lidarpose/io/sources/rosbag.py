@@ -247,7 +247,7 @@ class _Cloud:
         ring: np.ndarray | None
         times: np.ndarray | None = None
         if isinstance(self.content, livox.LivoxCloud):
-            points, ring = self.content.points, self.content.ring
+            points, ring, times = self.content.points, self.content.ring, self.content.times
         elif hasattr(self.content, "packets"):
             points, ring = velodyne.decode_scan(self.content.packets)
         else:
