@@ -13,6 +13,8 @@ from lidarpose.arrays import to_numpy
 from lidarpose.errors import InputError, counted
 from lidarpose.geometry import vector_of
 from lidarpose.io.files import FormatError, one_line
+from lidarpose.io.point_cloud import Cloud
+from lidarpose.io.point_times import as_point_times
 from lidarpose.io.text import is_image, is_transposed, pick_xyz
 from lidarpose.sample import CLIP_FRAMES, FARTHEST, MIN_POINTS, clip_windows, within_reach
 
@@ -189,6 +191,27 @@ def clip_times(times: Any, count: int) -> np.ndarray:
             f"got {reprlib.repr(times)}"
         )
     return seconds
+
+
+def own_times(points: Any) -> np.ndarray | None:
+    """The times of the points of a `Cloud`, which are relative to the newest; None for arrays."""
+    return points.point_times if isinstance(points, Cloud) else None
+
+
+def times_of_clouds(inputs: Sequence, clouds: list[np.ndarray], point_times: Any) -> list[np.ndarray | None]:
+    """When the points of each cloud were measured: as given by the user, or of a `Cloud`. Raises InputError."""
+    if point_times is None:
+        return [own_times(points) for points in inputs]
+    if not isinstance(point_times, list | tuple) or len(point_times) != len(clouds):
+        raise InputError(
+            f"point_times: expected a list with the times of each of {len(clouds)} clouds or None, got "
+            f"{reprlib.repr(point_times)}"
+        )
+    triples = zip(inputs, clouds, point_times, strict=True)
+    return [
+        own_times(points) if times is None else as_point_times(times, len(cloud), f"point_times[{i}]")
+        for i, (points, cloud, times) in enumerate(triples)
+    ]
 
 
 def as_origin(value: object) -> np.ndarray | None:

@@ -1,12 +1,11 @@
 """`load` a network and predict the poses of one or many point clouds, of any number type; clouds may be empty."""
 
 import os
-import reprlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol, TypedDict, Unpack, overload
+from typing import TYPE_CHECKING, Literal, Protocol, TypedDict, Unpack, overload
 
 import numpy as np
 
@@ -33,14 +32,15 @@ from lidarpose.inference.inputs import (
     is_few,
     is_many,
     only_returns,
+    own_times,
+    times_of_clouds,
 )
 from lidarpose.inference.newest import newest_points
 from lidarpose.inference.results import PersonPose, Poses
-from lidarpose.inference.scan import Scan, own_times, pose_scan, read_scan
+from lidarpose.inference.scan import Scan, pose_scan, read_scan
 from lidarpose.inference.tta import tta_transforms
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.files import file_error
-from lidarpose.io.point_times import as_point_times
 from lidarpose.models import BUNDLED, DEFAULT, weights_name, weights_path
 from lidarpose.models.checkpoint import read_header
 from lidarpose.models.decode import decoder
@@ -285,7 +285,7 @@ class Predictor(PoseEstimator):
         is_one = not is_many(points)
         clouds = [as_points(points)] if is_one else [as_points(cloud, f"points[{i}]") for i, cloud in enumerate(points)]
         clips = None if clips is None else clips.checked(len(clouds))
-        times = _times_of([points] if is_one else points, clouds, [point_times] if is_one else point_times)
+        times = times_of_clouds([points] if is_one else points, clouds, [point_times] if is_one else point_times)
         poses = self._predict_clouds(clouds, origin, skeleton, progress, clips, times)
         return poses.people[0] if is_one else poses
 
@@ -483,22 +483,6 @@ class Predictor(PoseEstimator):
             i: select_pose(person_poses, None if box_centers is None else box_centers[i])
             for i, person_poses in poses_by_person.items()
         }
-
-
-def _times_of(inputs: Sequence, clouds: list[np.ndarray], point_times: Any) -> list[np.ndarray | None]:
-    """When the points of each cloud were measured: as given by the user, or of a `Cloud`. Raises InputError."""
-    if point_times is None:
-        return [own_times(points) for points in inputs]
-    if not isinstance(point_times, list | tuple) or len(point_times) != len(clouds):
-        raise InputError(
-            f"point_times: expected a list with the times of each of {len(clouds)} clouds or None, got "
-            f"{reprlib.repr(point_times)}"
-        )
-    triples = zip(inputs, clouds, point_times, strict=True)
-    return [
-        own_times(points) if times is None else as_point_times(times, len(cloud), f"point_times[{i}]")
-        for i, (points, cloud, times) in enumerate(triples)
-    ]
 
 
 def _range_warning(pose: Pose) -> str | None:

@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lidarpose.errors import InputError, check_int
 from lidarpose.geometry import rotation_from_up, rotation_of_boxes, upright_axis
 from lidarpose.inference.checks import check_scan, origin_warning, rows_inside, unit_warning
-from lidarpose.inference.inputs import as_points, distinct, rounding_warning, usable_rows
+from lidarpose.inference.inputs import as_points, distinct, own_times, rounding_warning, usable_rows
 from lidarpose.inference.newest import newest_of_person, newest_scan
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.io.files import file_error
@@ -121,11 +121,6 @@ class Scan:
 def _turned(points: np.ndarray, R: np.ndarray) -> np.ndarray:
     """points (n, 3) rotated by R; the input itself if R is the identity, which saves much time for whole scans."""
     return points if np.array_equal(R, np.eye(3)) else points @ R.T
-
-
-def own_times(points: Any) -> np.ndarray | None:
-    """The times of the points of a `Cloud`, which are relative to the newest; None for arrays."""
-    return points.point_times if isinstance(points, Cloud) else None
 
 
 def read_scan(
