@@ -28,7 +28,7 @@ def scores(folder, *, method="mine", kind="waymo", protocol="clean", value=70.0,
         )
     )
     counts = {"people": 9, "frames of clips": 0, "without a pose": 2}
-    result = Result(setting=setting, counts=counts, skipped={}, notes=(), lines=rows)
+    result = Result(setting=setting, counts=counts, skipped=more.get("skipped", {}), notes=(), lines=rows)
     made = Scores(weights={"name": method, "digest": digest}, command="c", seed=0, results=(result,))
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "scores.json").write_text(made.to_json())
@@ -156,3 +156,9 @@ def test_cli_errors_are_one_line_and_write_nothing(arguments, words, tmp_path, m
     shown = capsys.readouterr()
     assert shown.out == "" and words in shown.err and shown.err.startswith("lidarpose: error: ")
     assert shown.err.count("\n") == 1 and not list(tmp_path.iterdir())
+
+
+def test_table_names_people_and_shards_that_are_left_out(tmp_path):
+    skipped = {"damaged shards": {"count": 2, "first": "a"}, "people of under 10 points": {"count": 3, "first": "b"}}
+    text = evaluation.table([scores(tmp_path / "a", skipped=skipped)])
+    assert "3 left out; 2 damaged shards left out, with an unknown number of people" in text

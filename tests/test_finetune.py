@@ -168,7 +168,10 @@ def test_in_memory_dataset_skips_and_names_damaged_shard(datasets, tmp_path):
     dataset = InMemoryDataset.load([folder])
     assert len(dataset) == len(InMemoryDataset.load([datasets["humanm3"]])) * 3 // 4
     assert len(dataset.damaged) == 1 and str(broken) in dataset.damaged[0]
-    warning, _ = make_setup(Finetune(data=(str(folder),), mix=0.0)).warnings
+    setup = make_setup(Finetune(data=(str(folder),), mix=0.0))
+    warning, _ = setup.warnings
+    # not that there is no validation
+    assert setup.card["warnings"] == [warning]
     assert str(broken) in warning and warning.startswith("left out 1 damaged shards: ")
     # a missing shard is an error: the dataset is incomplete
     broken.unlink()

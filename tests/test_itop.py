@@ -124,7 +124,7 @@ def test_prepare_itop_ignores_missing_other_split(tmp_path, smpl):
         split: prepare("itop", tmp_path / "raw", tmp_path / f"{split}", split=split)["warnings"]
         for split in ("test", None)
     }
-    assert warnings == {"test": [], None: ["side/train of train by side are missing"]}
+    assert warnings == {"test": [], None: ["missing: side/train of train by side"]}
 
 
 def test_prepare_itop_ignores_damaged_other_split(tmp_path, smpl):

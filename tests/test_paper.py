@@ -275,6 +275,21 @@ def test_table1_cells_have_published_figures(data):
         assert cell.published == (wanted and wanted["mpjpe"])
 
 
+def test_cell_names_people_that_were_not_scored_and_warnings_of_training(finished, monkeypatch):
+    out, _, _ = finished
+    cell = next(c for c in cells(TABLES["table4"], Options(people=64, size="paper-tiny"), _ROWS) if c.row == "scratch")
+    result = report.read_scores(cell.evaluation.product(out) / report.FILE).results[0]
+    skipped = {"damaged shards": {"count": 1, "first": "labelled-00002.parquet"}}
+    network, header = report.load_checkpoint(cell.training[-1].product(out))
+    card = header.card | {"warnings": ["left out 1 damaged shards: a"], "init_card": {"warnings": ["no L_seg"]}}
+    changed = SimpleNamespace(results=[replace(result, skipped=skipped)])
+    monkeypatch.setattr(report, "read_scores", lambda path: changed)
+    monkeypatch.setattr(report, "load_checkpoint", lambda path: (network, SimpleNamespace(card=card)))
+    notes = report._figures(cell, cell.evaluation, out)["notes"]
+    expected = ["not scored: 1 damaged shards; labelled-00002.parquet", "training: left out 1 damaged shards: a"]
+    assert notes[-3:] == [*expected, "training: no L_seg"]
+
+
 def test_tables_share_common_steps():
     def runs(name, row):
         (cell,) = cells(TABLES[name], Options(), [row])[:1]
@@ -381,7 +396,7 @@ def test_mean_pose_is_relative_to_center_of_protocol(tmp_path, smpl):
     write_sloper4d(tmp_path / "raw", smpl, frames=40)
     prepare("sloper4d", tmp_path / "raw", tmp_path / "set", smpl=smpl, split_by="dapt")
     (target,) = _targets(TABLES["fig5"], Options(data={"sloper4d": str(tmp_path / "set")}))
-    setting = SimpleNamespace(dataset="set", kind="sloper4d", joints=HUMAN15.joints, protocol="dapt")
+    setting = SimpleNamespace(dataset="set", kind="sloper4d", joints=HUMAN15.joints, protocol="dapt", total=9)
     people = {split: list(open_dataset(tmp_path / "set").samples(split)) for split in ("train", "test")}
     own = {
         split: np.array([p.joints[SMPL24.map_to(HUMAN15)] - p.centers["trans"] for p in some])
@@ -390,6 +405,12 @@ def test_mean_pose_is_relative_to_center_of_protocol(tmp_path, smpl):
     wanted = 1e3 * np.linalg.norm(own["test"] - own["train"].mean(0), axis=-1).mean()
     found = mean_pose_error(target, SimpleNamespace(setting=setting), tmp_path)
     assert found == pytest.approx(wanted, abs=0.1)
+    # of other people, as after a shard was damaged or repaired, it is computed again
+    (path,) = (tmp_path / "cells").glob("mean-pose-*.json")
+    path.write_text('{"mpjpe": 1.0}')
+    assert mean_pose_error(target, SimpleNamespace(setting=setting), tmp_path) == 1.0
+    setting.total = 5
+    assert mean_pose_error(target, SimpleNamespace(setting=setting), tmp_path) == found
 
 
 def test_mean_pose_uses_training_set_and_skips_few_points(tmp_path, monkeypatch):

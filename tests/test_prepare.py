@@ -100,12 +100,12 @@ def test_prepare_sloper4d_has_trans_and_distances(tmp_path, smpl):
         assert row["distance"] == pytest.approx(np.linalg.norm(row["center"]), rel=1e-6)
         assert row["center_trans"] is not None and row["center_box"] is None and row["box_center"] is None
     assert summary["splits"] == {"test": 3, "train": 3} and summary["frames"] == 6
-    assert summary["sources"] == {"sloper4d/opt_pose, male": 6}
+    assert summary["sources"] == {"sloper4d/opt_pose, male by the given body": 6}
     assert summary["skipped"] == {"labels without a cloud": 2}
     assert summary["trunk"][2] > 0.7 and summary["joints"] == {"seen": 144, "hidden": 0, "unlabelled": 0}
     # the split has sequences that these files do not contain
     assert any(
-        line.startswith("seq003_street_002, ") and line.endswith("of train by lidar-hmr are missing")
+        line.startswith("missing: seq003_street_002, ") and line.endswith("of train by lidar-hmr")
         for line in summary["warnings"]
     )
     lines = summary_lines(summary)

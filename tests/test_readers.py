@@ -294,7 +294,7 @@ def test_sloper4d_prefers_refined_poses(tmp_path, smpl):
         items, skipped = everything("sloper4d", root, smpl)
         # frames 3 and 4 are beyond total_frames
         check(items, {key: value for key, value in truth.items() if key[1] < 115})
-        assert {item.source for item in items} == {f"sloper4d/{which}, male"}
+        assert {item.source for item in items} == {f"sloper4d/{which}, male by the given body"}
         assert reasons(skipped) == {"labels without a cloud": 2, "frame beyond total_frames": 4}
         assert [item.time for item in items[:2]] == pytest.approx([0.0, 0.1], abs=1e-6)
 

@@ -204,7 +204,9 @@ def test_pretrain_warns_about_corpus_without_parts(people, tmp_path):
     warnings = make_setup(Pretrain(shards=(str(tmp_path / "corpus"),))).warnings
     assert any("L_seg" in warning for warning in warnings)
     shutil.copytree(tmp_path / "corpus", tmp_path / "second")
-    (warning,) = make_setup(Pretrain(shards=(str(tmp_path / "corpus"), str(tmp_path / "second")))).warnings
+    setup = make_setup(Pretrain(shards=(str(tmp_path / "corpus"), str(tmp_path / "second"))))
+    (warning,) = setup.warnings
+    assert setup.card["warnings"] == [warning]
     assert warning.startswith("no point of corpus, second has a body part")
     assert not make_setup(Pretrain(shards=(str(people),))).warnings
 

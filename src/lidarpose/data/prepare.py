@@ -282,7 +282,7 @@ def _warnings(summary: dict[str, Any], absent_names: dict[str, list[str]], rule:
         lines.append(f"no people in {first_names(empty_parts, 5)}")
     if rule is not None:
         lines += [
-            f"{first_names(names, 5)} of {split} by {rule.name} are missing" for split, names in absent_names.items()
+            f"missing: {first_names(names, 5)} of {split} by {rule.name}" for split, names in absent_names.items()
         ]
         if rule.leaks:
             lines.append(f"the split {rule.name} leaks: {rule.leaks}")

@@ -6,7 +6,7 @@ from importlib import resources
 from os import PathLike
 from typing import Any
 
-from lidarpose.errors import InputError
+from lidarpose.errors import InputError, counted
 from lidarpose.eval.scores import BASELINE, OURS, RELEASED, Result, Scores, read_scores
 from lidarpose.io.files import listed
 
@@ -94,6 +94,8 @@ def _setting_words(result: Result) -> Iterator[str]:
     yield "" if setting.sensor == "known" else f"sensor position {setting.sensor}"
     yield f"{no_pose:,} without a pose, not counted" if no_pose else ""
     yield f"{num_left_out:,} left out" if num_left_out else ""
+    damaged = result.skipped.get("damaged shards")
+    yield f"{counted(damaged['count'], 'damaged shard')} left out, with an unknown number of people" if damaged else ""
 
 
 def _markdown(entries: list[dict[str, Any]]) -> str:

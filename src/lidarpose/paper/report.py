@@ -237,6 +237,11 @@ def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
     network, header = load_checkpoint(cell.training[-1].product(out))
     runs, entry = runs_of(header.card), last_entry(cell.training[-1].folder(out))
     row, study = result.line("mpjpe"), stability_study(evaluation, out)
+    left_out = [
+        f"not scored: {entry['count']:,} {reason}; {entry['first']}" for reason, entry in result.skipped.items()
+    ]
+    # of pre-training and fine-tuning
+    warnings = dict.fromkeys(warning for run in runs for warning in run.get("warnings", ()))
     mean_pose = mean_pose_error(cell.target, result, out)
     return {
         **{name: _value(result, name) for name in (*COLUMNS, ROOT)},
@@ -245,7 +250,7 @@ def _figures(cell: Cell, evaluation: Step, out: Path) -> dict[str, Any]:
         "people_scored": row.people,
         "joints": list(result.setting.joints),
         "protocol": result.setting.summary,
-        "notes": [*result.notes, *(f"training: {warning}" for warning in header.card.get("warnings", ()))],
+        "notes": [*result.notes, *left_out, *(f"training: {warning}" for warning in warnings)],
         "people_seen": sum(run.get("people_seen", 0) for run in runs),
         "hours": round(sum(run.get("hours", 0.0) for run in runs), 3),
         "people_per_second": round(entry["people"] / entry["seconds"], 1) if entry and entry["seconds"] else None,
@@ -274,13 +279,14 @@ def mean_pose_error(target: Target, result: Result, out: Path) -> float:
     depending on the protocol.
     """
     folders = [str(part.product(out)) if isinstance(part, Step) else part for part in (target.train, target.test)]
-    # real sets may be prepared again: the digest of the card tells the versions apart
-    card_digest = (
-        None if isinstance(target.test, Step) else content_digest(Path(folders[1]) / CARD, expected="a dataset")[:8]
-    )
+    # real sets may be prepared again, and shards be damaged: the card's digest and the number of people tell them apart
+    version = None
+    if not isinstance(target.test, Step):
+        digest = content_digest(Path(folders[1]) / CARD, expected="a dataset")
+        version = f"{digest[:8]}-{result.setting.total}"
     # different budgets have different training people, but are scored on the same people
     learned = target.train.name if isinstance(target.train, Step) else None
-    name = filter(None, (result.setting.dataset, str(len(result.setting.joints)), card_digest, learned))
+    name = filter(None, (result.setting.dataset, str(len(result.setting.joints)), version, learned))
     path = out / CELLS / f"mean-pose-{'-'.join(name)}.json"
     if not path.is_file():
         split = None if isinstance(target.train, Step) else "train"

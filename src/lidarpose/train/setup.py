@@ -264,7 +264,8 @@ def _pretraining(recipe: Pretrain, layout: str) -> TrainSetup:
     source = StoredSource(dataset=dataset, seed=recipe.seed, augmentation=turn_augmentation, **noise)
     # PRN and LPFormer derive a point's part from the nearest joint
     has_parts = config.neck != "prn" if isinstance(config, DaptConfig) else not isinstance(config, BaselineConfig)
-    return replace(setup, source=source, warnings=_left_out(dataset) + (_no_parts(dataset) if has_parts else ()))
+    warnings = _left_out(dataset) + (_no_parts(dataset) if has_parts else ())
+    return replace(setup, source=source, card=card | {"warnings": list(warnings)}, warnings=warnings)
 
 
 def _check_no_test(folder: str) -> None:
@@ -335,7 +336,7 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
         network=network,
         validation=validation,
         joints=joints,
-        card=card | {"damaged": list(dataset.damaged)},
+        card=card | {"damaged": list(dataset.damaged), "warnings": list(_left_out(dataset))},
         warnings=_left_out(dataset) + ((no_validation,) if held_out_dataset is None else ()),
     )
     if not isinstance(config, LidarcapConfig):
@@ -381,7 +382,7 @@ def _of_clips(setup: TrainSetup, source: ClipSource) -> TrainSetup:
     parts = source.dataset.parts
     if len(config.clouds) > 1 and all(rows["background"].null_count == rows.num_rows for _, rows, _ in parts):
         warnings.append(f"the surroundings of these people are not known: {config.name} sees only the people")
-    card = setup.card | {"warnings": warnings}
+    card = setup.card | {"warnings": [*setup.card.get("warnings", ()), *warnings]}
     return replace(setup, source=source, frames=config.frames, card=card, warnings=(*setup.warnings, *warnings))
 
 

@@ -77,7 +77,7 @@ class Sloper4D(Reader):
         betas = numbers(path, numbers(path, person.get("beta"), (-1,), "beta")[:10], (10,), "beta")[None]
         gender = str(person.get("gender", "neutral")).lower()
         kind = self._smpl.kind(gender)
-        body = gender if kind == "any" else f"{gender} by the {kind} body"
+        body = f"{gender} by the {'given' if kind == 'any' else kind} body"
         has_pose = np.isfinite(pose).all(1) & np.isfinite(trans).all(1)
         pose, trans = (np.where(has_pose[:, None], x, 0.0) for x in (pose, trans))
         has_place = np.isfinite(position).all(1) & np.isfinite(heading)
