@@ -18,6 +18,7 @@ import pytest
 from dataset_files import write_lidarhuman26m, write_sloper4d
 from matplotlib import style
 from matplotlib.text import Text
+from motion_files import a_clip, write_amass
 from training_runs import Killed, few_to_validate_on  # noqa: F401
 
 from lidarpose.body.mocap.smpl_poses import load_betas
@@ -429,6 +430,14 @@ def test_mean_pose_uses_training_set_and_skips_few_points(tmp_path, monkeypatch)
         assert mean_pose_error(replace(target, train=train), SimpleNamespace(setting=setting), tmp_path) == error
 
 
+def test_run_table_rejects_unknown_subjects_before_training(tmp_path):
+    motion = write_amass(tmp_path / "001_poses.npz", *a_clip())
+    for subjects, held_out in (("001,9", "001"), ("001", "9")):
+        options = Options(people=64, motion=(str(motion),), subjects=subjects, held_out=held_out)
+        with pytest.raises(InputError, match="no clip starts with '9'"):
+            run_table(TABLES["table4"], options, tmp_path / "out", [], lambda words: pytest.fail(str(words)), print)
+
+
 def test_run_table_rejects_unsuitable_dataset_before_training(tmp_path, smpl, monkeypatch, capsys):
     write_sloper4d(tmp_path / "raw", smpl)
     prepare("sloper4d", tmp_path / "raw", tmp_path / "set", smpl=smpl)
@@ -565,9 +574,9 @@ def test_paper_checks_files_before_it_trains(tmp_path, monkeypatch, capsys, dry)
     assert main(["paper", "table4", "--motion", "nowhere.npz", *dry]) == 2
     assert "nowhere.npz: no such file or folder, for --motion" in capsys.readouterr().err
     # of the chosen rows alone
-    (tmp_path / "first.npz").touch()
-    words = ["paper", "table2", "--motion", "first.npz,nowhere.npz", "--dry-run", "--rows"]
-    assert main([*words, "poses-of-first"]) == 0 and main([*words, "poses-of-nowhere"]) == 2
+    write_amass(tmp_path / "first_poses.npz", *a_clip())
+    words = ["paper", "table2", "--motion", "first_poses.npz,nowhere.npz", "--dry-run", "--rows"]
+    assert main([*words, "poses-of-first_poses"]) == 0 and main([*words, "poses-of-nowhere"]) == 2
 
 
 def test_options_need_poses_for_a_body(data):

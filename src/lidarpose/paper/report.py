@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose._version import __version__
+from lidarpose.body.mocap import load_motion
 from lidarpose.data.dataset_card import CARD
 from lidarpose.errors import InputError, LidarPoseError, counted
 from lidarpose.eval.dataset import EvalSample, open_eval_dataset
@@ -85,6 +86,12 @@ def check_targets(selected: Sequence[Cell]) -> list[str]:
     for file, option in files.items():
         if not Path(file).exists():
             raise InputError(f"{file}: no such file or folder, for {option}")
+    options = [dict(pairwise(map(str, step))) for step in words]
+    # read here, too: without these clips, a row would end after hours of others
+    for motion, subjects in dict.fromkeys((o["--motion"], o.get("--subjects")) for o in options if "--motion" in o):
+        clips = load_motion(motion)
+        if subjects:
+            clips.of(tuple(subjects.split(",")))
     for train in dict.fromkeys(cell.target.train for cell in selected if cell.evaluation is not None):
         if isinstance(train, str):
             open_eval_dataset(train, split="train", limit=1)
