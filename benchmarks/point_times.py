@@ -118,6 +118,7 @@ def whole_scans(model: Predictor, sensor: str, count: int) -> dict:
         times = np.concatenate([0.1 * (k + _phases(frame.points, sensor, rng)) for k, frame in enumerate(frames)])
         num_points = np.bincount(newest.person[newest.person >= 0], minlength=len(newest.boxes))
         distance = np.linalg.norm([box.center[:2] for box in newest.boxes], axis=1)
+        is_counted = (num_points >= LEAST_POINTS) & (distance < FARTHEST)
         table = np.full((len(newest.boxes), len(ways)), np.nan)
         clouds = ((points, None), (newest.points, None), (points, times))
         for way, (cloud, point_times) in enumerate(clouds):
@@ -125,11 +126,11 @@ def whole_scans(model: Predictor, sensor: str, count: int) -> dict:
             joints = np.stack([person.joints for person in poses if person.has_pose] or [np.full((26, 3), np.inf)])
             apart = np.linalg.norm(joints[:, None, 0, :2] - newest.joints[None, :, 0, :2], axis=-1)
             false[ways[way]] += int((np.isfinite(joints).all((1, 2)) & (apart.min(1) > FOUND)).sum())
-            for person in np.flatnonzero((num_points >= LEAST_POINTS) & (distance < FARTHEST)):
+            for person in np.flatnonzero(is_counted):
                 if apart[:, person].min() < FOUND:
                     difference = (joints[apart[:, person].argmin()] - newest.joints[person])[BODY26.map_to(HUMAN15)]
                     table[person, way] = 1e3 * np.linalg.norm(difference, axis=-1).mean()
-        tables.append(table[(num_points >= LEAST_POINTS) & (distance < FARTHEST)])
+        tables.append(table[is_counted])
     errors = np.concatenate(tables)
     is_found = np.isfinite(errors)
     in_all = errors[is_found.all(1)]

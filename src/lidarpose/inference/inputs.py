@@ -227,8 +227,7 @@ def as_origin(value: object) -> np.ndarray | None:
 def clean(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """Drops invalid points of (n, 3) m as `only_returns` does and thins the rest to `MAX_POINTS`. Returns the points
     and a message for each change."""
-    rows, notes = usable_rows(points)
-    points = points if rows is None else points[rows]
+    points, notes = _finite_returns(points)
     if len(points) > MAX_POINTS:
         notes.append(
             f"thinned from {len(points)} to {MAX_POINTS} points: crop closer to the person if the crop contains others"
@@ -286,9 +285,13 @@ def rounding_warning(points: np.ndarray) -> str | None:
 def only_returns(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
     """Drops rows of points (n, 3) m that are not finite, too large or not returns. Returns the points and a message for
     each kind of dropped rows and for rounded coordinates."""
-    rows, notes = usable_rows(points)
-    points = points if rows is None else points[rows]
+    points, notes = _finite_returns(points)
     return points, [*notes, *filter(None, [rounding_warning(points)])]
+
+
+def _finite_returns(points: np.ndarray) -> tuple[np.ndarray, list[str]]:
+    rows, notes = usable_rows(points)
+    return points if rows is None else points[rows], notes
 
 
 def usable_rows(points: np.ndarray) -> tuple[np.ndarray | None, list[str]]:

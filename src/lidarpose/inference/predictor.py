@@ -32,12 +32,11 @@ from lidarpose.inference.inputs import (
     is_few,
     is_many,
     only_returns,
-    own_times,
     times_of_clouds,
 )
 from lidarpose.inference.newest import newest_points
 from lidarpose.inference.results import PersonPose, Poses
-from lidarpose.inference.scan import Scan, pose_scan, read_scan
+from lidarpose.inference.scan import Scan, pose_scan, scan_of_array
 from lidarpose.inference.tta import tta_transforms
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.files import file_error
@@ -269,12 +268,11 @@ class Predictor(PoseEstimator):
         if clips is not None and (find or boxes is not None):
             raise InputError("clips need a list of clouds, each of one person: omit clips with boxes or find")
         if boxes is not None or find:
-            cloud = as_points(points)
             origin = np.zeros(3) if sensor_origin is None else as_origin(sensor_origin)
             input_boxes = None if boxes is None else read_boxes(boxes)
             up = "z" if input_boxes is None else input_boxes.up
-            scan = Scan(points=cloud, boxes=input_boxes, origin=origin, up=up)
-            scan = read_scan(scan, cloud, None, own_times(points) if point_times is None else point_times)
+            scan = Scan(points=np.zeros((0, 3)), boxes=input_boxes, origin=origin, up=up)
+            scan = scan_of_array(scan, points, point_times)
             if find:
                 from lidarpose.inference.detection import Search
                 from lidarpose.inference.single_scan import search_alone

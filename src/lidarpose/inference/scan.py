@@ -134,27 +134,38 @@ def read_scan(
 
     Raises InputError for a file without valid points.
     """
-    source = os.fsdecode(points) if isinstance(points, str | os.PathLike) else None
-    if source is None and columns is not None:
-        check_int("columns", columns, least=3, hint=" (x y z first)")
-    if source is None:
-        array = as_points(points)
-        times = own_times(points) if point_times is None else point_times
-        cloud = Cloud(points=array, point_times=as_point_times(times, len(array)))
-    else:
-        if point_times is not None:
-            problem = "point_times are for arrays, a file has its own"
-            raise InputError(f"{problem}: omit them, or give the points as an array")
-        cloud = read_points(source, columns=columns)
-    rows, notes = usable_rows(cloud.points)
-    scan = replace(scan, points=cloud.points, point_times=cloud.point_times).with_points_of(rows)
-    notes += filter(None, [rounding_warning(scan.points)])
-    if source is not None and not len(scan.points):
+    if not isinstance(points, str | os.PathLike):
+        if columns is not None:
+            check_int("columns", columns, least=3, hint=" (x y z first)")
+        return scan_of_array(scan, points, point_times)
+    if point_times is not None:
+        problem = "point_times are for arrays, a file has its own"
+        raise InputError(f"{problem}: omit them, or give the points as an array")
+    source = os.fsdecode(points)
+    cloud = read_points(source, columns=columns)
+    scan = replace(_with_cloud(scan, cloud), source=source)
+    if not len(scan.points):
         problem = (
             f"only coordinates beyond {FARTHEST:,.0f} m" if cloud.points.any() else "only 0,0,0, which are not returns"
         )
         raise file_error(source, f"expected points in meters, got {problem}: export it again")
-    return replace(scan, warnings=(*cloud.warnings, *notes), source=source)
+    return scan
+
+
+def scan_of_array(scan: Scan, points: ArrayLike, point_times: ArrayLike | None = None) -> Scan:
+    """The scan with the valid points of an array (n, 3+) m or a `Cloud`, when they were measured, and warnings.
+    point_times: (n,) s; None means those of a `Cloud`."""
+    array = as_points(points)
+    times = own_times(points) if point_times is None else point_times
+    return _with_cloud(scan, Cloud(points=array, point_times=as_point_times(times, len(array))))
+
+
+def _with_cloud(scan: Scan, cloud: Cloud) -> Scan:
+    """The scan with the valid points of a cloud."""
+    rows, notes = usable_rows(cloud.points)
+    scan = replace(scan, points=cloud.points, point_times=cloud.point_times).with_points_of(rows)
+    notes += filter(None, [rounding_warning(scan.points)])
+    return replace(scan, warnings=(*cloud.warnings, *notes))
 
 
 def pose_scan(
@@ -169,7 +180,6 @@ def pose_scan(
     if warning := origin_warning(scan):
         warnings.append(warning)
         scan = replace(scan, origin=None)
-    scan = scan.with_newest() if scan.boxes else scan
     origin = scan.level_origin
     if scan.boxes:
         pelvises = None if scan.pelvises is None else scan.pelvises @ scan.R_level_input.T
@@ -178,9 +188,10 @@ def pose_scan(
             pelvises = np.where(scan.verified[:, None], np.nan, pelvises)
         box_centers = np.stack([scan.R_level_input @ box.center for box in scan.boxes])
         is_scored = all(box.score is not None for box in scan.boxes)
+        newest_clouds = scan.with_newest().newest_clouds()
         level_poses = predictor.predict_in(
             *(clouds, origin, skeleton, progress),
-            pelvises=pelvises, box_centers=box_centers, is_scored=is_scored, newest_clouds=scan.newest_clouds(),
+            pelvises=pelvises, box_centers=box_centers, is_scored=is_scored, newest_clouds=newest_clouds,
         )  # fmt: skip
     else:
         # a crop, or no boxes at all

@@ -15,11 +15,11 @@ import numpy as np
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_from_up, up_text
 from lidarpose.inference.detection import DetectedScan, detect_places, least_score, search_options
-from lidarpose.inference.inputs import as_origin, as_points
+from lidarpose.inference.inputs import as_origin
 from lidarpose.inference.predict_scan import SAME_AXIS, check_choice, check_up, is_whole, predict_scan, predictor_of
 from lidarpose.inference.predictor import Predictor
 from lidarpose.inference.results import Poses
-from lidarpose.inference.scan import Scan, read_scan
+from lidarpose.inference.scan import Scan, scan_of_array
 from lidarpose.inference.single_scan import why_nobody
 from lidarpose.io.sources import DamagedFrame, Frame, FrameSource, open_source
 from lidarpose.io.sources.frame import DEFAULT_RATE
@@ -348,9 +348,8 @@ class FramePredictor:
         return frame_poses(poses=replace(poses, source=self.name))
 
     def _scan(self, frame: Frame) -> Scan:
-        # `as_points` copies: results keep the points, and a driver may write the next frame into the same array
-        scan = Scan(points=np.zeros((0, 3)), up=self.up)
-        scan = read_scan(scan, as_points(frame.points), None, frame.point_times)
+        # `scan_of_array` copies: results keep the points, and a driver may write the next frame into the same array
+        scan = scan_of_array(Scan(points=np.zeros((0, 3)), up=self.up), frame.points, frame.point_times)
         points, notes = scan.points, list(scan.warnings)
         if self.boxes is not None:
             boxes = self.boxes.of(frame)

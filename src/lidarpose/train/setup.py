@@ -326,6 +326,7 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
         rows = evenly_spaced(len(held_out_dataset), VALIDATION)
         return [augmented(held_out_dataset.sample(k), cropping, np.random.default_rng([recipe.seed, k])) for k in rows]
 
+    warnings = _left_out(dataset)
     no_validation = _NO_VALIDATION if recipe.hold_out else _NOT_VALIDATED
     setup = TrainSetup(
         objective=objective_of(config, recipe, layout),
@@ -336,8 +337,8 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
         network=network,
         validation=validation,
         joints=joints,
-        card=card | {"damaged": list(dataset.damaged), "warnings": list(_left_out(dataset))},
-        warnings=_left_out(dataset) + ((no_validation,) if held_out_dataset is None else ()),
+        card=card | {"damaged": list(dataset.damaged), "warnings": list(warnings)},
+        warnings=warnings + ((no_validation,) if held_out_dataset is None else ()),
     )
     if not isinstance(config, LidarcapConfig):
         if recipe.shift_windows:
