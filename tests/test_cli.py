@@ -531,7 +531,7 @@ def test_invalid_commands_are_one_line(crop, boxes, tmp_path, capsys, monkeypatc
 
 
 def test_predict_checks_output_before_predicting(crop, out, monkeypatch, capsys):
-    monkeypatch.setattr(predictor.Predictor, "predict", lambda *_, **__: pytest.fail("predicted first"))
+    monkeypatch.setattr(predictor.Predictor, "predict_in", lambda *_, **__: pytest.fail("predicted first"))
     (out / "crop.poses.png").mkdir(parents=True)
     for folder, words in ((crop / "deep", "cannot write"), (out, "crop.poses.png")):
         assert run("predict", crop, "--out", folder, "--picture") == 2

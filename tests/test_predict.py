@@ -16,15 +16,16 @@ import lidarpose
 from lidarpose.cli import main
 from lidarpose.errors import InputError
 from lidarpose.geometry import UP_AXES, axis_angle_to_matrix, rotation_about, rotation_from_up, up_text
-from lidarpose.inference import crop_search, predictor
+from lidarpose.inference import cloud_predictor, crop_search
 from lidarpose.inference.backend import Raw
-from lidarpose.inference.checks import flat_axis, is_lying, rows_inside, scan_unit_warning, unit_warning
+from lidarpose.inference.checks import flat_axis, is_lying, scan_unit_warning, unit_warning
 from lidarpose.inference.crop_search import candidates, select_pose
 from lidarpose.inference.inputs import MAX_POINTS, as_origin, clean
 from lidarpose.inference.predict_scan import predictor_of
 from lidarpose.inference.predictor import Predictor
 from lidarpose.inference.result_panels import panels_of, person_label
 from lidarpose.inference.results import PersonPose
+from lidarpose.inference.scan import rows_inside
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.point_cloud import Cloud
 from lidarpose.models import bundled_path
@@ -1024,7 +1025,7 @@ def test_predict_checks_upside_down_people_in_one_batch(model, points, monkeypat
     assert batches == [3] * 2
     np.testing.assert_array_equal(same.to_numpy(), people.to_numpy())
     # lying people get no warning of their own
-    monkeypatch.setattr(predictor, "is_lying", lambda pose, part: True)
+    monkeypatch.setattr(cloud_predictor, "is_lying", lambda pose, part: True)
     assert not any("try --up" in line for line in model.predict(points * [1, -1, -1]).warnings)
 
 

@@ -4,21 +4,15 @@ A check of boxes is a function of (`Scan`, `Poses` in the level frame), called f
 it and append it to `SCAN_CHECKS`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lidarpose.errors import first_names
-from lidarpose.geometry import rows_near
 from lidarpose.inference.results import Poses
+from lidarpose.inference.scan import Scan, rows_inside
 from lidarpose.sample import MIN_POINTS, UNLIKE_A_PERSON, Box, Pose, person_note
-
-if TYPE_CHECKING:
-    from lidarpose.inference.scan import Scan
 
 # bounds on the extent of a person given in other units but read as meters
 _LARGEST_IN_CENTIMETERS, _SMALLEST_IN_OTHER_UNITS, _LARGEST_IN_KILOMETERS = 500, 20, 0.02
@@ -300,15 +294,6 @@ def all_lying(scan: Scan, people: Poses) -> str | None:
     other_options = ", or ".join(_option(axis) for axis in "zyx" if axis != scan.upright_axis)
     subject = "the person lies" if len(posed_people) == 1 else f"all {len(posed_people)} people lie"
     return f"{subject} down: if that is wrong, {scan.up} is not the input's up axis: try {other_options}"
-
-
-def rows_inside(boxes: list[Box], points: np.ndarray) -> list[np.ndarray]:
-    """points (n, 3) m, z up -> for each `Box`, the rows (k,) of the points inside it, ascending."""
-    centers = np.array([box.center for box in boxes]).reshape(-1, 3)
-    # twice the distance from the center to a corner, for any yaw
-    reach = np.array([np.hypot(*box.size[:2]) for box in boxes])
-    near_rows = rows_near(centers, points, reach)
-    return [rows[box.contains(points[rows])] for box, rows in zip(boxes, near_rows, strict=True)]
 
 
 def _heights(boxes: list[Box], points: np.ndarray, rows: list[np.ndarray]) -> np.ndarray:

@@ -16,10 +16,10 @@ import numpy as np
 from lidarpose.errors import InputError, check_int, is_number
 from lidarpose.geometry import UP_AXES, nearest_axis, rotation_about, up_text, upright_axis
 from lidarpose.inference.background import is_static, read_background
-from lidarpose.inference.checks import flat_along_another_axis, rows_inside, scan_unit_warning, unlikely_origin
+from lidarpose.inference.checks import flat_along_another_axis, scan_unit_warning, unlikely_origin
 from lidarpose.inference.inputs import distinct_rows, hashes
 from lidarpose.inference.known_places import KnownPlaces
-from lidarpose.inference.scan import Scan
+from lidarpose.inference.scan import Scan, rows_inside
 from lidarpose.inference.verification import rounded, verified
 from lidarpose.models.detector.detector import MAX_RANGE, Detections, Detector
 from lidarpose.models.detector.ground import estimate_up

@@ -16,9 +16,10 @@ from lidarpose.inference.checks import scan_unit_warning
 from lidarpose.inference.detection import DetectedScan, Search, search_options, verify_people
 from lidarpose.inference.inputs import as_origin
 from lidarpose.inference.known_places import KnownPlaces
+from lidarpose.inference.pose_scan import pose_scan
 from lidarpose.inference.predictor import Predictor, load
 from lidarpose.inference.results import Poses
-from lidarpose.inference.scan import Scan, pose_scan, read_scan
+from lidarpose.inference.scan import Scan, read_scan
 from lidarpose.inference.single_scan import search_alone
 from lidarpose.io.boxes import Boxes, read_boxes
 from lidarpose.io.files import read_bytes

@@ -16,8 +16,8 @@ from lidarpose.errors import InputError
 from lidarpose.eval.detector.labeled_scans import LabeledScan, ScanSet
 from lidarpose.eval.metrics import aggregate
 from lidarpose.eval.metrics.joint_errors import joint_errors
-from lidarpose.inference.checks import rows_inside
 from lidarpose.inference.predictor import Predictor
+from lidarpose.inference.scan import rows_inside
 from lidarpose.sample import Box
 from lidarpose.skeleton import BODY26, HUMAN15
 

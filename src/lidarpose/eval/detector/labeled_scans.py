@@ -14,8 +14,8 @@ import numpy as np
 
 from lidarpose.errors import InputError
 from lidarpose.eval.dataset import evenly_drawn
-from lidarpose.inference.checks import rows_inside
 from lidarpose.inference.inputs import as_origin, only_returns
+from lidarpose.inference.scan import rows_inside
 from lidarpose.io.boxes import read_boxes
 from lidarpose.io.files import file_error, read_json, shorten
 from lidarpose.io.point_cloud import SUFFIXES, read_points
