@@ -242,6 +242,10 @@ def test_info_of_checkpoint_prints_network_and_runs(capsys):
     assert f"tiny, {facts['parameters']:,} parameters" in text
     assert f"trained  {card['command']}\n         {card['people_seen']:,} people, {card['hours']:.2f} hours" in text
     assert run("info", "nowhere.safetensors") == 2
+    capsys.readouterr()
+    exported = path.with_suffix(".onnx")
+    assert run("info", exported) == 0
+    assert capsys.readouterr().out.startswith(f"{exported}: tiny, exported, written by lidarpose ")
 
 
 @pytest.mark.long

@@ -558,6 +558,12 @@ def test_run_table_marks_failed_cells_and_continues(tmp_path):
     # the target is made once
     assert asked == ["synth", "finetune", "pretrain", "finetune"]
     assert "failed: unrecognized arguments" in (tmp_path / "out" / "table4.md").read_text()
+    # the reason stays until the cell is run again, unless the table is damaged
+    again = write_table(TABLES["table4"], Options(people=64), tmp_path / "out", chosen=chosen)
+    assert _chosen(again) == _chosen(content)
+    (tmp_path / "out" / "table4.json").write_text("{")
+    again = write_table(TABLES["table4"], Options(people=64), tmp_path / "out", chosen=chosen)
+    assert {cell["state"] for cell in _chosen(again)} == {"not run"}
 
 
 def test_paper_command_fails_if_a_cell_failed(tmp_path, monkeypatch, capsys):
@@ -628,7 +634,7 @@ def test_damaged_files_of_steps_are_named(tmp_path):
 
     for path, read in (
         (state, lambda: steps.is_done(cell.evaluation, tmp_path)),
-        (results, lambda: report._entry(cell, tmp_path, "")),
+        (results, lambda: report._entry(cell, tmp_path, "", [])),
         (curves, curves_of_done_cell),
         (tmp_path / run_dir.CONFIG, lambda: steps._people(tmp_path)),
     ):
@@ -901,7 +907,7 @@ def test_fig7_is_drawn_from_copied_cells(tmp_path):
     assert report._is_there(TABLES["fig7"], cell.evaluation, tmp_path)
     (path,) = figures.draw("fig7", [cell], tmp_path)
     assert path.read_bytes().startswith(b"\x89PNG")
-    assert "stability" not in report._entry(cell, tmp_path, "")
+    assert "stability" not in report._entry(cell, tmp_path, "", [])
 
 
 def test_figures_have_all_finished_rows_whatever_the_chosen_ones(tmp_path, monkeypatch):

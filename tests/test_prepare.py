@@ -310,7 +310,13 @@ def test_prepare_rejects_bad_user_lists(copied, tmp_path, train, test, message):
 def test_prepare_single_split(raw, tmp_path):
     summary = prepare("humanm3", raw[0], tmp_path / "out", split="test")
     assert summary["splits"] == {"test": 6} and [part["part"] for part in summary["parts"]] == ["test/c"]
-    refused("other settings: count is 1, requested is 2", "humanm3", raw[0], tmp_path / "out", split="train")
+    refused(
+        "other settings: the number of the release's parts is 1, requested is 2",
+        "humanm3",
+        raw[0],
+        tmp_path / "out",
+        split="train",
+    )
 
 
 def test_prepare_warns_that_split_in_chunks_leaks(tmp_path, smpl):

@@ -72,6 +72,15 @@ def test_scene_rejects_unknown_fields_and_invalid_values(setting, told):
         scene_config("paper").changed((setting,))
 
 
+def test_keep_option_excludes_the_same_change(tmp_path, capsys):
+    assert (
+        main(["synth", "--out", str(tmp_path / "people"), "-n", "4", "--keep", "0.5", "--set", "slope=0, keep=0.6"])
+        == 2
+    )
+    assert "--keep 0.5 is the same as --set keep=0.5, got both: give one of them" in capsys.readouterr().err
+    assert not (tmp_path / "people").exists()
+
+
 def test_keep_option_sets_mask_of_scene(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert not main(["synth", "--out", "people", "-n", "4", "--scene", "paper", "--keep", "1", "--set", "slope=0"])

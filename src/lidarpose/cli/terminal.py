@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from lidarpose.errors import InputError
 from lidarpose.io.files import one_line
 from lidarpose.progress import is_quiet
 
@@ -117,9 +118,12 @@ def names(text: str) -> tuple[str, ...]:
 
 
 def scene_changes(options: argparse.Namespace) -> tuple[str, ...] | None:
-    """The changes of the scene that `--keep` and `--set` ask for; None for none."""
+    """The changes of the scene that `--keep` and `--set` ask for; None for none. Raises InputError if both set keep."""
     keep = () if options.keep is None else (f"keep={options.keep}",)
-    return keep + (() if options.set_set is None else names(options.set_set)) or None
+    changes = () if options.set_set is None else names(options.set_set)
+    if keep and any(change.partition("=")[0].strip() == "keep" for change in changes):
+        raise InputError(f"--keep {options.keep} is the same as --set keep={options.keep}, got both: give one of them")
+    return keep + changes or None
 
 
 def tell(text: str, *, error: bool = False) -> None:

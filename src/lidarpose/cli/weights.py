@@ -16,9 +16,9 @@ from lidarpose.models import BUNDLED, DEFAULT, bundled_path
 
 _INFO = """
 show versions, device, bundled weights and their scores
-With a checkpoint: what network it is, and how it was trained.
+With a checkpoint or an exported file: what network it is, and how it was trained.
 $ lidarpose info
-<weights> FILE?  a checkpoint of your own
+<weights> FILE?  a checkpoint of your own, or a file that `lidarpose export` wrote
 -v,--verbose  also show how the weights were trained, and all scores
 --json  print everything as JSON
 """
@@ -67,18 +67,20 @@ def _info(options: argparse.Namespace) -> None:
 
 
 def checkpoint_facts(weights: str) -> dict[str, Any]:
-    """A checkpoint's network, configuration, number of parameters, and training runs, the last first. weights: a file
-    or the name of a bundled network."""
+    """A checkpoint's network, configuration, number of parameters (None for an exported file), and training runs, the
+    last first. weights: a file or the name of a bundled network."""
     from lidarpose.models import weights_path
     from lidarpose.models.checkpoint import parameter_count, read_header, runs_of
+    from lidarpose.models.onnx import open_network
 
     path = weights_path(weights)
-    header = read_header(path)
+    is_exported = path.suffix.lower() == ".onnx"
+    header = open_network(path)[1] if is_exported else read_header(path)
     return {
         "file": str(path),
         "lidarpose": header.version,
         "network": header.network,
-        "parameters": parameter_count(path),
+        "parameters": None if is_exported else parameter_count(path),
         "config": header.config.to_dict(),
         "runs": [{key: value for key, value in run.items() if key != "init_card"} for run in runs_of(header.card)],
     }
@@ -88,7 +90,8 @@ def _checkpoint_lines(facts: dict[str, Any]) -> Iterator[str]:
     from lidarpose.models.config import is_number
 
     name = facts["config"].get("size") or facts["config"].get("name") or facts["network"]
-    yield f"{facts['file']}: {name}, {facts['parameters']:,} parameters, written by lidarpose {facts['lidarpose']}"
+    size = "exported" if facts["parameters"] is None else f"{facts['parameters']:,} parameters"
+    yield f"{facts['file']}: {name}, {size}, written by lidarpose {facts['lidarpose']}"
     for run in facts["runs"]:
         # cards are not checked when they are read
         numbers = {key: value for key, value in run.items() if is_number(value)}

@@ -70,8 +70,10 @@ def check_settings(folder: str | Path, present: DatasetCard, wanted: DatasetCard
         name: (json.dumps(old_settings.get(name)), json.dumps(new_settings.get(name)))
         for name in sorted(old_settings | new_settings)
     }
+    # of a prepared dataset, items are parts of the release
+    labels = {"count": "the number of the release's parts"} if "parts" in new_settings else {}
     differences = {
-        name: f"{name} is {present_value}, requested is {wanted_value}"
+        name: f"{labels.get(name, name)} is {present_value}, requested is {wanted_value}"
         for name, (present_value, wanted_value) in pairs.items()
         if present_value != wanted_value
     }

@@ -133,7 +133,9 @@ def write_table(
         update: raise InputError instead of replacing a table with finished cells, if with these options none is.
     """
     failed, all_cells, chosen_cells = failed or {}, cells(table, options), cells(table, options, chosen)
-    entries = [_entry(cell, out, failed.get(k, "")) for k, cell in enumerate(all_cells)]
+    path = out / f"{table.name}.json"
+    earlier = _earlier_cells(path)
+    entries = [_entry(cell, out, failed.get(k, ""), earlier) for k, cell in enumerate(all_cells)]
     for cell, entry in zip(all_cells, entries, strict=True):
         entry |= _difference(cell, _reference(table, cell, all_cells), out) if entry["state"] == "done" else {}
     is_meant = [cell in chosen_cells or not cell.seed for cell in all_cells]
@@ -151,9 +153,8 @@ def write_table(
         "reference": table.reference,
         "cells": entries,
     }
-    path = out / f"{table.name}.json"
-    if update and not _finished(entries) and path.is_file():
-        count = _finished(read_json(path, expected="a table")["cells"])
+    if update and not _finished(entries):
+        count = _finished(earlier)
         if count:
             problem = f"{path} has {counted(count, 'finished cell')}, none of them run with these options"
             raise InputError(f"{problem}: repeat --data, --people, --size and the others of the command that ran them")
@@ -162,12 +163,23 @@ def write_table(
     return content
 
 
+def _earlier_cells(path: Path) -> list[dict[str, Any]]:
+    """The cells of a table as written before; none if it is missing or damaged, since it is made from other files."""
+    try:
+        return read_json(path, expected="a table")["cells"] if path.is_file() else []
+    except (LidarPoseError, LookupError, TypeError):
+        return []
+
+
 def _finished(entries: Sequence[dict[str, Any]]) -> int:
     return sum(entry["state"] == "done" for entry in entries)
 
 
-def _entry(cell: Cell, out: Path, failure: str) -> dict[str, Any]:
-    """A cell as JSON. state: done, failed, not run or not possible; finished cells also have their results."""
+def _entry(cell: Cell, out: Path, failure: str, earlier: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """A cell as JSON. state: done, failed, not run or not possible; finished cells also have their results.
+
+    failure: its error, now; earlier: the cells as written before, from which an earlier error is kept.
+    """
     steps = list(cell.evaluation.all()) if cell.evaluation else []
     entry: dict[str, Any] = {"row": cell.row, "column": cell.column, "seed": cell.seed, "published": cell.published}
     entry["commands"] = [step.line(out) for step in steps]
@@ -179,6 +191,9 @@ def _entry(cell: Cell, out: Path, failure: str) -> dict[str, Any]:
     if path.is_file():
         return entry | _without_study(read_json(path, expected="a cell's results"))
     if not is_done(cell.evaluation, out):
+        for old in earlier:
+            if old["state"] == "failed" and old["commands"] == entry["commands"]:
+                return entry | {"state": "failed", "reason": old["reason"]}
         return entry | {"state": "not run", "reason": "its command was not run, or did not finish"}
     try:
         figures = {"state": "done"} | _figures(cell, cell.evaluation, out)

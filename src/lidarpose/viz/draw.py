@@ -157,9 +157,10 @@ def _draw_header(figure, panels: list[Panel], shown_panels: list[Panel], title: 
     width, height = figure.get_size_inches()
     left, top = _MARGIN / width, 1 - _MARGIN / height
     note = f"the first {len(shown_panels)} of {len(panels)} people" if len(shown_panels) < len(panels) else ""
-    # wide enough for a hash
-    room = int((width - 2 * _MARGIN) / 0.127) - len(note)
-    _text(figure, left, top, shortened(title, max(room, 12)), size=13, weight="bold", va="top")
+    # a long title is smaller, a still longer one is shortened; letters are taken to be as wide as those of a hash
+    room = (width - 2 * _MARGIN) / 0.127 - len(note)
+    size = min(max(13 * room / max(len(title), 1), 8), 13)
+    _text(figure, left, top, shortened(title, max(int(room * 13 / size), 12)), size=size, weight="bold", va="top")
     _text(figure, 1 - left, top - 0.03 / height, note, size=9, color=FAINT, va="top", ha="right")
     if handles := _legend_handles(shown_panels):
         figure.legend(

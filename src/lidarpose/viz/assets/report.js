@@ -124,6 +124,7 @@
     slider.addEventListener("input", () => { stop(); show(+slider.value); });
     view.frame = 0;
     text.textContent = frames[0].label;
+    button.hidden = slider.hidden = frames.length < 2;
   }
 
   function draw(view) {
