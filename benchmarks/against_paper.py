@@ -28,12 +28,7 @@ from lidarpose.inference.predictor import load
 from lidarpose.models.checkpoint import load_checkpoint
 from lidarpose.models.dapt.dapt_config import DaptConfig
 from lidarpose.train.loop import train
-from lidarpose.train.objectives.dapt_objective import (
-    DaptObjective,
-    finetuning_config,
-    pretraining_config,
-    small,
-)
+from lidarpose.train.objectives.dapt_objective import DaptObjective, finetuning_config, pretraining_config, small
 from lidarpose.train.objectives.dapt_transfer import transferred
 from lidarpose.train.recipes import Pretrain, recipe
 from lidarpose.train.run_dir import MODEL

@@ -12,8 +12,7 @@ from lidarpose.geometry import rotation_about
 from lidarpose.lidar.presets import sensor
 from lidarpose.sample import SEEN, Box, LabeledSample
 from lidarpose.skeleton import BODY26
-from lidarpose.synth import generator
-from lidarpose.synth import simulate as simulate_module
+from lidarpose.synth import generator, simulate as simulate_module
 from lidarpose.synth.acquisition import MOST_FRAMES, Acquisition, draw_acquisition
 from lidarpose.synth.bodies import draw_bodies, draw_moving_bodies
 from lidarpose.synth.generator import BLOCK, Generator

@@ -1,8 +1,7 @@
 """Evenly spaced indices. Arrays of other libraries are tested with the functions that accept them."""
 
 import numpy as np
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from lidarpose.arrays import evenly_spaced
 

@@ -14,8 +14,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from lidarpose.errors import InputError, MissingExtra, missing_extra
 from lidarpose.inference.backend import OnnxBackend, Raw, bundled_backend, estimates, person_parts

@@ -13,14 +13,7 @@ from lidarpose import evaluation
 from lidarpose.cli import main
 from lidarpose.errors import InputError
 from lidarpose.eval import dataset as module
-from lidarpose.eval.dataset import (
-    BENCHES,
-    bench_path,
-    facing,
-    load_bench,
-    mean_poses,
-    open_eval_dataset,
-)
+from lidarpose.eval.dataset import BENCHES, bench_path, facing, load_bench, mean_poses, open_eval_dataset
 from lidarpose.geometry import rotation_about
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.sample import Box, Pose

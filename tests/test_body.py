@@ -4,8 +4,7 @@ from importlib import resources
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from reference.rig import add_folds_reference, pose_bodies_reference, vertex_normals_reference
 
 from lidarpose.body import rig as body_rig

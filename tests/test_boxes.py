@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 from hostile_files import KITTI, npy, npy_header, refusal
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import lidarpose
 from lidarpose.errors import InputError

@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 from motion_files import MAIN, J, check_rotations, joints_of
 
 from lidarpose.body.mocap import motion, retarget

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from lidarpose.models.dapt.dapt_config import CURVES
 from lidarpose.models.dapt.voxel_tables import curve, dilated, hilbert, z_order

@@ -14,8 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import waymo_files
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from pyarrow import parquet
 from scipy.spatial import cKDTree
 from shard_files import write_shard
@@ -26,8 +25,7 @@ from lidarpose.cli import evaluating, main
 from lidarpose.data.prepare import prepare
 from lidarpose.data.shards import open_dataset, read_rows, shard_path
 from lidarpose.errors import InputError
-from lidarpose.eval import robustness
-from lidarpose.eval import run as run_module
+from lidarpose.eval import robustness, run as run_module
 from lidarpose.eval.dataset import evenly_drawn, load_bench, open_eval_dataset
 from lidarpose.eval.metric_rows import facing_flipped, metric_rows, triples
 from lidarpose.eval.metrics import aggregate

@@ -8,8 +8,7 @@ from types import SimpleNamespace
 import dataset_files as files
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from test_evaluate import Fake, standing
 from test_metric_rows import PERSON
 

@@ -9,16 +9,14 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import lidarpose
 from lidarpose.errors import InputError, LidarPoseError, MissingExtra
 from lidarpose.inference.backend import OnnxBackend, exported_beside
 from lidarpose.inference.torch_backend import TorchBackend
 from lidarpose.io.files import content_digest
-from lidarpose.models import BUNDLED, DEFAULT, bundled_path
-from lidarpose.models import export as exporting
+from lidarpose.models import BUNDLED, DEFAULT, bundled_path, export as exporting
 from lidarpose.models.checkpoint import DAMAGED, DIGEST, load_checkpoint, read_header, save_checkpoint
 from lidarpose.models.config import NetworkConfig
 from lidarpose.models.export import check, export, module_to_onnx

@@ -12,8 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 import waymo_files
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from training_runs import few_to_validate_on, refused, train_until_killed  # noqa: F401 - a fixture
 
 from lidarpose import evaluation

@@ -24,8 +24,7 @@ from hostile_files import (
     refusal,
     zipped,
 )
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
 from lidarpose.errors import InputError, MissingExtra

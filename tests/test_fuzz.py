@@ -11,8 +11,7 @@ import pyarrow as pa
 import pytest
 import safetensors.numpy
 from hostile_files import BOX_FILES, CALIBRATION, PICKLE_PIECES, PICKLES, POINT_FILES, damaged
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 from pyarrow import parquet
 from shard_files import sample, write_shard
 

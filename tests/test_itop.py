@@ -8,8 +8,7 @@ import h5py
 import motion_files
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from test_evaluate import Fake
 
 from lidarpose.cli import main

@@ -80,11 +80,7 @@ def test_lidarhuman26m_reader_levels_tilted_sensor(raw):
         np.testing.assert_allclose(a.joints, truth["5", a.frame, "0"] @ tilt(15).T, atol=1e-4)
         # one rotation about the LiDAR for points, joints and trans; heights are right to 2 degrees
         np.testing.assert_allclose(b.joints[:, 2], truth["5", a.frame, "0"][:, 2], atol=15 * 0.035)
-        for before, after in (
-            (a.points, b.points),
-            (a.joints, b.joints),
-            (a.centers["trans"], b.centers["trans"]),
-        ):
+        for before, after in ((a.points, b.points), (a.joints, b.joints), (a.centers["trans"], b.centers["trans"])):
             np.testing.assert_allclose(np.linalg.norm(after, axis=-1), np.linalg.norm(before, axis=-1), atol=1e-4)
         # distances between joints and trans do not change
         before, after = (np.linalg.norm(x.joints - x.centers["trans"], axis=-1) for x in (a, b))

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scripts import load_script
 from walkers import piece_volumes
 
@@ -155,10 +154,7 @@ def test_cast_rays_passes_fences_and_foliage_but_not_walls():
     assert 0.05 < hit_share(shapes.rail_fence(3.0, 1.0, 3)) < 0.4
     thin, thick = (hit_share(shapes.foliage((0.8, 1.0, 1.0), n, 0.12, RNG(0))) for n in (40, 120))
     assert 0.15 < thin < thick < 0.9
-    whole, holed = (
-        hit_share(shapes.wall(2.0, 2.0)),
-        hit_share(shapes.wall(2.0, 2.0, opening=(-0.5, 0.5, 0.5, 1.5))),
-    )
+    whole, holed = (hit_share(shapes.wall(2.0, 2.0)), hit_share(shapes.wall(2.0, 2.0, opening=(-0.5, 0.5, 0.5, 1.5))))
     assert whole - holed == pytest.approx(0.25, abs=0.06)
 
 

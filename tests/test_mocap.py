@@ -7,8 +7,7 @@ import re
 import motion_files as files
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 from lidarpose.body.mocap import digest, joint_tree, load_motion, retarget, skeleton_files
 from lidarpose.body.mocap.smpl_poses import load_betas

@@ -7,14 +7,12 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
 from lidarpose.models.config import BIN, SIZES, NetworkConfig
-from lidarpose.models.decode import HALF_WIDTH
-from lidarpose.models.decode import window as window_mean
+from lidarpose.models.decode import HALF_WIDTH, window as window_mean
 from lidarpose.models.layers import (
     REACH,
     WAVELENGTHS,

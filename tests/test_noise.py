@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from reference.sensor_noise import intensity_loss, lose_returns_reference
 
 from lidarpose.geometry import rotation_about, unit

@@ -4,8 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from reference.raycast_reference import cast_ray_list_reference
 
 from lidarpose.errors import InputError
@@ -46,8 +45,7 @@ def test_pattern_rays_are_sorted_unit_and_in_field_of_view(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "rate"),
-    [("livox-mid40", 100e3), ("livox-mid100", 300e3), ("livox-avia", 240e3), ("livox-mid360", 200e3)],
+    ("name", "rate"), [("livox-mid40", 100e3), ("livox-mid100", 300e3), ("livox-avia", 240e3), ("livox-mid360", 200e3)]
 )
 def test_rosettes_have_published_rate_and_different_frames(name, rate):
     pattern = BY_NAME[name]

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from hostile_files import las, npy, pcd_header
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 import lidarpose
 from lidarpose.data.rows import person_row, sample_of

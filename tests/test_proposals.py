@@ -7,14 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from reference.detector_reference import (
-    context_reference,
-    fine_reference,
-    range_reference,
-    suppress_near_reference,
-)
+from hypothesis import given, strategies as st
+from reference.detector_reference import context_reference, fine_reference, range_reference, suppress_near_reference
 
 from lidarpose.geometry import rotation_about
 from lidarpose.models.detector import proposals

@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from walkers import piece_volumes
 
 from lidarpose.body.pose_prior.activities import KINDS

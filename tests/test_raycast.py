@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 from raycast_meshes import assert_same, body, ground, join, soup, sphere
 from reference.raycast_reference import (
     cast_ray_list_reference,

@@ -14,8 +14,7 @@ from unittest.mock import Mock
 import numpy as np
 import pandas
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from walking_people import FRAMES, PLACES, STEPS, moving_source, walking_clouds
 
 import lidarpose
@@ -1067,10 +1066,7 @@ def test_impossible_sensor_pose_fails_only_its_frame(clouds, model):
     places = [np.eye(4) for _ in range(3)]
     places[1][0, 3] = 1e12
     recording = IndexedRecording(
-        name="made",
-        ids=list("abc"),
-        times=None,
-        read=lambda i: Sweep(points=clouds[i], T_world_sensor=places[i]),
+        name="made", ids=list("abc"), times=None, read=lambda i: Sweep(points=clouds[i], T_world_sensor=places[i])
     )
     frames = list(lidarpose.predict_recording(FrameSource(recording), boxes=boxes, track=True, model=model))
     assert [frame.error is None for frame in frames] == [True, False, True]

@@ -22,8 +22,12 @@ from lidarpose.recording.predict_recording import predict_recording
 
 rosbags = pytest.importorskip("rosbags", reason="the extra recordings is not installed")
 from rosbags.rosbag1 import Writer as Writer1  # noqa: E402
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin  # noqa: E402
-from rosbags.rosbag2 import Writer as Writer2  # noqa: E402
+from rosbags.rosbag2 import (  # noqa: E402
+    CompressionFormat,
+    CompressionMode,
+    StoragePlugin,
+    Writer as Writer2,  # noqa: E402
+)
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # noqa: E402
 
 ROS2, ROS1 = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)

@@ -32,8 +32,7 @@ from lidarpose.train.data_loader import SyntheticSource, lanes_of
 from lidarpose.train.loop import Interrupted, StopRequest
 from lidarpose.train.objectives.posenet_objective import PoseNetObjective
 from lidarpose.train.optim import optimizers, rate_factor
-from lidarpose.train.recipes import Finetune, Pretrain, TrainVerifier
-from lidarpose.train.recipes import recipe as recipe_of
+from lidarpose.train.recipes import Finetune, Pretrain, TrainVerifier, recipe as recipe_of
 from lidarpose.train.setup import make_setup
 
 # people per chunk; a run has three chunks

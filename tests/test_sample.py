@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from lidarpose.errors import InputError
 from lidarpose.geometry import rotation_about
@@ -157,11 +156,7 @@ def test_sample_may_be_empty_and_is_frozen():
 
 @pytest.mark.parametrize(
     "make",
-    [
-        lambda: Box(center=[0, 0, 0], size=[1, 1, 2]),
-        lambda: pose(),
-        lambda: Sample(**SAMPLE),
-    ],
+    [lambda: Box(center=[0, 0, 0], size=[1, 1, 2]), lambda: pose(), lambda: Sample(**SAMPLE)],
     ids=["box", "pose", "sample"],
 )
 def test_array_classes_compare_by_identity(make):

@@ -3,8 +3,7 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from lidarpose.errors import InputError
 from lidarpose.lidar.presets import SENSORS, listing, load_sensor, sensor

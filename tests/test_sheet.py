@@ -22,14 +22,7 @@ from lidarpose.synth import shard_job
 from lidarpose.synth.shard_job import SynthesisJob, write_dataset
 from lidarpose.synth.street import street
 from lidarpose.viz import bird_eye, contact_sheet
-from lidarpose.viz.bird_eye import (
-    MAX_SCANS,
-    ScanPanel,
-    _window,
-    draw_scan_and_people,
-    draw_scans,
-    label_offsets,
-)
+from lidarpose.viz.bird_eye import MAX_SCANS, ScanPanel, _window, draw_scan_and_people, draw_scans, label_offsets
 from lidarpose.viz.contact_sheet import _spread, draw_dataset
 from lidarpose.viz.draw import Panel, draw_people
 

@@ -11,8 +11,7 @@ from lidarpose.geometry import rotation_about
 from lidarpose.lidar.presets import sensor
 from lidarpose.sample import Pose, Sample
 from lidarpose.skeleton import BODY26
-from lidarpose.synth import generator, noise
-from lidarpose.synth import simulate as simulate_module
+from lidarpose.synth import generator, noise, simulate as simulate_module
 from lidarpose.synth.environment.mesh import Mesh, box, quad
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.place import Place

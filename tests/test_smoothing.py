@@ -16,13 +16,7 @@ from lidarpose.skeleton import SKELETONS, SMPL24, Skeleton
 from lidarpose.tracking.bones import lengths_of, rigid_bones
 from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.live import LiveFilter, filter_track
-from lidarpose.tracking.motion_model import (
-    SCALES,
-    KalmanState,
-    learn_process_noise,
-    pooled,
-    smooth_joints,
-)
+from lidarpose.tracking.motion_model import SCALES, KalmanState, learn_process_noise, pooled, smooth_joints
 from lidarpose.tracking.smoothing import likely_hit, smooth, with_facing_corrected
 
 

@@ -5,8 +5,7 @@ import pickle
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from lidarpose.body.mocap.smpl_poses import load_betas
 from lidarpose.body.rig import load_rig, pose_bodies

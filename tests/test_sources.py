@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from hostile_files import refusal
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 import lidarpose
 from lidarpose.errors import InputError

@@ -14,8 +14,7 @@ from training_runs import refused, train_until_killed
 from lidarpose.cli import main
 from lidarpose.errors import LidarPoseError
 from lidarpose.geometry import axis_angle_to_matrix
-from lidarpose.models import bundled_path
-from lidarpose.models import export as export_module
+from lidarpose.models import bundled_path, export as export_module
 from lidarpose.models.checkpoint import load_checkpoint, save_checkpoint
 from lidarpose.models.detector.candidates import Candidates
 from lidarpose.models.detector.detector import detector_path, open_detector

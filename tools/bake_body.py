@@ -151,9 +151,7 @@ def sample_anny(*, adults: int, children: int, seed: int) -> AnnyPeople:
             torch.distributions.Uniform(torch.tensor([0.0, 0.75]), torch.tensor([0.25, 1.0])),
         )
         population = SimpleShapeDistribution(
-            model,
-            morphological_age_distribution=torch.distributions.Uniform(low, high),
-            gender_distribution=sex,
+            model, morphological_age_distribution=torch.distributions.Uniform(low, high), gender_distribution=sex
         )
         age, phenotype = population.sample(count)
         ages.append(age.numpy())

@@ -17,70 +17,55 @@ from lidarpose.errors import needs_extra
 
 if TYPE_CHECKING:
     # the names below, for editors and type checkers
-    from lidarpose import evaluation as evaluation
-    from lidarpose import metrics as metrics
+    from lidarpose import evaluation as evaluation, metrics as metrics
     from lidarpose.body.pose_prior.sampling import sample_poses as sample_poses
-    from lidarpose.errors import InputError as InputError
-    from lidarpose.errors import LidarPoseError as LidarPoseError
-    from lidarpose.errors import MissingExtra as MissingExtra
+    from lidarpose.errors import (
+        InputError as InputError,
+        LidarPoseError as LidarPoseError,
+        MissingExtra as MissingExtra,
+    )
     from lidarpose.inference.background import learn_background as learn_background
     from lidarpose.inference.predict_scan import predict as predict
-    from lidarpose.inference.predictor import Predictor as Predictor
-    from lidarpose.inference.predictor import load as load
+    from lidarpose.inference.predictor import Predictor as Predictor, load as load
     from lidarpose.inference.read_poses import read_poses as read_poses
-    from lidarpose.inference.results import PersonPose as PersonPose
-    from lidarpose.inference.results import Poses as Poses
+    from lidarpose.inference.results import PersonPose as PersonPose, Poses as Poses
     from lidarpose.inference.single_scan import detect as detect
-    from lidarpose.io.boxes import Boxes as Boxes
-    from lidarpose.io.boxes import read_boxes as read_boxes
+    from lidarpose.io.boxes import Boxes as Boxes, read_boxes as read_boxes
     from lidarpose.io.point_cloud import read_points as read_points
-    from lidarpose.io.sources import Frame as Frame
-    from lidarpose.io.sources import open_source as open_source
+    from lidarpose.io.sources import Frame as Frame, open_source as open_source
     from lidarpose.lidar.presets import sensor as sensor
     from lidarpose.lidar.raycast import cast_rays as cast_rays
     from lidarpose.lidar.sensor import Sensor as Sensor
     from lidarpose.models.dapt.import_weights import import_dapt as import_dapt
     from lidarpose.models.export import export as export
-    from lidarpose.recording.predict_recording import FramePoses as FramePoses
-    from lidarpose.recording.predict_recording import predict_recording as predict_recording
-    from lidarpose.sample import Box as Box
-    from lidarpose.sample import Pose as Pose
-    from lidarpose.sample import Sample as Sample
-    from lidarpose.skeleton import SKELETONS as SKELETONS
-    from lidarpose.skeleton import Skeleton as Skeleton
+    from lidarpose.recording.predict_recording import FramePoses as FramePoses, predict_recording as predict_recording
+    from lidarpose.sample import Box as Box, Pose as Pose, Sample as Sample
+    from lidarpose.skeleton import SKELETONS as SKELETONS, Skeleton as Skeleton
 
-# public name -> module that defines it
-_HOMES = {
-    "load": "lidarpose.inference.predictor",
-    "Predictor": "lidarpose.inference.predictor",
-    "predict": "lidarpose.inference.predict_scan",
-    "predict_recording": "lidarpose.recording.predict_recording",
-    "FramePoses": "lidarpose.recording.predict_recording",
-    "detect": "lidarpose.inference.single_scan",
-    "learn_background": "lidarpose.inference.background",
-    "export": "lidarpose.models.export",
-    "import_dapt": "lidarpose.models.dapt.import_weights",
-    "PersonPose": "lidarpose.inference.results",
-    "Poses": "lidarpose.inference.results",
-    "cast_rays": "lidarpose.lidar.raycast",
-    "sensor": "lidarpose.lidar.presets",
-    "Sensor": "lidarpose.lidar.sensor",
-    "sample_poses": "lidarpose.body.pose_prior.sampling",
-    "read_points": "lidarpose.io.point_cloud",
-    "read_boxes": "lidarpose.io.boxes",
-    "read_poses": "lidarpose.inference.read_poses",
-    "open_source": "lidarpose.io.sources",
-    "Frame": "lidarpose.io.sources.frame",
-    "Box": "lidarpose.sample",
-    "Boxes": "lidarpose.io.boxes",
-    "Pose": "lidarpose.sample",
-    "Sample": "lidarpose.sample",
-    "Skeleton": "lidarpose.skeleton",
-    "SKELETONS": "lidarpose.skeleton",
-    "LidarPoseError": "lidarpose.errors",
-    "InputError": "lidarpose.errors",
-    "MissingExtra": "lidarpose.errors",
+# module -> public names that it defines
+_PUBLIC = {
+    "inference.predictor": ("load", "Predictor"),
+    "inference.predict_scan": ("predict",),
+    "recording.predict_recording": ("predict_recording", "FramePoses"),
+    "inference.single_scan": ("detect",),
+    "inference.background": ("learn_background",),
+    "models.export": ("export",),
+    "models.dapt.import_weights": ("import_dapt",),
+    "inference.results": ("PersonPose", "Poses"),
+    "lidar.raycast": ("cast_rays",),
+    "lidar.presets": ("sensor",),
+    "lidar.sensor": ("Sensor",),
+    "body.pose_prior.sampling": ("sample_poses",),
+    "io.point_cloud": ("read_points",),
+    "io.boxes": ("read_boxes", "Boxes"),
+    "inference.read_poses": ("read_poses",),
+    "io.sources": ("open_source",),
+    "io.sources.frame": ("Frame",),
+    "sample": ("Box", "Pose", "Sample"),
+    "skeleton": ("Skeleton", "SKELETONS"),
+    "errors": ("LidarPoseError", "InputError", "MissingExtra"),
 }
+_HOMES = {name: f"lidarpose.{module}" for module, names in _PUBLIC.items() for name in names}
 
 _renamed.install()
 

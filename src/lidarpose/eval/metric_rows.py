@@ -37,10 +37,7 @@ _NEARBY_EDGES = (0, 1, 5, 20, np.inf)
 # frames count as evenly spaced if two steps in time differ by less than this fraction
 _EVEN = 0.2
 # joints of each half of the body, without sides. Source: Haque et al. 2016, where the torso is in neither
-ITOP_HALVES = {
-    "upper": ("head_center", "neck", "shoulder", "elbow", "hand"),
-    "lower": ("hip", "knee", "foot"),
-}
+ITOP_HALVES = {"upper": ("head_center", "neck", "shoulder", "elbow", "hand"), "lower": ("hip", "knee", "foot")}
 
 
 # ---- metrics

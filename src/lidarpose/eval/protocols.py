@@ -21,8 +21,7 @@ from lidarpose.inference.inputs import Clips
 from lidarpose.inference.newest import newest_points
 from lidarpose.io.files import one_line, shorten
 from lidarpose.sample import PER_PERSON, UNLABELED, Box, LabeledSample, Pose, clip_windows, known_values
-from lidarpose.skeleton import Skeleton
-from lidarpose.skeleton import skeleton as skeleton_of
+from lidarpose.skeleton import Skeleton, skeleton as skeleton_of
 
 PROTOCOLS = ("clean", "dapt")
 

@@ -21,14 +21,7 @@ from lidarpose.models import weights_file
 from lidarpose.models.checkpoint import Header, read_header
 from lidarpose.models.config import BIN, NetworkConfig
 from lidarpose.models.decode import Decoder, out_of_range, sigmoid
-from lidarpose.models.onnx import (
-    input_name,
-    map_in_threads,
-    open_onnx,
-    output_names,
-    thread_count,
-    voxelize_people,
-)
+from lidarpose.models.onnx import input_name, map_in_threads, open_onnx, output_names, thread_count, voxelize_people
 from lidarpose.sample import CONFIDENCE_RADIUS, PER_PERSON, Pose
 from lidarpose.skeleton import Skeleton
 

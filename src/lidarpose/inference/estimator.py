@@ -63,11 +63,7 @@ class PoseEstimator:
         return pose.joints[..., self._middle, :].mean(-2)
 
     def outputs(
-        self,
-        clouds: list[np.ndarray],
-        centers: np.ndarray,
-        origin: np.ndarray | None,
-        clip: Clips | None = None,
+        self, clouds: list[np.ndarray], centers: np.ndarray, origin: np.ndarray | None, clip: Clips | None = None
     ) -> Pose:
         """A single forward pass.
 

@@ -11,14 +11,7 @@ import numpy as np
 from lidarpose.errors import InputError, check_int, check_name, needs_extra
 from lidarpose.inference.backend import Backend, OnnxBackend, bundled_backend, exported_beside
 from lidarpose.inference.cloud_predictor import CloudPredictor
-from lidarpose.inference.inputs import (
-    Clips,
-    as_origin,
-    as_points,
-    clip_times,
-    is_many,
-    times_of_clouds,
-)
+from lidarpose.inference.inputs import Clips, as_origin, as_points, clip_times, is_many, times_of_clouds
 from lidarpose.inference.pose_scan import pose_scan
 from lidarpose.inference.results import PersonPose, Poses
 from lidarpose.inference.scan import Scan, scan_of_array

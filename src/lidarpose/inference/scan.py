@@ -116,10 +116,7 @@ def _turned(points: np.ndarray, R: np.ndarray) -> np.ndarray:
 
 
 def read_scan(
-    scan: Scan,
-    points: str | os.PathLike | ArrayLike,
-    columns: int | None,
-    point_times: ArrayLike | None = None,
+    scan: Scan, points: str | os.PathLike | ArrayLike, columns: int | None, point_times: ArrayLike | None = None
 ) -> Scan:
     """The scan with the valid points of a file or an array (n, 3+) m, when they were measured, the file's name, and
     warnings from reading. point_times: (n,) s, of an array.

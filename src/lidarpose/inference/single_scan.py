@@ -82,11 +82,7 @@ def detect(
     scan = Scan(points=np.zeros((0, 3)), origin=origin, up=up_text(up_direction))
     result = search_alone(read_scan(scan, points, columns, point_times), search)
     return Boxes(
-        result.boxes or [],
-        source=result.source,
-        warnings=result.warnings,
-        detector=detector_version(),
-        up=result.up,
+        result.boxes or [], source=result.source, warnings=result.warnings, detector=detector_version(), up=result.up
     )
 
 

@@ -375,10 +375,7 @@ def _without_repeats(
 
 
 def _fit_boxes(
-    places: _ScoredDetections,
-    points: np.ndarray,
-    neighbor_score: float,
-    known_boxes: dict[int, Box],
+    places: _ScoredDetections, points: np.ndarray, neighbor_score: float, known_boxes: dict[int, Box]
 ) -> list[_FittedBox]:
     """Fits boxes to the distinct people among detections with a pelvis, highest score first.
 

@@ -152,10 +152,7 @@ def open_network(path: str | os.PathLike) -> tuple[Any, Header]:
 
 def check_names(path: str | os.PathLike, session: Any, inputs: Sequence[str], outputs: Sequence[str]) -> None:
     """Raises InputError unless the inputs and outputs of a session have exactly these names."""
-    for kind, values, expected in (
-        ("input", session.get_inputs(), inputs),
-        ("output", session.get_outputs(), outputs),
-    ):
+    for kind, values, expected in (("input", session.get_inputs(), inputs), ("output", session.get_outputs(), outputs)):
         if mismatches := sorted({value.name for value in values} ^ set(expected)):
             problem = "is missing" if mismatches[0] in expected else "is unknown"
             remedy = "make the file anew with `lidarpose export` of this version"

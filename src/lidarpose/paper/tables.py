@@ -20,11 +20,7 @@ _TURNED = ("--augment", "turn")
 _FASTER, _FASTER_WIDE = ("--rate", "2e-3"), ("--rate", "1e-3", "--batch", "32")
 _ONE_CYCLE = (*_FASTER, "--schedule", "cosine", "--warmup", "0.04")
 # likewise baselines at full width: steps of 2 clips, of NE 1, and LPFormer with an eighth of its cells
-_WIDE_BASELINES = {
-    "lidarcap": ("--batch", "32"),
-    "ne": ("--batch", "16"),
-    "lpformer": ("--options", "grid=32"),
-}
+_WIDE_BASELINES = {"lidarcap": ("--batch", "32"), "ne": ("--batch", "16"), "lpformer": ("--options", "grid=32")}
 # an Adam step moves a weight by about the learning rate, and logits of narrow heatmaps are large (docs/log.md)
 _HEATMAP_RATE = ("--heatmap-rate", "10")
 _KEPT = ("0.5", "0.6", "0.7", "0.8", "0.9")

@@ -272,11 +272,7 @@ def _changed(scene: SceneConfig, name: str, text: str) -> SceneConfig:
 # Paper: section "Scene sampling": r in [4, 20] m, a tilted square of ground, the effective window without a margin,
 # s_p and r_keep of "Laser-level masking". Clusters of noise are named only among its stability tests.
 _PAPER = SceneConfig(
-    name="paper",
-    sensors=("dapt64",),
-    distance=(4.0, 20.0),
-    slope=np.radians(5.0),
-    noise=NoiseConfig(mask=1.0),
+    name="paper", sensors=("dapt64",), distance=(4.0, 20.0), slope=np.radians(5.0), noise=NoiseConfig(mask=1.0)
 )
 
 SCENES = {

@@ -15,8 +15,7 @@ from lidarpose.lidar.sensor import Sensor
 from lidarpose.sample import Box
 from lidarpose.synth.acquisition import SINGLE_SCAN, Acquisition
 from lidarpose.synth.bodies import FRAME_TIME, Bodies
-from lidarpose.synth.environment.mesh import Mesh, union
-from lidarpose.synth.environment.mesh import box as box_mesh
+from lidarpose.synth.environment.mesh import Mesh, box as box_mesh, union
 from lidarpose.synth.noise import direction_mask, laser_mask
 from lidarpose.synth.noise_kernels import lose_returns
 from lidarpose.synth.place import Place

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from lidarpose.sample import Pose
-from lidarpose.skeleton import Skeleton
-from lidarpose.skeleton import skeleton as skeleton_of
+from lidarpose.skeleton import Skeleton, skeleton as skeleton_of
 from lidarpose.tracking.bones import keep_lengths, length_statistics, lengths_of, rigid_bones
 from lidarpose.tracking.clip import TrackPoses
 from lidarpose.tracking.motion_model import SCALES, KalmanState, pooled, scale_probabilities_after, usual_process_noise

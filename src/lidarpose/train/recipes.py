@@ -157,8 +157,7 @@ class Pretrain(PoseRecipe):
 
     model: str = _setting("", f"{_MODEL} (default: by --size)")
     size: str = _setting(
-        "",
-        "network size: tiny (default), small, base; paper, paper-small, ...; prn, prn-small, ... (lidarpose models)",
+        "", "network size: tiny (default), small, base; paper, paper-small, ...; prn, prn-small, ... (lidarpose models)"
     )
     options: tuple[str, ...] = _setting((), _OPTIONS)
     neck: str = _setting("mde", "paper's network: mde, finest or prn (docs/train.md)")
@@ -190,9 +189,7 @@ class Pretrain(PoseRecipe):
         0.0, "share of people cropped from whole synthesized scans by detected boxes", "SHARE"
     )
     shards: tuple[str, ...] = _setting(
-        (),
-        "train on folders that `lidarpose synth` wrote; scene and motion then define validation people",
-        "DIR,DIR",
+        (), "train on folders that `lidarpose synth` wrote; scene and motion then define validation people", "DIR,DIR"
     )
 
     def __post_init__(self):

@@ -15,8 +15,7 @@ from types import NoneType
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load
-from safetensors.torch import save as to_bytes
+from safetensors.torch import load, save as to_bytes
 from torch import Tensor, nn
 
 from lidarpose._version import __version__

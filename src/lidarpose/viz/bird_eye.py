@@ -100,15 +100,8 @@ def draw_scans(panels: Sequence[ScanPanel], *, title: str = "", panel_width: flo
     rows = max(-(-len(panels) // columns), 1)
     width, height = columns * panel_width, rows * _PANEL + _TITLE
     figure = Figure(figsize=(width, height), dpi=_DPI, facecolor="white")
-    figure.text(
-        0.15 / width,
-        1 - 0.15 / height,
-        shortened(title, int(4.7 * width)),
-        fontsize=13,
-        weight="bold",
-        va="top",
-        parse_math=False,
-    )
+    heading = shortened(title, int(4.7 * width))
+    figure.text(0.15 / width, 1 - 0.15 / height, heading, fontsize=13, weight="bold", va="top", parse_math=False)
     tracks = "; dotted: path over the frames" if any(panel.tracks for panel in panels) else ""
     limbs = "; left limbs blue, right ones orange" if any(is_known(panel.poses) for panel in panels) else ""
     dots = "; dots: people of all frames" if any(panel.places is not None for panel in panels) else ""

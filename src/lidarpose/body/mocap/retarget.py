@@ -95,12 +95,7 @@ def motion_from_joints(
     body = mean_adult_joints()[None].astype(np.float32), rotations, np.zeros((len(joints), 3), np.float32)
     origin_joints = forward_kinematics(SMPL24.parents, *body)[1]
     translation = _hips_of_mean_adult(joints, clips["length"]) - origin_joints[:, _HIPS].mean(1)
-    return Motion(
-        rotations=rotations,
-        translation=translation.astype(np.float32),
-        source=f"{kind}: {path}",
-        **clips,
-    )
+    return Motion(rotations=rotations, translation=translation.astype(np.float32), source=f"{kind}: {path}", **clips)
 
 
 def _hips_of_mean_adult(joints: np.ndarray, length: Sequence[int]) -> np.ndarray:

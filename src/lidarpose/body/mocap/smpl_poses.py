@@ -113,10 +113,7 @@ def motion_from_smpl(
         remedy = f"give load_motion up={axis!r}, or up='z' if they lie"
         raise file_error(path, f"people stand or lie along {axis}, not z; {remedy}")
     return Motion(
-        rotations=rotations,
-        translation=(trans @ R_level_world.T).astype(np.float32),
-        source=f"{kind}: {path}",
-        **clips,
+        rotations=rotations, translation=(trans @ R_level_world.T).astype(np.float32), source=f"{kind}: {path}", **clips
     )
 
 

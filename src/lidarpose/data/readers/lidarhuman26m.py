@@ -100,12 +100,7 @@ def _labels(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _sample(
-    path: Path,
-    clouds: base.SceneClouds,
-    joints: np.ndarray,
-    trans: np.ndarray,
-    turn: np.ndarray | None,
-    **fields: Any,
+    path: Path, clouds: base.SceneClouds, joints: np.ndarray, trans: np.ndarray, turn: np.ndarray | None, **fields: Any
 ) -> LabeledSample | Skipped:
     """The sample of a frame. clouds: the whole scans; turn: R_level_sensor, None to keep the sensor's frame; fields:
     others of the sample, already turned."""

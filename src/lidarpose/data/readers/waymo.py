@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from lidarpose.data.readers import waymo_frames as frames
-from lidarpose.data.readers import waymo_v1
+from lidarpose.data.readers import waymo_frames as frames, waymo_v1
 from lidarpose.data.readers.base import Reader, Skipped, entries, numbers
 from lidarpose.data.readers.waymo_v1 import SPLITS
 from lidarpose.data.shards import open_parquet, rows_of_shard

@@ -16,14 +16,7 @@ from lidarpose.errors import InputError, check_int
 from lidarpose.io.files import common_folder, file_error, listed
 from lidarpose.io.point_cloud import RECORDINGS, SUFFIXES
 from lidarpose.io.sources.folders import is_result, list_folder, natural_key, open_files, scan_files
-from lidarpose.io.sources.frame import (
-    ChainedRecording,
-    DamagedFrame,
-    Frame,
-    FrameSource,
-    ReadingOptions,
-    Recording,
-)
+from lidarpose.io.sources.frame import ChainedRecording, DamagedFrame, Frame, FrameSource, ReadingOptions, Recording
 from lidarpose.io.sources.kitti import open_kitti
 from lidarpose.io.sources.nuscenes import open_nuscenes
 

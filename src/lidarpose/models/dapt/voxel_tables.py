@@ -85,11 +85,7 @@ class Tables(Generic[Array]):
 
 
 def build_tables(
-    clouds: list[np.ndarray],
-    config: DaptConfig,
-    *,
-    layout: str = "ragged",
-    rng: np.random.Generator | None = None,
+    clouds: list[np.ndarray], config: DaptConfig, *, layout: str = "ragged", rng: np.random.Generator | None = None
 ) -> Tables[np.ndarray]:
     """Tables of people's clouds, each (n, 3) m in its person's frame; n may be 0.
 
@@ -220,12 +216,7 @@ def _neighbors(key: np.ndarray, cells: np.ndarray, reach: int, bits: int, layout
 
 
 def _people(
-    person: np.ndarray,
-    people: int,
-    cells: np.ndarray,
-    config: DaptConfig,
-    layout: str,
-    rng: np.random.Generator | None,
+    person: np.ndarray, people: int, cells: np.ndarray, config: DaptConfig, layout: str, rng: np.random.Generator | None
 ) -> dict[str, Any]:
     """The fields of a `Level` that say which rows belong to each person, and which rows attend to each other."""
     lengths = np.bincount(person, minlength=people)

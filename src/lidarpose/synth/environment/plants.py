@@ -100,10 +100,7 @@ def low_crown(u: np.ndarray, rng: np.random.Generator) -> Mesh:
     """A trunk with a crown down to knee or hip height: thuja, spruce, an old shrub."""
     trunk_height, width, height = 0.1 + 1.0 * u[0], 0.6 + 2.2 * u[1], 1.6 + 3.0 * u[2]
     return union(
-        [
-            post(0.05 + 0.15 * u[3], trunk_height + 0.6 * height),
-            at(crown((width, width, height), rng), z=trunk_height),
-        ]
+        [post(0.05 + 0.15 * u[3], trunk_height + 0.6 * height), at(crown((width, width, height), rng), z=trunk_height)]
     )
 
 
@@ -126,8 +123,5 @@ def pot_plant(u: np.ndarray, rng: np.random.Generator) -> Mesh:
     """A pot plant."""
     pot_height, width = 0.25 + 0.35 * u[0], 0.3 + 0.6 * u[1]
     return union(
-        [
-            post(0.5 * pot_height, pot_height),
-            at(crown((width, width, 0.4 + 1.1 * u[2]), rng, dense=0.5), z=pot_height),
-        ]
+        [post(0.5 * pot_height, pot_height), at(crown((width, width, 0.4 + 1.1 * u[2]), rng, dense=0.5), z=pot_height)]
     )

@@ -12,8 +12,7 @@ from math import pi
 
 import numpy as np
 
-from lidarpose.synth.environment import mesh as shapes
-from lidarpose.synth.environment import plants
+from lidarpose.synth.environment import mesh as shapes, plants
 from lidarpose.synth.environment.facades import window_bars
 from lidarpose.synth.environment.mesh import Mesh, at, box_at, post, shape, union, union_of
 
