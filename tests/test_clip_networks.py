@@ -316,10 +316,11 @@ def test_setup_rejects_settings_that_clip_networks_lack(folder, tmp_path):
         make_setup(recipe(Finetune, "lidarcap", data=(str(folder),), split="all", keep_anchors=False))
     with refused("heatmap_rate is for the paper's network with heatmaps, lidarcap has none: omit it"):
         make_setup(recipe(Finetune, "lidarcap", data=(str(folder),), split="all", heatmap_rate=10.0))
+    # before the data are read
     with refused("leave --mix at 0, and --augment at none or turn"):
-        make_setup(recipe(Finetune, "ne", data=(str(folder),), split="all", mix=0.25))
+        make_setup(recipe(Finetune, "ne", data=(str(tmp_path),), split="all", mix=0.25))
     with refused("shift_windows is for clip networks, tiny reads single frames"):
-        make_setup(recipe(Finetune, data=(str(folder),), init="tiny", split="all", mix=0.0, shift_windows=True))
+        make_setup(recipe(Finetune, data=(str(tmp_path),), init="tiny", split="all", mix=0.0, shift_windows=True))
     with refused("normalize_in_training is an option of lidarcap"):
         make_setup(recipe(Pretrain, "ne", shards=(str(folder),), options=("normalize_in_training",)))
     wanted = recipe(Pretrain, "lidarcap", shards=(str(folder),), options=("normalize_in_training",))

@@ -35,6 +35,7 @@ from lidarpose.train.data_loader import BATCHES, ClipSource, MixedSource, Source
 from lidarpose.train.detector.candidate_source import SceneSource, draw_candidates, scan_example, validation_scans
 from lidarpose.train.detector.crop_source import draw_crops, scan_crops, validation_crops
 from lidarpose.train.networks import (
+    PRETRAINED,
     Config,
     check_rates,
     expanded_network,
@@ -301,6 +302,7 @@ def _no_parts(dataset: InMemoryDataset) -> tuple[str, ...]:
 
 def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
     trained, card = initial_network(recipe)
+    _check_clip_options(recipe, PRETRAINED[recipe.size][0] if trained is None else trained.config)
     split = None if recipe.split == "all" else recipe.split
     kind = augmentation(recipe.augment)
     full_dataset = InMemoryDataset.load(recipe.data, split=split, interval=recipe.interval)
@@ -341,11 +343,7 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
         warnings=warnings + ((no_validation,) if held_out_dataset is None else ()),
     )
     if not isinstance(config, LidarcapConfig):
-        if recipe.shift_windows:
-            raise InputError(f"shift_windows is for clip networks, {config.name} reads single frames: omit it")
         return setup
-    if recipe.mix or recipe.augment not in ("none", "turn"):
-        raise InputError(f"{config.name} learns from clips: leave --mix at 0, and --augment at none or turn")
     clip_source = _clips(dataset, config, recipe)
     held_out_clips = None if held_out_dataset is None else _clips(held_out_dataset, config, recipe)
     people = max(round(recipe.epochs * len(clip_source.clips)), 1) * config.frames
@@ -354,6 +352,15 @@ def _finetuning(recipe: Finetune, layout: str) -> TrainSetup:
     )
     epoch = len(clip_source.clips) * config.frames
     return replace(_of_clips(setup, clip_source), people=people, epoch=epoch, validation=clip_validation)
+
+
+def _check_clip_options(recipe: Finetune, config: Config) -> None:
+    """Raises InputError for options that networks of clips, or of single frames, do not have."""
+    if not isinstance(config, LidarcapConfig):
+        if recipe.shift_windows:
+            raise InputError(f"shift_windows is for clip networks, {config.name} reads single frames: omit it")
+    elif recipe.mix or recipe.augment not in ("none", "turn"):
+        raise InputError(f"{config.name} learns from clips: leave --mix at 0, and --augment at none or turn")
 
 
 def _clips(dataset: InMemoryDataset, config: LidarcapConfig, recipe: Pretrain | Finetune) -> ClipSource:
