@@ -50,3 +50,9 @@ def test_learn_background_excludes_person_who_leaves(monkeypatch):
     assert is_static(wall + map_origin, learn_background([empty, *[wall + map_origin] * 8])).all()
     assert not is_static(person + map_origin, learn_background([empty, *[wall + map_origin] * 8])).any()
     assert learn_background([empty] * 6).shape == (0, 3)
+
+
+def test_learned_points_are_in_the_middle_of_static_ones():
+    cube = np.random.default_rng(0).uniform(0, 1.2, (40_000, 3))
+    background = learn_background([cube + [7.0, 3.0, -1.0]] * 5)
+    np.testing.assert_allclose(background.mean(0), [7.6, 3.6, -0.4], atol=0.02)

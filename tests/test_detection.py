@@ -18,6 +18,7 @@ from lidarpose.geometry import UP_AXES, rotation_about, rotation_from_up
 from lidarpose.inference import detection, inputs, single_scan, verification
 from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.result_panels import panels_of
+from lidarpose.inference.scan import Scan
 from lidarpose.lidar.raycast import scan
 from lidarpose.models.detector.candidates import SceneIndex
 from lidarpose.models.detector.detector import Detector, rows_that_matter
@@ -912,3 +913,29 @@ def test_detect_accepts_numpy_numbers_as_options(model, scene, fake):
         assert [box.score for box in lidarpose.detect(scene[0], **options)] == [box.score for box in expected]
     with pytest.raises(InputError, match="columns must be a whole number of at least 3"):
         lidarpose.detect(scene[0], columns=2)
+
+
+def test_likely_reasons_for_nobody(monkeypatch):
+    """Another axis, also where a scan along the wrong one looks as if in other units; feet only if the units fit."""
+    given = SimpleNamespace(points=np.zeros((0, 3)), warnings=("read",))
+    places = SimpleNamespace(detections=(), far_warning=None, scan=None, level=None, given=given, moving=None)
+    monkeypatch.setattr(single_scan, "_feet", lambda *_: "feet")
+    found = []
+    for hint in ("axis", None):
+        monkeypatch.setattr(single_scan, "_other_up_axis", lambda *_, hint=hint: hint)
+        for other, unit in ((None, None), ("y", None), ("y", "mm"), (None, "mm")):
+            monkeypatch.setattr(single_scan, "flat_along_another_axis", lambda *_, other=other: other)
+            monkeypatch.setattr(single_scan, "scan_unit_warning", lambda *_, unit=unit: unit)
+            found.append(single_scan.why_nobody(places, detection.Search(), ("searched",)))
+    axis, nothing = ("read", "axis"), ("searched",)
+    assert found == [axis, axis, axis, nothing, ("searched", "feet"), nothing, nothing, nothing]
+
+
+def test_opposite_axis_is_suggested_only_if_it_finds_far_more(monkeypatch):
+    person = Box(center=np.zeros(3), size=np.ones(3), score=0.9)
+    places = SimpleNamespace(given=Scan(points=np.zeros((0, 3))))
+    monkeypatch.setattr(single_scan, "find_people", lambda scan, search: replace(scan, boxes=[person] * 3))
+    assert single_scan._opposite_up(places, detection.Search(), [person]) is not None
+    assert single_scan._opposite_up(places, detection.Search(), [person] * 2) is None
+    # of how many there are, `max_people` shows one
+    assert single_scan._opposite_up(places, detection.Search(max_people=1), [person]) is None

@@ -11,7 +11,7 @@ from hypothesis import given, strategies as st
 
 from lidarpose.cli import main
 from lidarpose.errors import InputError
-from lidarpose.eval.detector import evaluate_detector as run_module
+from lidarpose.eval.detector import detection_pictures, evaluate_detector as run_module
 from lidarpose.eval.detector.detection_scores import (
     CONDITIONS,
     FALSE,
@@ -563,3 +563,70 @@ def _scans_called(folder):
     np.save(folder / "0.npy", np.random.default_rng(0).uniform(-9, 9, (50, 3)))
     (folder / "0.json").write_text('{"people": []}')
     return folder
+
+
+def test_labels_that_are_no_people_and_things_above_are_no_company():
+    own = scan([5, {"x": 5.5, "is_person": False}], things=("lamp",), person=np.full(122, -1))
+    # a lamp above the person and the ground below
+    points = np.concatenate([own.points, [[5, 0, 0.3], [5, 0, -1.75]]])
+    own = replace(own, points=points, thing=np.repeat([-1, 0], [120, 2]))
+    people, _ = score_scan(0, own, [], np.zeros(0), max_range=40)
+    assert people[list(CONDITIONS)].to_numpy(int).tolist() == [[0, 0, 0, 1]]
+
+
+def test_range_is_measured_from_the_sensor():
+    own = scan([45.0, 5.0], origin=np.array([50.0, 0, 0]))
+    people, detections = score_scan(0, own, [box(45, 0), box(8, 0)], np.array([0.9, 0.8]), max_range=40)
+    assert (
+        people.person.tolist() == [0]
+        and people.distance.tolist() == [5]
+        and detections.status.tolist() == ["person", "neither"]
+    )
+
+
+def test_people_of_exactly_the_default_score_are_found():
+    result = score_detector(answers([(5, 0.5)]), scan_set([scan([5])]), default_score=0.5)
+    assert row_of(result, "recall", "default")["value"] == 100
+
+
+def test_scores_of_1_are_in_the_last_bin():
+    result = score_detector(answers([(5, 0.96), (10, 1.0)]), scan_set([scan([5, 10])]))
+    assert result.reliability == [{"score": 0.98, "people": 1.0, "detections": 2}]
+
+
+def test_people_of_50_points_are_in_the_groups_of_50_and_more():
+    people = pd.DataFrame({"mounted": False, "points": [49, 50], "distance": 5.0, "activity": ""})
+    people = people.assign(**{name: "a" for name in OF_SCAN})
+    masks = {(group, of): mask.tolist() for group, of, mask in _groups_of_people(people)}
+    assert masks["kind, 50 points and more", "a"] == masks["points", "50 and more"] == [False, True]
+
+
+def test_tilt_of_scenes_is_in_degrees(monkeypatch):
+    names = "points origin boxes mounted activities sensor kind thing things person joints".split()
+    up = np.array([0.0, np.sin(np.radians(5)), np.cos(np.radians(5))])
+    scene = SimpleNamespace(**dict.fromkeys(names, ()), height=1.5, up=up, points_digest=str)
+    scene.person = np.zeros(0, int)
+    monkeypatch.setattr("lidarpose.synth.detection_scene.detection_scene", lambda *_, **__: scene)
+    assert synthetic_scan(0, 0).tilt == "3 to 10 degrees" and synthetic_scan(0, 0).height == "1 to 2.2 m"
+
+
+def test_only_the_detector_has_a_default_score(tmp_path, monkeypatch):
+    monkeypatch.setattr(run_module, "score_detector", lambda *_, default_score, **__: default_score)
+    folder = _scans_called(tmp_path / "a")
+    found = [run_module.run_detector(name, heldout=False, folders=[folder])[0] for name in ("detector", "scorer")]
+    assert found == [[Detector().header["default_score"]], [None]]
+
+
+def test_candidates_are_ranked_by_their_order(monkeypatch):
+    monkeypatch.setattr(run_module, "propose", lambda points, ground: np.array([[5.0, 0, -1.7], [9.0, 0, -1.7]]))
+    boxes, scores = run_module.detector_of("candidates", None, max_range=20.0)(np.ones((9, 3)), np.zeros(3))
+    assert [box.center[0] for box in boxes] == [5, 9] and scores.tolist() == [1, 0.5]
+
+
+def test_crops_are_drawn_as_seen_from_the_sensor(monkeypatch):
+    """What is to the right as seen from the sensor is drawn to the right."""
+    views, own = [], scan([5])
+    monkeypatch.setattr(detection_pictures, "_draw_crop", lambda ax, crop, right, up: views.append((right, up)))
+    monkeypatch.setattr(detection_pictures, "png_of", lambda figure: b"")
+    detection_pictures._sheet([detection_pictures._crop(own, own.boxes[0], ("a",))], "title")
+    np.testing.assert_allclose(views, [[[0, -1, 0], [1, 0, 0]], [[0, -1, 0], [0, 0, 1]]], atol=1e-9)

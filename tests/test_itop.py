@@ -246,3 +246,11 @@ def test_itop_clusters_match_reference(seed, count, wide):
     points = np.random.default_rng(seed).uniform(0, wide, (count, 3))
     ours, theirs = itop._clusters(points), clusters_reference(points)
     np.testing.assert_array_equal(ours[:, None] == ours, theirs[:, None] == theirs)
+
+
+def test_itop_joints_after_the_torso_have_their_own_visibility(tmp_path, smpl):
+    files.write_itop(tmp_path, smpl, parts=("top/test",), frames=1)
+    with h5py.File(tmp_path / "ITOP_top_test_labels.h5", "r+") as file:
+        file["visible_joints"][:] = np.array(files.ITOP_JOINTS) != "left_knee"
+    (item,) = reader("itop").read(tmp_path, "top/test")
+    assert [ITOP14.joints[k] for k in np.flatnonzero(item.joint_labels == HIDDEN)] == ["left_knee"]

@@ -998,3 +998,77 @@ def test_table_in_folder_that_cannot_be_written_is_refused(tmp_path, monkeypatch
     problem = f"cannot write into the folder {tmp_path / 'out'} (Read-only file system)"
     assert f"{problem}; the disk is read-only: write to another folder" in error
     assert error.count("\n") == 1
+
+
+def test_stand_in_is_scored_on_other_people_than_it_trains_on():
+    for target in _targets(TABLES["table1"], Options(people=100)):
+        (train, test), epochs = (step.words for step in (target.train, target.test)), float(target.learn[-1])
+        seeds, counts = ([int(words[words.index(name) + 1]) for words in (train, test)] for name in ("--seed", "-n"))
+        assert seeds[0] != seeds[1]
+        frames = 16 if target.clips else 1
+        assert counts == [-(-100 // frames), -(-25 // frames)]
+        assert epochs * counts[0] * frames == pytest.approx(100, rel=1e-5)
+
+
+def test_poses_of_held_out_subjects_are_not_pretrained_on():
+    options = Options(motion=("a.npz", "b.npz"), subjects="1", held_out="2")
+    rows = [("table2", "poses-of-a"), ("table2", "poses-of-b"), ("table1", "dapt"), ("table4", "pre-training")]
+    pretrained = [" ".join(cells(TABLES[t], options, [row])[0].training[0].command(Path("o"))) for t, row in rows]
+    assert ["--subjects 1 " in words for words in pretrained] == [True, False, True, True]
+
+
+def test_ours_sees_as_many_people_of_real_sets_as_other_rows(data):
+    tuned = [
+        cells(TABLES["table1"], options, ["ours"])[0].training[1].words for options in (Options(data=data), Options())
+    ]
+    assert ["--hold-out" in words for words in tuned] == [True, False]
+    assert " ".join(map(str, tuned[0])).count("--mix 0 --hold-out 0") == 1
+
+
+def test_cell_is_undertrained_unless_a_fifth_better_than_the_mean_pose(finished, monkeypatch):
+    out, _, _ = finished
+    cell = next(c for c in cells(TABLES["table4"], Options(people=64, size="paper-tiny"), _ROWS) if c.row == "scratch")
+    found = []
+    for share in (0.79, 0.81):
+        error = report.read_scores(cell.evaluation.product(out) / report.FILE).results[0].line("mpjpe").value / share
+        monkeypatch.setattr(report, "mean_pose_error", lambda *_, error=error: error)
+        found.append(report._figures(cell, cell.evaluation, out)["undertrained"])
+    assert found == [False, True]
+
+
+def test_hours_of_a_cell_include_pretraining(finished, monkeypatch):
+    out, _, _ = finished
+    cell = next(c for c in cells(TABLES["table4"], Options(people=64, size="paper-tiny"), _ROWS) if c.row == "scratch")
+    network, header = report.load_checkpoint(cell.training[-1].product(out))
+    card = header.card | {"hours": 1.5, "init_card": {"hours": 2.25, "people_seen": 9}}
+    monkeypatch.setattr(report, "load_checkpoint", lambda path: (network, SimpleNamespace(card=card)))
+    figures = report._figures(cell, cell.evaluation, out)
+    assert (figures["hours"], figures["people_seen"]) == (3.75, 73)
+
+
+def test_rows_of_other_people_are_not_compared(finished, monkeypatch):
+    out, _, _ = finished
+    cell, reference = cells(TABLES["table4"], Options(people=64, size="paper-tiny"), _ROWS)
+    read, others = report.read_poses, iter((0.0, 1.0))
+
+    def moved(path):
+        return {name: replace(p, true=p.true + next(others)) for name, p in read(path).items()}
+
+    assert report._difference(cell, reference, out)
+    monkeypatch.setattr(report, "read_poses", moved)
+    assert report._difference(cell, reference, out) == {}
+
+
+def test_differences_of_clips_are_drawn_by_sequence(finished, monkeypatch):
+    out, _, _ = finished
+    cell, reference = cells(TABLES["table4"], Options(people=64, size="paper-tiny"), _ROWS)
+    result, drawn = report.read_scores(cell.evaluation.product(out) / report.FILE).results[0], []
+    interval = report.aggregate.paired_interval
+    monkeypatch.setattr(
+        report.aggregate, "paired_interval", lambda *of, clusters: drawn.append(clusters) or interval(*of)
+    )
+    for clusters in (False, True):
+        scores = SimpleNamespace(results=[replace(result, setting=replace(result.setting, clusters=clusters))])
+        monkeypatch.setattr(report, "read_scores", lambda path, scores=scores: scores)
+        report._difference(cell, reference, out)
+    assert drawn[0] is None and len(drawn[1]) == 16

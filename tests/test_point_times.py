@@ -57,11 +57,13 @@ def sample():
         ("x y z timestamp", [1.7e9 + 0.25, 1.7e9 + 0.5, 1.7e9], [-0.25, 0, -0.5]),
         ("x|y|z|TIMESTAMP (ns)", [0, 5e7, 1e8], [-0.1, -0.05, 0]),
         ("x|y|z|Time [ms]", [0, 50, 100], [-0.1, -0.05, 0]),
+        ("x|y|z|time (us)", [0, 5e4, 1e5], [-0.1, -0.05, 0]),
         ("x y z adjustedtime timestamp", [0, 5e4, 1e5], [-0.1, -0.05, 0]),
         ("x y z time", [0.5, np.nan, 1.0], [-0.5, -np.inf, 0]),
         # whole numbers of an unknown unit, float32 seconds since 1970, milliseconds, one time for all
         ("x y z time", [0, 1, 2], None),
         ("x y z timestamp", np.float32([1.7e9, 1.7e9 + 200, 1.7e9 + 500]), None),
+        ("x y z timestamp", np.float32([6e5 + 0.25, 6e5, 6e5 + 0.5]), None),
         ("x y z timestamp", [1.7e12 + 0.5, 1.7e12 + 1.5, 1.7e12], None),
         ("x y z gps_time", [3.5, 3.5, 3.5], None),
         ("x y z time", [np.nan] * 3, None),
@@ -404,3 +406,28 @@ def test_newest_of_several_scans_is_searched(turns, model, start):
     found = lidarpose.predict(turned, find=True, point_times=times[order], up="-y", model=model, skeleton="body26")
     counts = (sorted(len(person.points) for person in people) for people in (found, poses))
     np.testing.assert_allclose(*counts, rtol=0.1)
+
+
+def test_newest_scan_is_found_about_the_sensor(turns):
+    """Wherever it stands in the frame of the points."""
+    points, times = joined(turns[0], 0.7)
+    origin = np.array([32.0, -16.0, 2.0])
+    np.testing.assert_array_equal(newest_scan(points + origin, times, origin), newest_scan(points, times, np.zeros(3)))
+
+
+def test_person_cut_by_a_turn_is_seen_from_the_sensor():
+    points = np.random.default_rng(0).normal((-8, 0, 0), (0.2, 0.2, 0.5), (400, 3))
+    halves = np.where(points[:, 1] > 0.05, 0.0, 0.1).astype(np.float32)
+    assert newest_points(points + [8, 8, 0], halves, np.array([8.0, 8, 0])) is None
+
+
+def test_newest_points_are_distinct_and_none_of_a_map():
+    points = np.random.default_rng(0).normal((-8, 0, 0), (0.2, 0.2, 0.5), (400, 3))
+    walking = points + [0, 0.3, 0]
+    both, times = np.concatenate([points, walking]), np.repeat(np.float32([0, 1]), 400)
+    # second returns
+    twice = newest_points(np.concatenate([both, walking]), np.append(times, times[400:]), np.zeros(3))
+    np.testing.assert_array_equal(twice, walking)
+    # over two seconds
+    assert newest_points(both, 1.9 * times, np.zeros(3)) is not None
+    assert newest_points(both, 2.1 * times, np.zeros(3)) is None

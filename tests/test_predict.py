@@ -1063,3 +1063,9 @@ def test_scan_unit_warning_of_person_in_millimeters():
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (500, 3)) * [500, 300, 950]
     assert "are the units millimeters? divide all coordinates by 1000" in scan_unit_warning(points, len(points))
+
+
+def test_notes_of_reading_a_crop_belong_to_its_person(model):
+    points = np.random.default_rng(0).normal((5, 0, 0), (0.2, 0.2, 0.5), (99, 3))
+    poses = lidarpose.predict(np.concatenate([points, [[np.nan] * 3]]), crop=True, model=model)
+    assert poses.warnings == () and sum("dropped 1 of 100 points" in text for text in poses[0].warnings) == 1

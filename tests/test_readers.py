@@ -534,3 +534,14 @@ def test_published_smpl_file_names_are_recognized(tmp_path):
         "female": names[0], "male": names[1], "neutral": names[2]
     }  # fmt: skip
     assert [found.kind(g) for g in ("male", "female", "robot")] == ["male", "female", "neutral"]
+
+
+def test_corpora_have_ten_frames_a_second_and_joints_at_their_points(tmp_path, smpl):
+    files.write_lipd(tmp_path, smpl)
+    path = tmp_path / "LIPD_train.pkl"
+    entries = pickle.loads(path.read_bytes())
+    entries[2]["gt_joint"] = entries[2]["gt_joint"] + np.tile([0.9, 0, 0], 24)
+    path.write_bytes(pickle.dumps(entries))
+    items, skipped = everything("lipd", tmp_path, smpl)
+    assert [item.time for item in items] == pytest.approx([0.0, 0.1])
+    assert reasons(skipped) == {"joints are far from the points": 2}

@@ -11,7 +11,7 @@ from walking_people import FRAMES, boxes_of, moving_source, places_in_world, wal
 import lidarpose
 from lidarpose.body.rig import mean_adult_joints
 from lidarpose.cli import main
-from lidarpose.geometry import UP_AXES, inverse_transform
+from lidarpose.geometry import UP_AXES, inverse_transform, rigid_transform, rotation_about
 from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.predictor import Predictor
 from lidarpose.inference.results import PersonPose, Poses
@@ -355,3 +355,105 @@ def test_tables_have_all_values_of_all_frames(suffix, tmp_path, monkeypatch):
     expected |= {"in_range": False, "person_probability": 0.9, "second_person": 0.2, "score": 0.7, "mounted": False}
     assert {name: row[name] for name in expected} == pytest.approx(expected)
     assert bool(table[(table.track == 5) & (table.joint == "pelvis")].iloc[0].in_range)
+
+
+def test_known_people_close_together_are_detected_again():
+    boxes = [Box(center=(x, 0, 1), size=(0.6, 0.6, 1.8), score=0.9) for x in (5.0, 5.8, 9.0)]
+    places = np.array([box.center for box in boxes])
+    known = KnownPlaces(boxes=boxes, pelvises=places, tracks=places, reach=np.full(3, 0.5), rejected=np.zeros((0, 3)))
+    # also where only a detection's height differs
+    assert known.index_of(places + [0, 0, 0.6], np.ones(3, bool)).tolist() == [-1, -1, 2]
+    # a low threshold stays
+    assert known.least_scores(places, np.array([-1, -1, 2]), 0.05).tolist() == [0.05] * 3
+
+
+def test_known_person_at_a_rejected_place_stays():
+    box = Box(center=(5, 0, 1), size=(0.6, 0.6, 1.8), score=0.9)
+    places = box.center[None]
+    known = KnownPlaces(boxes=[box], pelvises=places, tracks=places, reach=np.array([0.5]), rejected=places)
+    assert known.least_scores(np.repeat(places, 2, 0), np.array([0, -1]), 0.5).tolist() == [0.5, np.inf]
+
+
+def seen(known, time, *, score=0.9, verified=True):
+    """Adds a frame with a person at (5, 0)."""
+    box = Box(center=(5, 0, 1), size=(0.6, 0.6, 1.8), score=score, mounted=False)
+    pelvis = np.array([5, 0, 1.0])
+    person = PersonPose(pose=None, skeleton=SMPL24, points=np.zeros((0, 3)), box=box, pelvis=pelvis)
+    scan = Scan(points=np.zeros((5, 3)), boxes=[box], pelvises=pelvis[None], verified=np.array([verified]))
+    known.update(time, scan, Poses(people=(person,), skeleton=SMPL24), np.eye(4))
+
+
+def test_people_are_known_until_they_must_be_verified_again():
+    known = KnownPeople(up="z", least_score=0.5, live=False)
+    for k in range(5):
+        seen(known, k / 10)
+        assert len(known.expected(k / 10 + 0.1, np.eye(4)).boxes) == 1
+    # unseen for over half a second
+    assert [len(known.expected(time, np.eye(4)).boxes) for time in (0.8, 1.0)] == [1, 0]
+    assert len(known.expected(1.0, np.eye(4)).tracks) == 1
+    # seen, but not verified, for 1.6 s
+    for k in range(5, 25):
+        seen(known, k / 10, verified=False)
+        assert len(known.expected(k / 10 + 0.1, np.eye(4)).boxes) == (k / 10 + 0.1 < 2.0 - 1e-6), k
+    # of a low score
+    seen(known, 2.5, score=0.3)
+    assert not known.expected(2.6, np.eye(4)).boxes and len(known.expected(2.6, np.eye(4)).tracks) == 1
+
+
+def test_weak_detections_start_no_tracks():
+    known = KnownPeople(up="z", least_score=0.5, live=False)
+    box = Box(center=(5, 0, 1), size=(0.6, 0.6, 1.8), score=0.2)
+    person = PersonPose(pose=None, skeleton=SMPL24, points=np.zeros((0, 3)), box=box)
+    scan, poses = Scan(points=np.zeros((5, 3)), boxes=[box]), Poses(people=(person,), skeleton=SMPL24)
+    assert [len(known.update(k / 10, scan, poses, np.eye(4))) for k in range(3)] == [0, 0, 0]
+
+
+def test_velocity_is_along_the_axes_of_the_sensor():
+    known, T = (
+        KnownPeople(up="z", least_score=0.5, live=False),
+        rigid_transform(rotation_about("z", np.pi / 2), np.zeros(3)),
+    )
+    known.fixed.from_sensor(T)
+    for k in range(20):
+        # walks along the world's x
+        box = Box(center=T[:3, :3].T @ [3 + 0.1 * k, 2, 1], size=(0.6, 0.6, 1.8), score=0.9)
+        person = PersonPose(pose=None, skeleton=SMPL24, points=np.zeros((0, 3)), box=box)
+        scan, poses = Scan(points=np.zeros((5, 3)), boxes=[box]), Poses(people=(person,), skeleton=SMPL24)
+        (person,) = known.update(k / 10, scan, poses, T)
+    np.testing.assert_allclose(person.velocity, [0, -1, 0], atol=0.05)
+
+
+def test_rejected_positions_of_another_clock_are_forgotten():
+    """A clock that was set back would else hide people there for long."""
+    known = KnownPeople(up="z", least_score=0.5, live=False)
+    known._rejected = np.array([[4.0, 1.0, 0.0, 1000.0]])
+    restored = KnownPeople(up="z", least_score=0.5, live=False)
+    restored.restore(json.loads(json.dumps(known.state())))
+    assert len(restored.expected(1000.5, np.eye(4)).rejected) == 1
+    assert not len(restored.expected(10.0, np.eye(4)).rejected)
+
+
+def test_added_people_have_the_id_of_their_track():
+    times = np.arange(10) / 10
+    lines = [
+        {"time": time, "T_world_sensor": None, "error": None, "up": "z", "people": [{"track": 3} | person_values(pose)]}
+        for time, pose in zip(times, walker(times, np.random.default_rng(0)), strict=True)
+    ]
+    lines[5]["people"] = []
+    (added,) = list(smoothed_lines(lambda: iter(lines), "z", SMPL24))[5]["people"]
+    assert added["filled"] and added["id"] == added["track"] == 3
+
+
+def test_axes_are_the_worlds_if_the_first_pose_is_known():
+    T = rigid_transform(np.eye(3), np.ones(3))
+    first, late = FixedFrame("-y"), FixedFrame("-y")
+    late.from_sensor(None)
+    for fixed in (first, late):
+        fixed.from_sensor(T)
+    assert first.axes == ("x", "y") and late.axes == FixedFrame("-y").axes == ("z", "-x")
+
+
+def test_tables_have_no_in_range_without_values_of_joints(tmp_path):
+    person = person_of(0, confidence=[], spread=[], visible=[], out_of_range=[])
+    result_files.write_result(tmp_path / "a.csv", [line_of(0, [person])])
+    assert pandas.read_csv(tmp_path / "a.csv").in_range.isna().all()

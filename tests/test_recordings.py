@@ -1248,3 +1248,60 @@ def test_boxes_of_one_scan_are_rejected_for_recording(tmp_path, model):
     Boxes([Box(center=np.zeros(3), size=np.ones(3))]).save(path)
     with pytest.raises(InputError, match="a.boxes.json: expected one entry per frame.*one box file is one scan"):
         next(iter(lidarpose.predict_recording(fed([np.ones((9, 3))]), boxes=path, model=model)))
+
+
+def test_tracks_are_smoothed_at_the_end_unless_live(model, tmp_path, monkeypatch):
+    crop, asked = np.random.default_rng(0).normal((5, 0, 0), (0.2, 0.2, 0.5), (99, 3)), []
+    monkeypatch.setattr(output, "smoothed_lines", lambda lines, *_, **given: asked.append(given) or lines())
+    box = Box(center=(5, 0, 0), size=(1, 1, 2), score=0.1)
+    for options in ({}, {"live": True}, {"track": True}, {"boxes": {0: [box]}, "track": True}):
+        predictor = FramePredictor(model=model, crop="boxes" not in options, **options)
+        output.write_recording(FrameSource(Crops([crop])), predictor, tmp_path / "a.jsonl", command={})
+    assert asked == [{"are_boxes_given": False}, {"are_boxes_given": True}]
+
+
+def test_given_boxes_of_any_score_are_tracked_at_ten_frames_a_second(model):
+    """If frames have no times."""
+    cloud = np.random.default_rng(0).normal((5, 0, 0), (0.2, 0.2, 0.5), (99, 3))
+    steps = [np.array([0.1 * k, 0, 0]) for k in range(8)]
+    boxes = {k: [Box(center=step + [5, 0, 0], size=(1, 1, 2), score=0.1)] for k, step in enumerate(steps)}
+    frames = [Frame(index=k, id=str(k), points=cloud + step, warnings=(f"w{k}",)) for k, step in enumerate(steps)]
+    *_, last = lidarpose.predict_recording(frames, boxes=boxes, track=True, model=model)
+    assert [person.id for person in last.poses] == [0] and "w7" in last.poses.warnings
+    assert last.poses[0].velocity[0] == pytest.approx(1.0, abs=0.2)
+
+
+def test_summary_keeps_the_first_error():
+    summary = output.Summary()
+    for k in range(3):
+        summary.add({"people": [], "error": f"no {k}", "warnings": [], "frame": k, "id": "a"})
+    assert summary.warning_lines(1) == ["3 damaged, first frame 0 (a): no 0"] and summary.in_world == 0
+
+
+def test_page_lists_ways_and_durations():
+    view = page.RecordingPage()
+    for k in range(3):
+        pose = Pose(joints=np.full((24, 3), [0.5 * k, 0.0, 1.0]), skeleton=SMPL24)
+        view.add(line_of({"pose": pose, "id": 0}, frame=2 * k, is_tracked=True))
+    assert view._tracks[0].way == pytest.approx(1.0) and view._step() == pytest.approx(200)
+
+
+def test_page_gives_people_with_boxes_their_points_where_their_pose_was_filled_in():
+    view, points = page.RecordingPage(), np.concatenate([np.ones((9, 3)), np.full((99, 3), 8.0)])
+    pose = Pose(joints=np.ones((24, 3)), skeleton=SMPL24)
+    line = line_of({"pose": pose, "id": 0, "box": Box(center=[1, 1, 1], size=[1, 1, 2])}, is_tracked=True)
+    line["people"][0]["filled"] = True
+    view.add(line)
+    text = view.render(FrameSource(Crops([points])), SMPL24, title="").decode()
+    (scan,) = json.loads(text.split('id="data">')[1].split("</script>")[0])["scans"]
+    assert len(scan["points"]) == 3 * 99 and len(scan["frames"][0]["points"]) == 3 * 9
+
+
+def test_paths_are_those_of_the_middle_of_people(monkeypatch):
+    drawn, view = [], picture.TrajectoryPicture()
+    monkeypatch.setattr(picture, "draw_scan_and_people", lambda scan, people, **_: drawn.append(scan) or b"")
+    for k in range(2):
+        pose = Pose(joints=np.linspace([k, 1.0, 0.0], [k + 0.4, 2.0, 1.8], 24), skeleton=SMPL24)
+        view.add(line_of({"pose": pose, "id": 3}, frame=k, is_tracked=True))
+    view.draw(FrameSource(Crops([np.zeros((9, 3))] * 2)), title="")
+    np.testing.assert_allclose(drawn[0].tracks, [[[0.2, 1.5, 0.9], [1.2, 1.5, 0.9]]], atol=1e-4)

@@ -15,6 +15,7 @@ from lidarpose.sample import Pose
 from lidarpose.skeleton import SKELETONS, SMPL24, Skeleton
 from lidarpose.tracking.bones import lengths_of, rigid_bones
 from lidarpose.tracking.clip import TrackPoses
+from lidarpose.tracking.facing import swapped_frames
 from lidarpose.tracking.live import LiveFilter, filter_track
 from lidarpose.tracking.motion_model import SCALES, KalmanState, learn_process_noise, pooled, smooth_joints
 from lidarpose.tracking.smoothing import likely_hit, smooth, with_facing_corrected
@@ -215,8 +216,9 @@ def test_smoothing_is_robust_to_outlier_frame(walker):
 def test_smoothed_spread_keeps_common_error():
     times = np.arange(100) / 10
     joints = np.broadcast_to(rest_pose(SMPL24), (100, 24, 3))
-    steady = smooth(TrackPoses(times=times, joints=joints, skeleton=SMPL24, spread=np.full((100, 24), 0.05)))
-    assert 0.8 * 0.05 < steady.spread[50].min() and steady.spread[50].max() < 0.05
+    track = TrackPoses(times=times, joints=joints, skeleton=SMPL24, spread=np.full((100, 24), 0.05))
+    for steady, most in ((smooth(track).pose(50), 0.05), (filter_track(track)[99], 0.06)):
+        assert 0.8 * 0.05 < steady.spread.min() and steady.spread.max() < most
 
 
 def test_smoothing_limits_tiny_spread():
@@ -421,3 +423,22 @@ def test_smoothing_splits_track_at_long_gap(walker):
     assert np.abs(smooth(later).joints - apart).max() < 0.06
     minute = replace(track, times=track.times + np.where(np.arange(24) < 12, 0, 60.0))
     np.testing.assert_allclose(smooth(later).joints, smooth(minute).joints, atol=1e-3)
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.0, 2.5, -2.0])
+def test_facing_correction_follows_straight_walk(heading):
+    """In any direction, and sidesteps to either side say nothing."""
+    turn = np.array([[np.cos(heading), np.sin(heading), 0], [-np.sin(heading), np.cos(heading), 0], [0, 0, 1]])
+    times, variance = np.arange(10) / 10, np.full((10, 24), 0.01)
+    for step, is_swapped in (([1, 0.2, 0], False), ([-1, 0.2, 0], True), ([1, -0.2, 0], False), ([-1, -0.2, 0], True)):
+        joints = (rest_pose(SMPL24) + np.outer(times, step)[:, None]) @ turn
+        assert (swapped_frames(times, joints, variance, np.zeros((10, 24)), SMPL24) == is_swapped).all()
+
+
+def test_smoothing_is_exact_far_from_the_origin(walker):
+    """As in map coordinates."""
+    _, track = walker(frames=10)
+    moved = replace(track, joints=track.joints + [4e5, 5e6, 0])
+    for smoothed in (lambda own: smooth(own).poses(), filter_track):
+        for here, there in zip(smoothed(track), smoothed(moved), strict=True):
+            np.testing.assert_allclose(there.joints - [4e5, 5e6, 0], here.joints, atol=1e-4)

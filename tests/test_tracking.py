@@ -298,3 +298,11 @@ def test_update_rejects_invalid_boxes_without_change():
 def test_from_state_rejects_invalid_state(state):
     with pytest.raises(InputError, match="^expected the state of a tracker, got .*: give what Tracker.state"):
         Tracker.from_state(state)
+
+
+def test_weak_box_below_detected_person_is_a_duplicate():
+    """Its height does not matter."""
+    tracker = Tracker()
+    low = Box(center=(0.1, 0, 0.2), size=(0.6, 0.6, 1.0), score=0.4)
+    assert tracker.update(0.0, [person(0, score=0.9)], [low]) == [0, -1]
+    assert len(tracker._tracks) == 1

@@ -13,7 +13,7 @@ from lidarpose.inference.backend import Raw
 from lidarpose.inference.estimator import PoseEstimator
 from lidarpose.inference.tta import IDENTITY, TRANSFORMS, TTATransform, apply, average, invert, tta_transforms
 from lidarpose.sample import Pose, center_of
-from lidarpose.skeleton import HUMAN15
+from lidarpose.skeleton import HUMAN15, WAYMO14
 from lidarpose.synth.generator import Generator
 from lidarpose.synth.scene import scene_config
 
@@ -237,3 +237,51 @@ class TwoPeople:
         person = np.array([[9.0, 9.0 if self.sure[len(cloud)] else -9.0] for cloud in clouds])
         raw = Raw.from_joints(np.zeros((len(clouds), 15, 3)))
         return replace(raw, confidence=each, log_spread=each, visible=each, person=person)
+
+
+def test_sure_pose_far_from_the_box_is_repeated_about_the_box():
+    cloud = np.random.default_rng(0).normal((5, 0, 0), (0.2, 0.2, 0.5), (300, 3))
+    middle = center_of(cloud)[0]
+    backend = PoseAt(
+        lambda x: (middle, 0.8, 0.0) if abs(x - middle) < 0.3 else (middle + 1, 0.9, 0.0), cloud.mean(0)[0]
+    )
+    (pose,) = PoseEstimator(backend).poses([cloud], np.zeros(3), box_centers=np.array([[middle + 1.1, 0, 0]]))
+    np.testing.assert_allclose(pose.joints[:, 0], middle + 1, atol=0.011)
+
+
+def test_second_pass_is_about_the_middle_of_the_hips():
+    """Of skeletons without a pelvis, whose first joint is the nose."""
+    cloud, centers = np.random.default_rng(0).normal((5, 0, 0), (0.2, 0.2, 0.5), (300, 3)), []
+
+    class Hips:
+        name, batch, header = "fake", 1, SimpleNamespace(skeleton=WAYMO14, network="dapt")
+
+        def run(self, clouds, view):
+            center = cloud.mean(0) - clouds[0].mean(0)
+            centers.append(center)
+            joints = np.zeros((1, 14, 3))
+            joints[0, WAYMO14.index("nose")] = [0.3, 0, 0.7]
+            return Raw.from_joints(joints - (center - [5, 0, 0]))
+
+    PoseEstimator(Hips()).poses([cloud], np.zeros(3), first_centers=np.array([[5.4, 0.2, 0.1]]))
+    np.testing.assert_allclose(centers, [[5.4, 0.2, 0.1], [5, 0, 0]], atol=0.006)
+
+
+def test_pose_needs_points_near_its_center():
+    """In all three axes: the cloud is beside the center."""
+    cloud = np.random.default_rng(0).normal((5, 0, 0), 0.1, (50, 3))
+    estimator = PoseEstimator(PoseAt(lambda x: (x, 0.9, 0.0), cloud.mean(0)[0]))
+    for offset, has_pose in ((0.0, True), (3.0, False)):
+        (pose,) = estimator.poses([cloud], np.zeros(3), centers=np.array([[5.0 + offset, 0, 0]]))
+        assert (pose is not None) == has_pose
+
+
+def test_newest_points_far_from_the_person_are_left_out(monkeypatch):
+    """A crop may show others, too."""
+    cloud = np.random.default_rng(0).normal((5, 0, 0), (0.2, 0.2, 0.5), (300, 3))
+    estimator, given = PoseEstimator(PoseAt(lambda x: (5.0, 0.9, 0.0), cloud.mean(0)[0])), []
+    (pose,) = estimator.poses([cloud], np.zeros(3))
+    monkeypatch.setattr(estimator, "poses", lambda clouds, *_, **__: given.extend(clouds) or [None])
+    (same,) = estimator.averaged_with_newest([pose], [np.concatenate([cloud, cloud + [0, 3, 0]])], np.zeros(3))
+    np.testing.assert_array_equal(given, [cloud])
+    assert same is pose

@@ -9,6 +9,7 @@ import pytest
 from lidarpose.inference import verification
 from lidarpose.inference.backend import bundled_backend
 from lidarpose.inference.estimator import PoseEstimator
+from lidarpose.inference.known_places import KnownPlaces
 from lidarpose.inference.tta import MIRRORED, average
 from lidarpose.inference.verification import Crops, box_about, inside_column
 from lidarpose.models import DEFAULT
@@ -214,3 +215,31 @@ def test_joined_detections_map_rows_to_all_points():
     joined = scored(2, [np.array([3]), np.array([1, 2])]).joined(some, np.array([4, 6, 9]))
     assert [rows.tolist() for rows in joined.near_rows] == [[3], [1, 2], [4, 9]] and joined.joints.shape == (3, 15, 3)
     assert joined.scores.tolist() == [0, 1, 0]
+
+
+def test_known_people_keep_the_score_of_their_verification():
+    box = Box(center=(5, 0, 1), size=(0.6, 0.6, 1.8), score=0.7, mounted=True)
+    places = box.center[None]
+    known = KnownPlaces(boxes=[box], pelvises=places, tracks=places, reach=np.ones(1), rejected=np.zeros((0, 3)))
+    points = np.random.default_rng(0).uniform((4.8, -0.2, 0.2), (5.2, 0.2, 1.8), (50, 3))
+    people = verification.verified(detections_at((5.1, 0, 1)), points, None, {}, 0.5, known=known)
+    ((kept, is_verified),) = zip(people.boxes, people.verified, strict=True)
+    assert (kept.score, kept.mounted, is_verified) == (0.7, True, False) and not len(people.rejected)
+
+
+def test_thresholds_of_known_places_posing_and_neighbors(monkeypatch):
+    asked, posed_from = [], []
+    header = {"verification": {"logit": 1.0, "verifier": 0.0}, "default_score": 0.75}
+    scored = verification._score_detections
+    monkeypatch.setattr(verification, "_score_detections", lambda *of: posed_from.append(of[4].tolist()) or scored(*of))
+    monkeypatch.setattr(verification, "_distinct_people", lambda *of: asked.append(of[3]) or [])
+    known = SimpleNamespace(boxes=[], pelvises=np.zeros((0, 3)))
+    known.index_of = lambda centers, is_sure: asked.append(is_sure.tolist()) or np.array([-1, -1])
+    known.least_scores = lambda centers, index, least: np.full(2, least)
+    given = detections_at((5.0, 0, 1), (9.0, 0, 1)), np.zeros((0, 3)), None, header, 0.6
+    verification.verified(*given, known=known)
+    # the scores of these detections are at most 0.5 and 0.73
+    assert asked == [[False, True], 0.75] and posed_from == [[0.6, 0.6]]
+    # surer ones than the threshold are posed if people beside them are searched for
+    verification.verified(*given, detect_beside=lambda *_: None)
+    assert posed_from[1] == [0.5, 0.5]
