@@ -168,6 +168,16 @@ def test_times_must_be_a_number_of_seconds_per_point(times):
         lidarpose.predict(POINTS, point_times=times)
 
 
+def test_times_of_32_bits_that_are_too_coarse_are_refused():
+    times = np.float32(1.7e9 + SECONDS)
+    with pytest.raises(
+        InputError, match=r"point_times: float32 seconds from 1.7e\+09 on are rounded to 1.3e\+02 s: give"
+    ):
+        lidarpose.predict(POINTS, point_times=times)
+    # a map of days, whose newest points have fine times
+    assert as_point_times(np.float32([-2e5, -1, 0, np.nan]), 4).tolist() == [-2e5, -1, 0, -np.inf]
+
+
 def test_times_may_be_missing_or_huge():
     with np.errstate(all="raise"):
         assert as_point_times([1e300, -1e300, np.nan, np.inf, 0, 1], 6).tolist()[0] == 0

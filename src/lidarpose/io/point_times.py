@@ -75,7 +75,8 @@ def _unit(values: np.ndarray, names: Sequence[str], column: int) -> float | None
 def as_point_times(times: Any, count: int, what: str = "point_times") -> np.ndarray | None:
     """Times given by the user, (n,) s from any zero, for `count` points; None stays None.
 
-    Raises InputError unless there is a number for each point. NaN is a point without a time.
+    Raises InputError unless there is a number for each point, and for 32-bit times that are too large to separate
+    scans. NaN is a point without a time.
     """
     if times is None:
         return None
@@ -88,6 +89,12 @@ def as_point_times(times: Any, count: int, what: str = "point_times") -> np.ndar
     if seconds.shape != (count,):
         actual = f"{times.dtype} of shape {times.shape}" if hasattr(times, "dtype") else reprlib.repr(times)
         raise InputError(f"{what}: expected {count} numbers of seconds, one per point, got {actual}")
+    is_finite = np.isfinite(seconds)
+    # of times relative to the newest, only the oldest are rounded so
+    smallest = np.abs(seconds[is_finite]).min() if is_finite.any() else 0.0
+    if array.dtype == np.float32 and (step := np.spacing(np.float32(smallest))) > _FINEST:
+        problem = f"float32 seconds from {smallest:.3g} on are rounded to {step:.2g} s"
+        raise InputError(f"{what}: {problem}: give float64, or seconds from the first point")
     return _relative(seconds)
 
 
